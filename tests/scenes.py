@@ -48,8 +48,8 @@ _MORE: dict[str, tuple[float, Lens, float]] = {
 EVERY_LENS = tuple(name for name in (*_LENSES, *_MORE) if name != "spline-surface")
 """Also with terms that a lens has only where they are asked for, but for a surface: most of its nodes show nowhere."""
 
-RADIAL = Options(lens="radial")
-"""The paper's lens, of tests that do not ask which lens it is."""
+RADIAL = Options(lens="radial", usual_camera=False)
+"""The paper's lens and nothing but what is stated, of tests that do not ask which lens it is."""
 
 _SPACING_M = 0.2
 _LINES = tuple(name for name in ssl_field("B").curve_names if name != "CenterCircle")

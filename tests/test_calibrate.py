@@ -48,7 +48,8 @@ PLAIN: dict[str, Any] = {"loss": "trivial", "noise_scale": "stated", "reject_sig
 
 def options_for(scene: Scene, **more: Any) -> Options:
     lens = next(iter(scene.cameras.values())).lens
-    return Options(lens=lens.kind, powers=getattr(lens, "powers", (2, 3)), **more)
+    given = {"lens": lens.kind, "powers": getattr(lens, "powers", (2, 3)), "usual_camera": False, **more}
+    return Options(**given)
 
 
 @cache
@@ -489,7 +490,7 @@ def test_a_height_prior_cures_the_view_from_straight_above() -> None:
     assert free.phi_from == {"camera": "guess"}
     assert any("frontal" in line and "height" in line for line in free.warnings)
     prior = Prior("station", "up", "height_m", (5.0,), (0.005,))
-    held = calibrate(observations, Options(lens="radial", priors=(prior,)))
+    held = calibrate(observations, Options(lens="radial", usual_camera=False, priors=(prior,)))
     assert held.phi_from == {"camera": "prior"}
     assert held.warnings == ()
     assert held.station().position[2] == pytest.approx(5.0, abs=0.015)
@@ -504,7 +505,7 @@ def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
         (Prior("camera", "overhead", "k1", (0.0,), (1.0,)), "no 'k1', only phi, aspect, cx, cy, a2, a3"),
     ):
         with pytest.raises(InputError, match=message):
-            calibrate(observations, Options(lens="radial", priors=(prior,)))
+            calibrate(observations, Options(lens="radial", usual_camera=False, priors=(prior,)))
 
 
 # ---- what is held ---------------------------------------------------------------------------------------------------
@@ -547,7 +548,7 @@ def test_everything_may_be_fixed_but_the_poses() -> None:
     }
     observations = observed("brown/two-cameras", Disturbance()).observations
     alone = replace(scene, cameras=dict.fromkeys(scene.cameras, truth))
-    calibration = calibrate(simulate(alone).observations, Options(lens="brown", fixed=numbers))
+    calibration = calibrate(simulate(alone).observations, Options(lens="brown", usual_camera=False, fixed=numbers))
     assert calibration.fit.unknowns == 6 * (2 + 4)
     for station, place in scene.stations.items():
         assert (

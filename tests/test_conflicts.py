@@ -48,7 +48,7 @@ def height(value: float, sigma: float) -> Prior:
 
 
 def under(*priors: Prior, fixed: Mapping[str, float] | None = None, **options: bool) -> Options:
-    return Options(**{"lens": "radial", "priors": priors, "fixed": fixed or {}, **options})  # type: ignore[arg-type]
+    return Options(**{"lens": "radial", "usual_camera": False, "priors": priors, "fixed": fixed or {}, **options})  # type: ignore[arg-type]
 
 
 @cache
@@ -293,13 +293,18 @@ def cropped(left_px: int) -> Observations:
 
 
 def test_a_cropped_picture_has_no_usual_principal_point() -> None:
-    """The data say where it is: what is usual has no part in it."""
-    calibration = calibrate(cropped(400), RADIAL)
-    assert not calibration.conflicts and not calibration.options.usual_camera
-    assert calibration.station().phi == pytest.approx(868.0, rel=0.02)
+    """The data say where it is: what is usual gives way."""
+    usual, alone = (calibrate(cropped(400), replace(RADIAL, usual_camera=on)) for on in (True, False))
+    assert not usual.conflicts
+    assert usual.station().phi == pytest.approx(868.0, rel=0.02)
+    off_px = np.subtract(usual.station().principal_point, alone.station().principal_point)
+    sd_px = alone.uncertainty.posterior.sd_of("camera", "overhead", "cx")
+    assert np.linalg.norm(off_px) < 0.5 * sd_px
 
 
 def test_what_is_usual_moves_nothing_that_the_data_determine() -> None:
-    with_it, without = (calibrate(seen(15.0), replace(RADIAL, usual_camera=on)) for on in (True, False))
+    """Beside a camera of which nothing is taken for usual but that its pixels are square."""
+    held = replace(RADIAL, usual_camera=True, free_aspect=False, free_skew=False)
+    with_it, without = (calibrate(seen(15.0), options) for options in (held, RADIAL))
     sd = without.uncertainty.posterior.sd_of("camera", "overhead", "phi")
     assert with_it.station().phi == pytest.approx(without.station().phi, abs=0.1 * sd)

@@ -25,7 +25,7 @@ from ceres_cal.calibration import lens_choice as choosing
 from ceres_cal.calibration import lens_seen as seen
 from ceres_cal.calibration.calibrating import Watched, calibrate
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
-from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, label_of, papers, pseudo_bma
+from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
 from ceres_cal.calibration.lens_kinds import Candidate
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
@@ -112,8 +112,13 @@ def test_corners_that_another_lens_explains_are_not_taken_out(tmp_path: Path) ->
 def test_decentring_is_seen_in_a_few_views(sony_boards: BoardDetections) -> None:
     """Halves of 13 views of 24 corners: .9 of what both state; with brown k1 in one of the second 2.2."""
     for seed in (0, 5):
-        choice = calibrate(halves.halves(sony_boards.observations, seed)[0]).lens_choice
-        assert choice is not None and choice.chosen.startswith("brown") and choice.chosen.endswith("p1 p2")
+        calibration = calibrate(halves.halves(sony_boards.observations, seed)[0])
+        (camera,) = calibration.cameras.values()
+        assert (
+            {*camera.lens.tangential}
+            == {"p1", "p2"}
+            <= {key.quantity for key in calibration.uncertainty.posterior.keys}
+        )
 
 
 def test_a_fisheye_in_few_views_has_a_start_of_its_own(real_data: Path) -> None:
@@ -128,9 +133,9 @@ def test_a_fisheye_in_few_views_has_a_start_of_its_own(real_data: Path) -> None:
 def test_where_the_longest_lenses_fold_shorter_ones_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """The paper's lens among them."""
     fault = vars(Candidate)["fault"].func
-    monkeypatch.setattr(Candidate, "fault", property(lambda one: fault(one) or "folds" * (len(one.form.names) != 1)))
+    monkeypatch.setattr(Candidate, "fault", property(lambda one: fault(one) or "folds" * (len(one.form.names) != 3)))
     choice = calibrate(_seen("radial-2-3", "boards")).lens_choice
-    assert choice is not None and choice.chosen in ("radial 2", "radial 3", "brown k1", "kannala-brandt k1")
+    assert choice is not None and choice.chosen in ("radial 3", "brown k1 p1 p2", "kannala-brandt k1 p1 p2")
 
 
 def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +174,7 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
         return of_choice(among)
 
     monkeypatch.setattr(choosing, "_choice", seen_choice)
-    for worse in (0.0, 2.79, 0.0):  # brown, kannala-brandt, radial, which is as good as brown
+    for worse in (0.0, 0.0, 2.28):  # brown, radial, which is as good, kannala-brandt
         choice = calibrate(_seen("brown", "boards")).lens_choice
         assert choice is not None and choice.chosen.split()[0] not in gone
         assert choice.tried[0].worse == pytest.approx(worse, abs=0.3)
@@ -248,7 +253,7 @@ def test_what_other_lenses_would_say_is_stated(tmp_path: Path) -> None:
     wider, narrow = (one.uncertainty.posterior for one in (calibration, alone))
     assert np.all(wider.sd >= narrow.sd * (1.0 - 1e-6))
     on_floor = [np.nanmean(one.uncertainty.map_sd_mm("camera").errors_mm) for one in (calibration, alone)]
-    assert 1.15 < on_floor[0] / on_floor[1] < 2.0  # 1.28
+    assert 1.05 < on_floor[0] / on_floor[1] < 2.0  # 1.13
 
 
 def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,9 +284,10 @@ def test_what_everybody_knows_comes_first_among_equals_of_one_size() -> None:
     assert decide(["radial 3,5", "brown k1 k2"], [2, 2], [same, a_little_worse + 0.3])[1] == 0  # 3 % are none
 
 
-def test_decentring_comes_after_two_coefficients_along_the_radius() -> None:
+def test_every_lens_is_decentred_as_far_as_is_usual() -> None:
     labels = [label_of(one) for one in candidates(Options(lens="brown"))]
-    assert labels == ["brown k1", "brown k1 k2 p1 p2", "brown k1 k2 p1 p2 k3"]
+    assert labels == ["brown k1 p1 p2", "brown k1 k2 p1 p2", "brown k1 k2 p1 p2 k3"]
+    assert all({"p1", "p2"} < {*form.names} for forms in kinds() for form in forms)
 
 
 def test_a_decentred_fisheye_is_recognised() -> None:
@@ -300,7 +306,7 @@ def test_a_lens_that_no_formula_has_is_seen_in_what_all_others_leave() -> None:
     choice = calibrate(simulate(replace(scene, cameras=cameras), noise, 1).observations).lens_choice
     assert choice is not None and choice.chosen == "spline 2,3"
     first, second, *_ = (one.rms_px for one in choice.tried)
-    assert first and second and second > 1.8 * first  # 2.3 times, and four standard errors, in each of four runs
+    assert first and second and second > 1.6 * first  # 1.7 times
     seen = _seen("radial-2-3", "boards")
     plain = calibrate(seen).lens_choice  # where nothing is left behind it is not looked at
     assert plain is not None and not [one for one in plain.tried if one.label.startswith("spline")]

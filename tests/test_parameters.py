@@ -10,6 +10,7 @@ import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import RADIAL
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
@@ -35,6 +36,9 @@ from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
 from ceres_cal.scene.targets import checkerboard
 
 BOARD = checkerboard(3, 2, 0.1)
+
+ALONE: dict[str, Any] = {"usual_camera": False}
+"""Nothing is taken for usual of cameras."""
 
 each_lens = pytest.mark.parametrize("lens", scenes.LENSES)
 
@@ -136,13 +140,21 @@ def test_radial_coefficients_scale_with_their_power() -> None:
 @pytest.mark.parametrize(
     "options, free",
     [
-        (Options(lens="radial"), ["phi", "cx", "cy", "a2", "a3"]),
-        (Options(lens="radial", free_aspect=True), ["phi", "aspect", "cx", "cy", "a2", "a3"]),
-        (Options(lens="radial", free_principal_point=False), ["phi", "a2", "a3"]),
-        (Options(lens="radial", fixed={"phi": 800.0, "cy": 200.0}), ["cx", "a2", "a3"]),
-        (Options(lens="radial", free_aspect=True, fixed={"aspect": 1.0}), ["phi", "cx", "cy", "a2", "a3"]),
-        (Options(lens="brown", fixed={"p1": 0.0, "p2": 0.0}), ["phi", "cx", "cy", "k1", "k2", "k3"]),
-        (Options(powers=(3,)), ["phi", "cx", "cy", "a3"]),
+        (Options(**ALONE, lens="radial"), ["phi", "cx", "cy", "a2", "a3"]),
+        (Options(**ALONE, lens="radial", free_aspect=True), ["phi", "aspect", "cx", "cy", "a2", "a3"]),
+        (Options(**ALONE, lens="radial", free_principal_point=False), ["phi", "a2", "a3"]),
+        (Options(**ALONE, lens="radial", fixed={"phi": 800.0, "cy": 200.0}), ["cx", "a2", "a3"]),
+        (
+            Options(**ALONE, lens="radial", free_aspect=True, fixed={"aspect": 1.0}),
+            ["phi", "cx", "cy", "a2", "a3"],
+        ),
+        (
+            Options(**ALONE, lens="brown", fixed={"p1": 0.0, "p2": 0.0}),
+            ["phi", "cx", "cy", "k1", "k2", "k3"],
+        ),
+        (Options(**ALONE, powers=(3,)), ["phi", "cx", "cy", "a3"]),
+        (Options(lens="radial"), ["phi", "aspect", "cx", "cy", "a2", "a3", "skew"]),
+        (Options(lens="radial", free_skew=False), ["phi", "aspect", "cx", "cy", "a2", "a3"]),
     ],
 )
 def test_free_numbers(options: Options, free: list[str]) -> None:
@@ -156,7 +168,7 @@ def test_free_numbers(options: Options, free: list[str]) -> None:
 def test_layout_counts_every_pose_once() -> None:
     """A camera of two stations, a board at two placements, one of them seen twice."""
     seen = watched(("a1", None), ("a2", None), ("a1", "p"), ("a2", "p"), ("a1", "q"), cameras={"a1": "a", "a2": "a"})
-    layout = make_layout(seen, Options(lens="radial"))
+    layout = make_layout(seen, RADIAL)
     assert layout == Layout(layout.free, frozenset({"a1", "a2"}), frozenset({"p", "q"}))
     assert layout.size == 5 + 2 * 6 + 2 * 6
 
@@ -181,17 +193,17 @@ def test_one_station_of_each_group_that_nothing_ties_to_the_world(
 ) -> None:
     observations = watched(*views)
     assert anchored_stations(observations) == anchored
-    assert make_layout(observations, Options(lens="radial")).stations == {station for station, _ in views} - anchored
+    assert make_layout(observations, RADIAL).stations == {station for station, _ in views} - anchored
 
 
 def test_views_without_observations_count_for_nothing() -> None:
     """A field that was looked for and not found ties nothing to the world; a placement nobody saw is no unknown."""
     seen = watched(("a", "p"))
     empty = (View("7", "a", "a", "board"), View("8", "a", "a", "board", "q"), View("9", "a", "a2", "board", "p"))
-    layout = make_layout(replace(seen, views=(*seen.views, *empty)), Options(lens="radial"))
+    layout = make_layout(replace(seen, views=(*seen.views, *empty)), RADIAL)
     assert anchored_stations(replace(seen, views=(*seen.views, *empty))) == {"a"}
     assert not layout.stations and layout.placements == {"p"}
-    assert layout.size == make_layout(seen, Options(lens="radial")).size == 5 + 6
+    assert layout.size == make_layout(seen, RADIAL).size == 5 + 6
 
 
 # ---- estimate -------------------------------------------------------------------------------------------------------
@@ -217,7 +229,7 @@ def test_poses_chain_from_frame_to_camera() -> None:
         ({"lens": None}, r"Options\(lens=\.\.\.\): Expected `str`, got `null`"),
         ({"fixed": {"phi": "x"}}, r"Options\(fixed=\.\.\.\): Expected `float`, got `str`"),
         ({"tolerances": {"field": 0.01}}, r"Options\(tolerances=\.\.\.\): Expected `object`"),
-        ({"free_skew": 1}, r"Options\(free_skew=\.\.\.\): Expected `bool`"),
+        ({"free_skew": 1}, r"Options\(free_skew=\.\.\.\): Expected `bool | null`"),
         ({"reject_sigma": 1e300}, "reject_sigma must be 0.001 to 1e\\+09 sigmas, not 1e\\+300"),
         ({"reject_sigma": 1e10}, "reject_sigma must be 0.001 to"),  # which no file of JSON holds
         ({"loss_scale": 1e-300}, "loss_scale must be 0.001 to 1e\\+09 sigmas, not 1e-300"),

@@ -17,11 +17,11 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout
-from ceres_cal.problem.priors import GaussianPrior, gather_priors, stated_prior, tolerances
+from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, gather_priors, stated_prior, tolerances
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import intrinsic_keys, moved
 from ceres_cal.problem.structure import Tolerance, make_structure
-from ceres_cal.scene.lens import Brown, Radial
+from ceres_cal.scene.lens import LENSES, Brown, Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, simulate
 
@@ -175,7 +175,7 @@ def test_given_and_without() -> None:
 def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     """The other numbers of the prior still count, with those held at their mean; what is known uses up no equation."""
     estimate, seen = estimated(), observed()
-    options = Options(lens="radial", fixed={"cx": 651.3})
+    options = Options(lens="radial", usual_camera=False, fixed={"cx": 651.3})
     prior = known_prior(estimate)
     problem = Problem(gather_sights(seen), make_layout(seen, options), (prior,), options=options)
     (heard,) = problem.priors_at(estimate)
@@ -191,13 +191,36 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
 
 def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
     """Not where it is stated, held back by the options, or known by an earlier calibration."""
-    seen, structure = observed(), estimated().structure
-    (usual,) = [one for one in gather_priors(seen, RADIAL, structure) if one.is_usual]
+    seen, structure, options = observed(), estimated().structure, replace(RADIAL, usual_camera=True)
+    usual, *others = (one for one in gather_priors(seen, options, structure) if one.is_usual)
+    assert {key.quantity for one in others for key in one.keys} == {"aspect", "skew"}
     assert usual.mean == pytest.approx(0.5 * (np.array(next(iter(seen.cameras.values()))) - 1.0))
     assert {key.quantity for key in usual.keys} == {"cx", "cy"}
     name = next(iter(seen.cameras))
-    stated = replace(RADIAL, priors=(Prior("camera", name, "cx", (640.0,), (1.0,)),))
-    carried = gather_priors(seen, RADIAL, structure, GaussianPrior(usual.information, usual.mean))
-    for priors in (gather_priors(seen, replace(RADIAL, usual_camera=False), structure), carried):
+    stated = replace(options, priors=(Prior("camera", name, "cx", (640.0,), (1.0,)),))
+    carried = gather_priors(seen, options, structure, GaussianPrior(usual.information, usual.mean))
+    for priors in (gather_priors(seen, RADIAL, structure), carried):
         assert not any(one.is_usual for one in priors)
-    assert not any(one.is_usual for one in gather_priors(seen, stated, structure))
+    assert not any("cx" in {key.quantity for key in one.keys} for one in gather_priors(seen, stated, structure)[1:])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_every_lens_is_little_decentred_as_is_usual(lens: str) -> None:
+    options = Options(lens=lens, terms=("tangential",) if "tangential" in LENSES[lens].more_terms else ())
+    priors = gather_priors(observed(), options, estimated().structure)
+    names = {key.quantity for one in priors if one.is_usual for key in one.keys}
+    assert names == {"cx", "cy", "aspect", "skew", *options.blank_lens.tangential}
+
+
+@given(st.floats(0.0, 1e4))
+def test_what_is_usual_gives_way(off: float) -> None:
+    """The farther off, the less it pulls: Cauchy's weight, of which the pull is greatest at its bend."""
+    key, estimate = Key("camera", "overhead", "aspect", "1"), estimated()
+    aspect = estimate.cameras["overhead"].aspect
+    prior = GaussianPrior(Information.of_sigmas({key: 1e-3}), np.array([aspect - 1e-3 * off]), is_usual=True)
+    pull = abs(float(prior.weighted_at(estimate).residuals(estimate)[0])) / 1e-3
+    sd = float(prior.weighted_at(estimate).information.spread.sd[0])
+    assert sd == pytest.approx(1e-3 * np.hypot(1.0, off / USUAL_BENDS))
+    assert pull * sd <= 1.001 * off
+    stated = replace(prior, is_usual=False)
+    assert stated.weighted_at(estimate) is stated

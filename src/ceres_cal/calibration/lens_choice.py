@@ -207,7 +207,7 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
 
 
 def _loosely(prior: Prior) -> Prior:
-    """What was stated of a camera or a station, said so vaguely that no lens wins by taking up what is wrong with it."""
+    """What was stated of a camera or a station, so vaguely that no lens wins by taking up what is wrong with it."""
     if prior.owner == "target" or prior.quantity not in _VAGUE:
         return prior
     least = _VAGUE_SHARE * max(map(abs, prior.value))

@@ -90,10 +90,19 @@ class CalibrateArguments(ReportArguments):
     fix: tuple[str, ...] = option(
         "hold phi, aspect, cx, cy, skew or a coefficient, such as k3=0", "NAME=VALUE", repeatable=True, group=_CAMERA
     )
-    free_aspect: bool = switch("let fy / fx differ from 1", group=_CAMERA)
-    free_skew: bool = switch("let the pixels' columns lean against their rows", group=_CAMERA)
+    free_aspect: bool | None = switch(
+        "fy / fx may be anything (default: near 1, or what the observations clearly say; `--fix aspect=1` holds it)",
+        default=None,
+        group=_CAMERA,
+    )
+    free_skew: bool | None = switch(
+        "the pixels' columns may lean against their rows as they like (default: hardly)", default=None, group=_CAMERA
+    )
     usual_camera: bool = switch(
-        "nothing is taken for usual of the principal point", default=True, flags=("--no-usual-camera",), group=_CAMERA
+        "nothing is taken for usual: no principal point near the middle, no little decentring; pixels are square",
+        default=True,
+        flags=("--no-usual-camera",),
+        group=_CAMERA,
     )
     free_principal_point: bool = switch(
         "hold it at the image's centre", default=True, flags=("--hold-principal-point",), group=_CAMERA

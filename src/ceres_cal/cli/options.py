@@ -42,7 +42,9 @@ def option(
     return field(default=() if repeatable and default is None else default, metadata=about)
 
 
-def switch(help: str, default: bool = False, *, flags: tuple[str, ...] = (), group: str = "", alone: str = "") -> Any:
+def switch(
+    help: str, default: bool | None = False, *, flags: tuple[str, ...] = (), group: str = "", alone: str = ""
+) -> Any:
     """A field that is an option without a value, which makes it the contrary of its default."""
     return option(help, default=default, flags=flags, group=group, alone=alone)
 
@@ -138,7 +140,8 @@ def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, An
     names = about["flags"] or (flag(one.name),)
     how |= {"dest": one.name, "default": one.default}
     if item is bool:
-        return names, {"action": f"store_{not one.default}".lower(), "help": how["help"], "dest": one.name}
+        action = f"store_{not one.default}".lower()
+        return names, {"action": action, "help": how["help"], "dest": one.name, "default": one.default}
     if one.default is MISSING:
         how |= {"required": True, "default": None}
     if about["repeatable"]:

@@ -298,7 +298,7 @@ def _rests(history: Sequence[float]) -> bool:
 
 def _require_enough(problem: Problem, estimate: Estimate) -> None:
     unknowns = problem.layout.size + len(estimate.structure.values)
-    known = sum(len(prior.information.root) for prior in problem.priors_of(estimate))
+    known = unknowns - problem.unknowns(estimate)
     if problem.equations + known < unknowns:
         raise DegenerateError(
             f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "

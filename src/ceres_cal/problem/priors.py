@@ -28,7 +28,7 @@ USUAL_CENTRE = 0.015
 middle of pictures that were not cropped."""
 # Standard deviations of fy / fx about 1, of the lean of the pixels' columns, which lithography draws upright, and of
 # either decentring coefficient. Of the public cameras tried, fy / fx is up to 0.6 % off and p1 and p2 are up to 1e-3.
-_USUAL_ASPECT, _USUAL_SKEW, _USUAL_DECENTRING = 1e-3, 3e-5, 5e-4
+_USUAL_ASPECT, _USUAL_SKEW, _USUAL_DECENTRING = 5e-4, 3e-5, 5e-4
 # Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
 # that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
 USUAL_BENDS = 2.0
@@ -61,6 +61,11 @@ class GaussianPrior:
     @property
     def keys(self) -> tuple[Key, ...]:
         return self.information.keys
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it says its numbers so well that they use up no observation: of what is usual, that pixels are square."""
+        return not self.is_usual or {key.quantity for key in self.keys} <= {"aspect", "skew"}
 
     def given(self, keys: Collection[Key]) -> GaussianPrior:
         """What it says of those of its numbers that are among the keys, with all others held at their mean."""

@@ -36,6 +36,7 @@ _MOST_FEATURES, _MOST_OFFSETS = 6, 40
 _MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
 _ANGLES = ("alpha, the paper's", "beta, the paper's", "gamma, the paper's", "tilt from straight down")
 _TURN = 1e-6  # rad
+_CLEARLY = 3.0  # standard deviations from what is usual of cameras: nearer it is not listed among the first numbers
 _PHI_FROM = {
     "fixed": "held",
     "views": "started from the views",
@@ -166,12 +167,16 @@ def _camera(quality: Quality, name: str) -> Section:
         held = held or all(one in options.held for one in quantities)
         return f"{title:16}{', '.join(shown)}{' (held)' if held else ''}"
 
+    def differs(one: str, usual: float) -> bool:
+        verdict = known(one)
+        return abs(values[one] - usual) > (_CLEARLY * verdict.sd if verdict else 0.0)
+
     started = quality.calibration.phi_from.get(name, "")
     freed = {"aspect": options.free_aspect, "skew": options.free_skew}
     lines = [
         f"{name}, {width} x {height} px",
         f"{'phi':16}{with_sd(camera.phi, 'px', known('phi'))} ({_PHI_FROM.get(started, started)})",
-        *(line(one, one) for one, usual in plain.items() if freed[one] or values[one] != usual),
+        *(line(one, one) for one, usual in plain.items() if freed[one] or differs(one, usual)),
         line("principal point", "cx", "cy", held=not options.free_principal_point),
         *(line(one, one) for one in camera.lens.listed),
     ]

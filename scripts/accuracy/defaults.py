@@ -1,0 +1,192 @@
+"""What somebody meets who states nothing: python scripts/run.py defaults [--help]
+
+Scenes of one camera over a division B field, calibrated by the defaults. Its lens is Brown's, with decentring that is
+drawn from the range of real lenses, or the paper's, without any. Of the first: how often 95 % intervals of places at
+0 and 150 mm hold (90 to 99 % asked), and that no number called "known" is over 5 standard deviations off. Of the
+second: what the default costs, as the error at 150 mm over that of the named lens. Then a stated height that is 5 % or
+2 % wrong, and one that is right: how often a contradiction is named. Exits with 1 when a figure is missed by more than
+two of its standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from runner import Row, mean_and_error, over, script, share_error
+
+from accuracy.odd_scenes import farthest
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem.parameters import Options
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.scene.lens import Brown, Lens, Radial
+from ceres_cal.scene.targets import checkerboard, ssl_field
+from ceres_cal.simulate import (
+    BoardRanges,
+    Disturbance,
+    Scene,
+    Station,
+    board_scene,
+    field_scene,
+    join,
+    overhead_pose,
+    simulate,
+)
+
+_DECENTRED = 5e-4  # standard deviation of p1 and of p2
+_NOISE_PX = 0.3
+_PLACES = np.array([[x, y] for x in (-4.0, -2.0, 0.0, 2.0, 4.0) for y in (-2.8, -1.0, 1.0, 2.8)])
+_SIZE = (1280, 960)
+_FAR = 5.0  # standard deviations
+
+
+def _brown(rng: np.random.Generator) -> tuple[float, Lens]:
+    p1, p2 = rng.normal(0.0, _DECENTRED, 2)
+    return 820.0 * rng.uniform(0.9, 1.1), Brown((-0.24, 0.08, p1, p2, -0.01))
+
+
+def _round(rng: np.random.Generator) -> tuple[float, Lens]:
+    return 868.0 * rng.uniform(0.9, 1.1), Radial((-5.2e-5, 6.1e-7))
+
+
+def _scene(seed: int, lens: Callable[[np.random.Generator], tuple[float, Lens]], tilts_deg: tuple[float, ...],
+           middle_m: float = 0.0, boards: int = 0) -> Scene:  # fmt: skip
+    """A camera 4.2 m over a place of the field, once at each tilt, and boards before it."""
+    rng = np.random.default_rng([seed, 34])
+    phi, model = lens(rng)
+    centre = (639.5 + rng.normal(0.0, 10.0), 479.5 + rng.normal(0.0, 10.0))
+    cameras, stations = {"c": Camera(_SIZE, phi, centre, model)}, {}
+    for number, tilt_deg in enumerate(tilts_deg):
+        way = rng.uniform(0.0, 2.0 * np.pi)
+        pose = overhead_pose(middle_m, 0.0, 4.2, tilt_deg * np.cos(way), tilt_deg * np.sin(way), rng.uniform(-5.0, 5.0))
+        stations[f"s{number}"] = Station("c", pose)
+    scene = field_scene(ssl_field("B"), cameras, stations, spacing_m=0.25)
+    if boards:
+        there = {"s0": stations["s0"]}
+        board = checkerboard(9, 6, 0.1)
+        scene = join(scene, board_scene(board, cameras, there, boards, seed, held=BoardRanges((1.5, 3.0))))
+    return scene
+
+
+_Maker = Callable[[int], Scene]
+DECENTRED: dict[str, tuple[_Maker, int]] = {
+    "one frame": (partial(_scene, lens=_brown, tilts_deg=(12.0,)), 1),
+    "five frames of one pose": (partial(_scene, lens=_brown, tilts_deg=(12.0,)), 5),
+    "half a field": (partial(_scene, lens=_brown, tilts_deg=(12.0,), middle_m=-2.3), 1),
+    "with six boards": (partial(_scene, lens=_brown, tilts_deg=(6.0,), boards=6), 1),
+    "four poses": (partial(_scene, lens=_brown, tilts_deg=(5.0, 10.0, 15.0, 20.0)), 1),
+}
+
+
+def observed(scene: Scene, frames: int, seed: int) -> Observations:
+    """What is seen of a scene, in so many frames: the same places of it, as one frame with less noise."""
+    sigma_px = _NOISE_PX / frames**0.5
+    return simulate(scene, Disturbance(sigma_px, sigma_px), seed).observations
+
+
+@dataclass
+class Found:
+    """Of one run: which intervals hold, by height, how far the farthest known number is off, and how it is headed."""
+
+    held: dict[float, Mask] = field(default_factory=dict)
+    sigmas: float = 0.0
+    which: str = ""
+    level: str = ""
+    failed: int = 0
+
+
+def _located(calibration: Calibration, scene: Scene, height_m: float) -> Iterator[tuple[Array, Array, Array]]:
+    """By how much places are located elsewhere, and the ends of their intervals."""
+    for station in scene.stations:
+        camera = scene.camera_at(station)
+        places = np.column_stack([_PLACES, np.full(len(_PLACES), height_m)])
+        pixels = camera.project(places)
+        inside = np.all((pixels > 0.0) & (pixels < np.array(_SIZE) - 1.0), axis=1)
+        points = calibration.uncertainty.located(pixels[inside], height_m, station)
+        yield points.located - _PLACES[inside], points.low - _PLACES[inside], points.high - _PLACES[inside]
+
+
+def _decentred(maker: _Maker, frames: int, seed: int) -> Found:
+    scene = maker(seed)
+    observations = observed(scene, frames, seed)
+    try:
+        calibration = calibrate(observations)
+    except CalibrationError:
+        return Found(failed=1)
+    found = Found(level=judge_quality(quality_of(calibration, observations)).level)
+    for height_m in HEIGHTS_M:
+        ends = [(low <= 0.0) & (high >= 0.0) for _, low, high in _located(calibration, scene, height_m)]
+        found.held[height_m] = np.concatenate(ends).ravel()
+    found.sigmas, found.which, _ = farthest(calibration, scene)
+    return found
+
+
+def decentred(name: str, runs: int) -> Iterator[Row]:
+    """The figures of a lens that is decentred."""
+    every = list(over(partial(_decentred, *DECENTRED[name]), range(runs)))
+    done = [one for one in every if not one.failed]
+    yield Row(name, "runs without a calibration", sum(one.failed for one in every), most=0.0)
+    for height_m in HEIGHTS_M:
+        held = mean_and_error([np.mean(one.held[height_m]) for one in done])
+        yield Row(name, f"places at {1e3 * height_m:.0f} mm in their 95 % intervals", *held, 0.90, 0.99)
+    far = [one for one in done if one.sigmas > _FAR]
+    note = ", ".join(sorted({one.which for one in far}))
+    yield Row(name, "runs with a known number over 5 sd off", len(far), most=0.0, note=note)
+    trusted = np.mean([one.level == "good" for one in done])
+    yield Row(name, "called trusted", float(trusted), share_error(float(trusted), len(done)))
+
+
+def _costs(tilt_deg: float, seed: int) -> tuple[float, float, bool]:
+    scene = _scene(seed, _round, (tilt_deg,))
+    observations, squares, is_paper = observed(scene, 1, seed), [], False
+    for options in (Options(lens="radial"), Options()):
+        calibration = calibrate(observations, options)
+        off = np.concatenate([off for off, _, _ in _located(calibration, scene, HEIGHTS_M[-1])])
+        squares.append(float(np.mean(off**2)))
+        choice = calibration.lens_choice
+        is_paper = choice is not None and choice.chosen == "radial 2,3"
+    return squares[0], squares[1], is_paper
+
+
+def round_lens(runs: int) -> Iterator[Row]:
+    """What the default costs where the lens is the paper's."""
+    for tilt_deg in (3.0, 12.0, 20.0):
+        named, auto, paper = np.array(list(over(partial(_costs, tilt_deg), range(runs))), dtype=float).T
+        name = f"the paper's lens, {tilt_deg:g} deg"
+        ratio = float(np.sqrt(auto.mean() / named.mean()))
+        yield Row(name, "rms error at 150 mm, over the named lens's", ratio, most=1.5)
+        yield Row(name, "recognised", float(paper.mean()), share_error(float(paper.mean()), runs), 0.95)
+
+
+def _is_accused(off: float, tilt_deg: float, seed: int) -> bool:
+    scene = _scene(seed, _brown if seed % 2 else _round, (tilt_deg,))
+    height_m = float(scene.camera_at("s0").position[2])
+    taped = height_m * (1.0 + off) + (0.0 if off else 0.005 * np.random.default_rng([seed, 7]).standard_normal())
+    prior = Prior("station", "s0", "height_m", (taped,), (0.005,))
+    try:
+        calibration = calibrate(observed(scene, 1, seed), Options(priors=(prior,)))
+    except CalibrationError:
+        return off != 0.0
+    return any(one.quantity == "height" for one in calibration.conflicts)
+
+
+def heights(runs: int) -> Iterator[Row]:
+    """How often a stated height is said to be contradicted."""
+    for off, tilt_deg, least, most in ((0.05, 12.0, 0.95, 1.0), (0.05, 20.0, 0.95, 1.0), (-0.2, 20.0, 0.95, 1.0),
+                                       (0.02, 20.0, 0.95, 1.0), (0.0, 12.0, 0.0, 0.005)):  # fmt: skip
+        share = float(np.mean(list(over(partial(_is_accused, off, tilt_deg), range(runs)))))
+        name = f"a height {100.0 * off:g} % wrong, {tilt_deg:g} deg" if off else "a height that is right"
+        yield Row(name, "contradiction named", share, share_error(share, runs), least, most)
+
+
+_cases = {name: partial(decentred, name) for name in DECENTRED} | {"round": round_lens, "heights": heights}
+main = script(_cases, __doc__, (200, "scenes of each case"))
