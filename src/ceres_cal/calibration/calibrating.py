@@ -13,7 +13,14 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.outcome import came_out, of_all, of_closed_form, resting_phi, unknown_phi
+from ceres_cal.calibration.outcome import (
+    came_out,
+    of_all,
+    of_closed_form,
+    require_lens_told,
+    resting_phi,
+    unknown_phi,
+)
 from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled
@@ -265,6 +272,8 @@ def solved_from(
     warnings = tuple(one.warning for one in (settled.explanations if settled else explanations))
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
+        if again is None:
+            require_lens_told(end.solution.estimate, posterior)
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))

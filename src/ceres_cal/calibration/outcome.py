@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.words import bounds_text, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.origin import COPY, Fit, Rejected
@@ -21,8 +22,9 @@ from ceres_cal.posterior.uncertainty import Uncertainty
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.noise import visible_from
-from ceres_cal.problem.parameters import Layout
+from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.competing import Explanation
 from ceres_cal.robust.robust import RobustSolution
@@ -38,12 +40,30 @@ _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
 )
+# Sizes that move a pixel of the image's corner by half the diagonal: a lens in which so many are one standard deviation
+# is none. Of boards that fill a tenth of the picture it is a hundred.
+_LOST = 1e3
 # Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
 _RESTING = 1.5
 USUAL = (
     "camera {!r}: phi, and what goes with it, rests on what is usual of cameras, a principal point near the middle of "
     "the image, square pixels and little decentring: without that its standard deviation is {}"
 )
+
+
+def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
+    """Raise DegenerateError where coefficients of a lens may be anything at all."""
+    for name, camera in estimate.cameras.items():
+        keys = [key for key in posterior.keys if key[:2] == ("camera", name) and key.quantity in camera.lens.names]
+        sd = posterior.sd[posterior.information.columns(keys)]
+        lost = [
+            key.quantity for key, size in zip(keys, sd / natural_sizes(estimate, keys), strict=True) if size > _LOST
+        ]
+        if lost:
+            raise DegenerateError(
+                f"camera {name!r}: its observations do not tell {', '.join(lost)} of the {camera.lens.kind} lens: "
+                f"show more of the targets, or hold them, such as --fix {lost[-1]}=0"
+            )
 
 
 def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:

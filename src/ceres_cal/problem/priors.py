@@ -64,7 +64,7 @@ class GaussianPrior:
 
     @property
     def is_known(self) -> bool:
-        """Whether it says its numbers so well that they use up no observation: of what is usual, that pixels are square."""
+        """Whether its numbers use up no observation: of what is usual, that pixels are square."""
         return not self.is_usual or {key.quantity for key in self.keys} <= {"aspect", "skew"}
 
     def given(self, keys: Collection[Key]) -> GaussianPrior:
