@@ -26,12 +26,6 @@ struct alignas(64) Lane {
 
 inline int filled_up(int n) { return (n + LANES - 1) / LANES * LANES; }
 
-// How many observations the chunk from `start` has, so that all chunks up to `end` are about as long.
-inline int chunk_from(int64_t start, int64_t end) {
-    const int64_t left = end - start, chunks = (left + CHUNK - 1) / CHUNK;
-    return static_cast<int>((left + chunks - 1) / chunks);
-}
-
 // body(i) for i from 0 to n, a multiple of LANES; no i has to do with another one.
 template <class Body>
 inline void each(int n, Body body) {

@@ -45,6 +45,17 @@ inline void substitute(int size, const double* upper, double* x) {
     }
 }
 
+// out (rows, columns) = a (rows, inner) b (inner, columns), their rows so many numbers apart.
+inline void multiply(int rows, int inner, int columns, const double* a, int a_apart, const double* b, int b_apart,
+                     double* out, int out_apart) {
+    for (int j = 0; j < rows; ++j)
+        for (int k = 0; k < columns; ++k) {
+            double sum = 0.0;
+            for (int i = 0; i < inner; ++i) sum += a[a_apart * j + i] * b[b_apart * i + k];
+            out[out_apart * j + k] = sum;
+        }
+}
+
 // Squared angle of a rotation vector, sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3, also where a is tiny.
 struct SineSeries {
     double angle2, sine, versine, rest;

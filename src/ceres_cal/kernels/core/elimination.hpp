@@ -79,12 +79,8 @@ class Elimination {
     static void move(const double* pose, const double* step, double* moved) {
         double turned[9];
         rotation(step, turned);
-        for (int j = 0; j < 3; ++j) {
-            for (int k = 0; k < 3; ++k)
-                moved[4 * j + k] =
-                    turned[3 * j] * pose[k] + turned[3 * j + 1] * pose[4 + k] + turned[3 * j + 2] * pose[8 + k];
-            moved[4 * j + 3] = pose[4 * j + 3] + step[3 + j];
-        }
+        multiply(3, 3, 3, turned, 3, pose, 4, moved, 4);
+        for (int j = 0; j < 3; ++j) moved[4 * j + 3] = pose[4 * j + 3] + step[3 + j];
     }
 
     // gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is. The

@@ -11,6 +11,15 @@ namespace ceres_cal {
 
 constexpr double NO_ANSWER = std::numeric_limits<double>::quiet_NaN();
 
+// What a direction of the target's frame moves, by what the camera's x, y and z move: the target moved along it moves
+// the point by R times it.
+inline double along(const double* by_camera, const double* pose, const double* direction) {
+    double sum = 0.0;
+    for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) sum += by_camera[j] * pose[4 * j + k] * direction[k];
+    return sum;
+}
+
 class Sums {
   public:
     Sums(const Optics& optics, const Unknowns& unknowns)
@@ -30,16 +39,13 @@ class Sums {
         return with_loss(loss.code, [&](auto code) {
             const Task task{pose, loss, newton, normal};
             double cost = 0.0;
-            for (int64_t start = points.bounds[sight], end = points.bounds[sight + 1]; start < end && cost == cost;) {
-                const int n = chunk_from(start, end);
-                cost += add_points<decltype(code)::value>(start, n, task, points);
-                start += n;
-            }
-            for (int64_t start = curves.bounds[sight], end = curves.bounds[sight + 1]; start < end && cost == cost;) {
-                const int n = chunk_from(start, end);
-                cost += add_curves<decltype(code)::value>(start, n, task, curves);
-                start += n;
-            }
+            const auto add_all = [&](const auto& seen) {
+                all_chunks(seen, sight, [&](int64_t start, int n) {
+                    cost += add<decltype(code)::value>(start, n, task, seen);
+                    return true;
+                });
+            };
+            add_all(points), add_all(curves);
             return cost;
         });
     }
@@ -52,74 +58,38 @@ class Sums {
         double* normal;
     };
 
-    template <LossCode code>
-    double add_points(int64_t start, int n, const Task& task, const Points& points) {
-        if (!shown_.show_points(start, n, task.pose, points)) return NO_ANSWER;
+    template <LossCode code, class Columns>
+    double add(int64_t start, int n, const Task& task, const Columns& seen) {
+        constexpr int MANY = Columns::RESIDUALS;
+        if (!shown_.show(start, n, task.pose, seen)) return NO_ANSWER;
         choose_rows();
-        const Rows& rows = shown_.rows;
-        const int filled = rows.n;
-        for (int i = 0; i < filled; ++i) {
-            const int64_t j = start + std::min(i, n - 1);
-            weight_[i] = i < n ? points.weights[j] : 0.0;
-            pixel_x_[i] = points.pixels[2 * j], pixel_y_[i] = points.pixels[2 * j + 1];
-        }
-        const Optics& optics = shown_.optics;
-        double *error = rows.x(shown_.last_row), cost = 0.0;
+        const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
+        for (int i = 0; i < filled; ++i) weight_[i] = i < n ? seen.weights[start + i] : 0.0;
+        double *error = own_[last], cost = 0.0;
         each(filled, [&](int i) {
-            const double w = weight_[i], dx = w * (optics.cx + shown_.image.x[i] - pixel_x_[i]);
-            const double dy = w * (optics.cy + optics.aspect * shown_.image.y[i] - pixel_y_[i]);
-            const double squared = dx * dx + dy * dy;
+            const double w = weight_[i], ex = w * (MANY == 2 ? shown_.off_x[i] : shown_.distance(i));
+            const double ey = MANY == 2 ? w * shown_.off_y[i] : 0.0, squared = ex * ex + ey * ey;
             const Robust one = robust<code>(task.loss.scale, squared);
-            const double root = std::sqrt(one.slope);
+            const double root = std::sqrt(one.slope), factor = root * w;
             cost += one.rho, squared_[i] = squared;
-            factor_[i] = factor_[filled + i] = root * w;
-            error[i] = root * dx, error[filled + i] = root * dy;
+            factor_[i] = MANY == 2 ? factor : factor * shown_.normal_x[i];
+            factor_[filled + i] = MANY == 2 ? factor : factor * shown_.normal_y[i];
+            error[i] = root * ex;
+            if (MANY == 2) error[filled + i] = root * ey;
         });
-        const int last = static_cast<int>(own_.size()) - 1;
         for (int k = 0; k < last; ++k) {
             double* own = own_[k];
-            each(2 * filled, [=](int i) { own[i] *= factor_[i]; });
+            if constexpr (MANY == 2)
+                each(2 * filled, [=](int i) { own[i] *= factor_[i]; });
+            else
+                each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
         }
-        if (task.newton) bend_rows<code>(n, 2, task.loss);
-        add_products(2 * filled, task.normal);
-        for (int i = 0; i < n && points.slots != nullptr; ++i) {
-            point_directions(points.bends + (BUILT - 2) * (start + i), directions_);
-            add_structure(i, 2, BUILT, points.slots + BUILT * (start + i), task);
-        }
-        return cost;
-    }
-
-    // One residual each, the distance along the image normal at the foot. By the envelope theorem its derivative is
-    // that of the projected foot with s held, along the normal.
-    template <LossCode code>
-    double add_curves(int64_t start, int n, const Task& task, const Curves& curves) {
-        if (!shown_.show_feet(start, n, task.pose, curves)) return NO_ANSWER;
-        choose_rows();
-        const Rows& rows = shown_.rows;
-        const int filled = rows.n;
-        for (int i = 0; i < filled; ++i) weight_[i] = i < n ? curves.weights[start + i] : 0.0;
-        double *error = rows.x(shown_.last_row), cost = 0.0;
-        each(filled, [&](int i) {
-            const double length = std::sqrt(shown_.length2[i]);
-            const double nx = -shown_.tau_y[i] / length, ny = shown_.tau_x[i] / length;
-            const double e = weight_[i] * (nx * shown_.off_x[i] + ny * shown_.off_y[i]);
-            const Robust one = robust<code>(task.loss.scale, e * e);
-            const double root = std::sqrt(one.slope), factor = root * weight_[i];
-            cost += one.rho, squared_[i] = e * e;
-            factor_[i] = factor * nx, factor_[filled + i] = factor * ny;
-            error[i] = root * e;
-        });
-        const int last = static_cast<int>(own_.size()) - 1;
-        for (int k = 0; k < last; ++k) {
-            double* own = own_[k];
-            each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
-        }
-        if (task.newton) bend_rows<code>(n, 1, task.loss);
-        add_products(filled, task.normal);
-        for (int i = 0; i < n && curves.slots != nullptr; ++i) {
-            const int64_t k = curves.track[start + i];
-            curve_directions(curves, k, shown_.tangent_x[i], shown_.tangent_y[i], directions_);
-            add_structure(i, 1, ON_TRACK, curves.slots + ON_TRACK * k, task);
+        if (task.newton) bend_rows<code>(n, MANY, task.loss);
+        add_products(MANY * filled, task.normal);
+        for (int i = 0; i < n && seen.slots != nullptr; ++i) {
+            double directions[BUILT][3] = {};
+            shown_.directions(seen, start + i, i, directions);
+            add_structure<Columns>(i, seen.slots + Columns::MOVED * seen.moved(start + i), directions, task);
         }
         return cost;
     }
@@ -192,43 +162,31 @@ class Sums {
     }
 
     // The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
-    //
-    // Moving the target along one of the directions, a slot each, moves the point by R times it in the camera frame:
-    // the pose's translation rows say what that does.
-    void add_structure(int i, int components, int many, const int32_t* slots, const Task& task) {
+    template <class Columns>
+    void add_structure(int i, const int32_t* slots, const double (&directions)[BUILT][3], const Task& task) {
         const int filled = shown_.rows.n, count = static_cast<int>(own_.size()), size = unknowns_.size();
-        double column[BUILT][2];
-        for (int a = 0; a < many; ++a) {
-            if (slots[a] < 0) continue;
-            const int place = unknowns_.count + slots[a];
-            for (int c = 0; c < components; ++c) {
-                column[a][c] = 0.0;
-                for (int j = 0; j < 3; ++j) {
-                    double turned = 0.0;
-                    for (int k = 0; k < 3; ++k) turned += task.pose[4 * j + k] * directions_[3 * a + k];
-                    column[a][c] += own_[count - 4 + j][c * filled + i] * turned;
-                }
-            }
-            for (int k = 0; k < count; ++k) {
-                double value = 0.0;
-                for (int c = 0; c < components; ++c) value += column[a][c] * own_[k][c * filled + i];
-                task.normal[size * std::max(place, places_[k]) + std::min(place, places_[k])] += value;
-            }
-            for (int b = 0; b <= a; ++b) {
-                if (slots[b] < 0) continue;
-                const int other = unknowns_.count + slots[b];
-                double value = 0.0;
-                for (int c = 0; c < components; ++c) value += column[a][c] * column[b][c];
-                task.normal[size * std::max(place, other) + std::min(place, other)] += value;
+        for (int c = 0; c < Columns::RESIDUALS; ++c) {
+            const auto row = [&](int k) { return own_[k][c * filled + i]; };
+            const double by_place[3] = {row(count - 4), row(count - 3), row(count - 2)};
+            double column[BUILT];
+            for (int a = 0; a < Columns::MOVED; ++a) {
+                if (slots[a] < 0) continue;
+                const auto add = [&](int place, int other, double value) {
+                    task.normal[size * std::max(place, other) + std::min(place, other)] += column[a] * value;
+                };
+                const int place = unknowns_.count + slots[a];
+                column[a] = along(by_place, task.pose, directions[a]);
+                for (int k = 0; k < count; ++k) add(place, places_[k], row(k));
+                for (int b = 0; b <= a; ++b)
+                    if (slots[b] >= 0) add(place, unknowns_.count + slots[b], column[b]);
             }
         }
     }
 
     const Unknowns unknowns_;
     Projection shown_;
-    Lane weight_, pixel_x_, pixel_y_, squared_;
+    Lane weight_, squared_;
     alignas(64) double factor_[2 * CHUNK];
-    double directions_[3 * BUILT];
     std::vector<double*> own_;
     std::vector<int> places_;
     std::vector<double> products_;  // room for three rows and columns more
