@@ -17,6 +17,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 
+IN_ORDER, NO_NORMALS = np.empty(0, dtype=np.int64), np.empty((0, 2))
+
 
 @cache
 def core() -> Any:
@@ -99,7 +101,7 @@ def point_residuals(
 
 def curve_residuals(optics: Optics, poses: Array, curves: CurveColumns, residuals: Array) -> None:
     """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
-    core().curve_residuals(optics, poses, curves, residuals)
+    core().curve_residuals(0, len(poses), optics, poses, curves, IN_ORDER, residuals[:, None])
 
 
 def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) -> None:
@@ -109,7 +111,7 @@ def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
     """
-    core().point_rows(optics, poses, points, rows)
+    core().point_rows(optics, poses, points, rows, NO_NORMALS)
 
 
 def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, normals: Array) -> bool:
@@ -121,7 +123,7 @@ def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, 
         See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
             lies at the pixel plus the signed distance along it.
     """
-    return bool(core().curve_rows(optics, poses, curves, rows, normals))
+    return bool(core().curve_rows(optics, poses, curves, rows[:, None], normals))
 
 
 def loss_weights(loss: Loss, squared: Array, weights: Array) -> None:

@@ -18,8 +18,7 @@ inline void align(const Aligned& seen, double* h) {
     for (int64_t i = 0; i < seen.n; ++i) {
         const double a = seen.p[2 * i], b = seen.p[2 * i + 1], x = seen.x[i], y = seen.y[i];
         const double row[6] = {-b * x, -b * y, -b, a * x, a * y, a};
-        for (int k = 0; k < 6; ++k)
-            for (int j = 0; j <= k; ++j) normal[6 * k + j] += seen.weights[i] * row[k] * row[j];
+        add_product(6, seen.weights[i], row, normal);
     }
     for (int k = 0; k < 6; ++k) h[k] = 1.0 + 0.1 * k;
     least_direction<6>(normal, h);
@@ -42,8 +41,7 @@ inline void add_depths(const Aligned& seen, const double* h, int columns, double
         row[0] = r * seen.x[i], row[1] = r * seen.y[i], row[2] = r, row[size - 1] = q;
         double power = -q;
         for (int k = 3; k < size - 1; ++k) power *= r * r, row[k] = power;
-        for (int k = 0; k < size; ++k)
-            for (int j = 0; j <= k; ++j) products[size * k + j] += seen.weights[i] * row[k] * row[j];
+        add_product(size, seen.weights[i], row.data(), products.data());
     }
     const double trace = products[0] + products[size + 1] + products[2 * (size + 1)];
     for (int k = 0; k < 3; ++k) products[(size + 1) * k] += 1e-12 * trace;
@@ -102,21 +100,16 @@ inline void usual_by_radius(int64_t n, const double* errors, const double* radiu
 }
 
 // Mean of (v - mean)(v - mean)^T over values (n, size), to scatter, (size, size).
-inline void scatter_of(int64_t n, int64_t size, const double* values, double* scatter) {
-    std::vector<double> mean(static_cast<size_t>(size));
-    std::fill_n(scatter, static_cast<size_t>(size * size), 0.0);
+inline void scatter_of(int64_t n, int size, const double* values, double* scatter) {
+    std::vector<double> mean(static_cast<size_t>(size)), off(mean.size());
+    std::fill_n(scatter, mean.size() * mean.size(), 0.0);
     for (int64_t k = 0; k < n; ++k)
-        for (int64_t i = 0; i < size; ++i) mean[i] += values[size * k + i];
-    for (double& one : mean) one /= static_cast<double>(n);
-    for (int64_t k = 0; k < n; ++k)
-        for (int64_t i = 0; i < size; ++i)
-            for (int64_t j = 0; j <= i; ++j)
-                scatter[size * i + j] += (values[size * k + i] - mean[i]) * (values[size * k + j] - mean[j]);
-    for (int64_t i = 0; i < size; ++i)
-        for (int64_t j = 0; j <= i; ++j) {
-            scatter[size * i + j] /= static_cast<double>(n);
-            scatter[size * j + i] = scatter[size * i + j];
-        }
+        for (int i = 0; i < size; ++i) mean[i] += values[size * k + i] / static_cast<double>(n);
+    for (int64_t k = 0; k < n; ++k) {
+        for (int i = 0; i < size; ++i) off[i] = values[size * k + i] - mean[i];
+        add_product(size, 1.0 / static_cast<double>(n), off.data(), scatter);
+    }
+    mirror(size, scatter);
 }
 
 }  // namespace ceres_cal

@@ -69,36 +69,33 @@ auto* row(const Of& array, int64_t number) {
 }
 
 // The optics of a camera, and what they need to live.
-class OpticsGiven {
-  public:
+struct OpticsGiven {
+    nb::object lens;
+    std::string kind;
+    Read<N> form;
+    double unit;
+    std::vector<double> intrinsics;
+
     explicit OpticsGiven(Tuple given)
-        : lens_(given[0]),
-          kind_(nb::cast<std::string>(given[1])),
-          form_(array<Read<N>>(given[2], "form")),
-          unit_(nb::cast<double>(given[4])) {
+        : lens(given[0]),
+          kind(nb::cast<std::string>(given[1])),
+          form(array<Read<N>>(given[2], "form")),
+          unit(nb::cast<double>(given[4])) {
         const Read<N> own = array<Read<N>>(given[3], "intrinsics");
         require(own.size() >= 5, "intrinsics: phi, aspect, cx, cy, coefficients and skew are needed");
         intrinsics.assign(own.data(), own.data() + own.size());
     }
 
-    std::vector<double> intrinsics;
-
     Optics make() const {
         const int count = whole(intrinsics.size());
-        const Making from{{form_.data(), whole(form_.size())}, {intrinsics.data(), count - 1}, unit_};
-        std::unique_ptr<Lens> lens = make_lens(kind_, from);
-        if (!lens) {
+        const Making from{{form.data(), whole(form.size())}, {intrinsics.data(), count - 1}, unit};
+        std::unique_ptr<Lens> made = make_lens(kind, from);
+        if (!made) {
             nb::ndarray<nb::numpy, const double, nb::ndim<1>> own(intrinsics.data() + 4, {intrinsics.size() - 5});
-            lens = std::make_unique<PythonLens>(lens_.attr("with_scaled")(own.cast(nb::rv_policy::copy), unit_), from);
+            made = std::make_unique<PythonLens>(lens.attr("with_scaled")(own.cast(nb::rv_policy::copy), unit), from);
         }
-        return {std::move(lens), intrinsics.data(), count};
+        return {std::move(made), intrinsics.data(), count};
     }
-
-  private:
-    nb::object lens_;
-    std::string kind_;
-    Read<N> form_;
-    double unit_;
 };
 
 // Groups of rows, each from bounds[g] to bounds[g + 1].
@@ -133,54 +130,46 @@ struct Columns {
     const int32_t* slots_or_null() const { return slots.size() > 0 ? slots.data() : nullptr; }
 };
 
-class PointsGiven : public Columns<BUILT> {
-  public:
+struct PointsGiven : Columns<BUILT> {
+    Read<N, 3> places;
+    Read<N, BUILT - 2> bends;
+    Points view;
+
     PointsGiven(Tuple given, int64_t first, int64_t last, int structure)
         : Columns(given[0], given[2], given[3], given[4], first, last, structure),
-          places_(array<Read<N, 3>>(given[1], "places")),
-          bends_(array<Read<N, BUILT - 2>>(given[5], "bends")) {
-        require(places_.shape(0) == count(), "points: places are as many as pixels");
+          places(array<Read<N, 3>>(given[1], "places")),
+          bends(array<Read<N, BUILT - 2>>(given[5], "bends")),
+          view{bounds.data(), places.data(), pixels.data(), weights.data(), slots_or_null(), bends.data()} {
+        require(places.shape(0) == count(), "points: places are as many as pixels");
         require(slots.size() == 0 || slots.shape(0) == count(), "points: slots are as many as pixels, or none");
-        require(slots.size() == 0 || bends_.shape(0) == count(), "points: slots need their bends");
+        if (slots.size() > 0) require_directions();
     }
-
-    Points view() const {
-        return {bounds.data(), places_.data(), pixels.data(), weights.data(), slots_or_null(), bends_.data()};
-    }
-    bool has_bends() const { return bends_.shape(0) == count(); }
-
-  private:
-    Read<N, 3> places_;
-    Read<N, BUILT - 2> bends_;
+    void require_directions() const { require(bends.shape(0) == count(), "points: slots need their bends"); }
 };
 
-class CurvesGiven : public Columns<ON_TRACK> {
-  public:
+struct CurvesGiven : Columns<ON_TRACK> {
+    Read<N, 3, 3> tracks;
+    Array<const bool, N> is_arc;
+    Array<const int32_t, N> track;
+    Filled<N> feet;
+    Curves view;
+
     CurvesGiven(Tuple given, int64_t first, int64_t last, int structure)
         : Columns(given[0], given[4], given[5], given[7], first, last, structure),
-          tracks_(array<Read<N, 3, 3>>(given[1], "tracks")),
-          is_arc_(array<Array<const bool, N>>(given[2], "is_arc")),
-          track_(array<Array<const int32_t, N>>(given[3], "track")),
-          feet_(array<Filled<N>>(given[6], "feet")) {
-        const size_t tracks = tracks_.shape(0);
-        require(feet_.size() == count() && track_.size() == count(), "curves: feet and track are as many as pixels");
-        require(is_arc_.size() == tracks, "curves: is_arc is as many as tracks");
-        require(slots.size() == 0 || slots.shape(0) == tracks, "curves: slots are as many as tracks, or none");
-        for (int64_t k = first < last ? bounds.data()[first] : 0; first < last && k < bounds.data()[last]; ++k)
-            require(track_.data()[k] >= 0 && track_.data()[k] < whole(tracks),
-                    "curves: there are fewer tracks than that");
+          tracks(array<Read<N, 3, 3>>(given[1], "tracks")),
+          is_arc(array<Array<const bool, N>>(given[2], "is_arc")),
+          track(array<Array<const int32_t, N>>(given[3], "track")),
+          feet(array<Filled<N>>(given[6], "feet")),
+          view{bounds.data(), tracks.data(),  is_arc.data(), track.data(),
+               pixels.data(), weights.data(), feet.data(),   slots_or_null()} {
+        const int64_t many = static_cast<int64_t>(tracks.shape(0));
+        require(feet.size() == count() && track.size() == count(), "curves: feet and track are as many as pixels");
+        require(is_arc.size() == tracks.shape(0), "curves: is_arc is as many as tracks");
+        require(slots.size() == 0 || slots.shape(0) == tracks.shape(0), "curves: slots are as many as tracks, or none");
+        for (int64_t k = first < last ? view.bounds[first] : 0; first < last && k < view.bounds[last]; ++k)
+            require(view.track[k] >= 0 && view.track[k] < many, "curves: there are fewer tracks than that");
     }
-
-    Curves view() const {
-        return {bounds.data(), tracks_.data(), is_arc_.data(), track_.data(),
-                pixels.data(), weights.data(), feet_.data(),   slots_or_null()};
-    }
-
-  private:
-    Read<N, 3, 3> tracks_;
-    Array<const bool, N> is_arc_;
-    Array<const int32_t, N> track_;
-    Filled<N> feet_;
+    void require_directions() const {}  // a track has its own
 };
 
 inline Loss loss_given(Tuple given) {
@@ -190,41 +179,28 @@ inline Loss loss_given(Tuple given) {
 }
 
 // What the solve's kernels take of sights from `first` to `last`.
-class Seen {
-  public:
-    Seen(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tuple points, Tuple curves, Tuple loss)
-        : optics(optics),
-          loss(loss_given(loss)),
-          free_(array<Array<const int64_t, N>>(unknowns[0], "unknowns.free")),
-          unknowns{free_.data(), whole(free_.size()), nb::cast<int>(unknowns[1])},
-          points_(points, first, last, this->unknowns.structure),
-          curves_(curves, first, last, this->unknowns.structure),
-          points(points_.view()),
-          curves(curves_.view()) {
-        for (size_t k = 0; k < free_.size(); ++k)
-            require(free_.data()[k] >= 0 && free_.data()[k] < static_cast<int64_t>(this->optics.intrinsics.size()),
-                    "unknowns: there is no such intrinsic");
-        require(this->unknowns.structure >= 0, "unknowns: fewer structure numbers than none");
-        require(points_.weights.size() == points_.count() && curves_.weights.size() == curves_.count(),
-                "weights are needed");
-    }
-
+struct Seen {
     OpticsGiven optics;
-    const Loss loss;
+    Array<const int64_t, N> free;
+    Unknowns unknowns;
+    PointsGiven points;
+    CurvesGiven curves;
+    Observed observed;
 
-  private:
-    Array<const int64_t, N> free_;
-
-  public:
-    const Unknowns unknowns;
-
-  private:
-    const PointsGiven points_;
-    const CurvesGiven curves_;
-
-  public:
-    const Points points;
-    const Curves curves;
+    Seen(int64_t first, int64_t last, Tuple camera, Tuple numbers, Tuple on_points, Tuple on_curves, Tuple robust)
+        : optics(camera),
+          free(array<Array<const int64_t, N>>(numbers[0], "unknowns.free")),
+          unknowns{free.data(), whole(free.size()), nb::cast<int>(numbers[1])},
+          points(on_points, first, last, unknowns.structure),
+          curves(on_curves, first, last, unknowns.structure),
+          observed{points.view, curves.view, loss_given(robust)} {
+        for (int k = 0; k < unknowns.count; ++k)
+            require(unknowns.free[k] >= 0 && unknowns.free[k] < static_cast<int64_t>(optics.intrinsics.size()),
+                    "unknowns: there is no such intrinsic");
+        require(unknowns.structure >= 0, "unknowns: fewer structure numbers than none");
+        require(points.weights.size() == points.count(), "points: weights are needed");
+        require(curves.weights.size() == curves.count(), "curves: weights are needed");
+    }
 };
 
 }  // namespace ceres_cal

@@ -43,22 +43,17 @@ inline void copy_columns(int size, const double* upper, int first, int count, co
     for (int row = 0; row < size - 1; ++row) std::copy_n(upper + size * row + first, count, jacobian + count * row);
 }
 
-// One array for each of Ceres's parameter blocks of a sight, null where the block is held.
-struct Jacobians {
-    double *camera, *station, *placement, *structure;
-};
-
-// What Ceres asks of the block of the first sight; false where an observation cannot be projected.
-inline bool evaluate_block(const Optics& optics, const Unknowns& unknowns, const Points& points, const Curves& curves,
-                           const Loss& loss, const double* station, const double* placement, double* residuals,
-                           const Jacobians& jacobians) {
+// What Ceres asks of the block of the first sight; false where an observation cannot be projected. jacobians: of
+// camera, station, placement and structure, null where one is held.
+inline bool evaluate_block(const Optics& optics, const Unknowns& unknowns, const Observed& seen, const double* station,
+                           const double* placement, double* residuals, double* const* jacobians) {
     const int size = unknowns.size(), last = size - 1;
     const Chain chain(station, placement);
-    Sums sums(optics, unknowns);
+    Sums sums(optics, unknowns, seen);
     std::vector<double> normal(static_cast<size_t>(size) * size), upper(normal.size());
     double missing = 0.0;
     for (const bool newton : {true, false}) {
-        const double cost = sums.normal_equations(0, chain.pose, points, curves, loss, newton, normal.data());
+        const double cost = sums.normal_equations(0, chain.pose, newton, normal.data());
         if (!std::isfinite(cost)) return false;
         cholesky(size, normal.data(), size, upper.data());
         missing = cost;
@@ -69,10 +64,10 @@ inline bool evaluate_block(const Optics& optics, const Unknowns& unknowns, const
         if (missing > -ROUNDING * cost) break;  // else Newton's step promises more than there is
     }
     residuals[last] = std::sqrt(std::max(missing, 0.0));
-    copy_columns(size, upper.data(), 0, unknowns.count, nullptr, jacobians.camera);
-    copy_columns(size, upper.data(), unknowns.count, unknowns.structure, nullptr, jacobians.structure);
-    copy_columns(size, upper.data(), unknowns.shared(), 6, chain.to_station, jacobians.station);
-    copy_columns(size, upper.data(), unknowns.shared(), 6, chain.to_placement, jacobians.placement);
+    copy_columns(size, upper.data(), 0, unknowns.count, nullptr, jacobians[0]);
+    copy_columns(size, upper.data(), unknowns.count, unknowns.structure, nullptr, jacobians[3]);
+    copy_columns(size, upper.data(), unknowns.shared(), 6, chain.to_station, jacobians[1]);
+    copy_columns(size, upper.data(), unknowns.shared(), 6, chain.to_placement, jacobians[2]);
     return true;
 }
 

@@ -51,11 +51,12 @@ struct Rows {
     int n;
     double* x(int row) const { return base + 2 * static_cast<int64_t>(n) * row; }
     double* y(int row) const { return x(row) + n; }
+    // A row to be filled.
+    double* show(int row) const { return shown[row] = true, x(row); }
     // A row to be added to, 0 at first.
     void open(int row) const {
         if (shown[row]) return;
-        shown[row] = true;
-        double* own = x(row);
+        double* own = show(row);
         each(2 * n, [=](int i) { own[i] = 0.0; });
     }
 };

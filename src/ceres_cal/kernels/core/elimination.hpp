@@ -17,12 +17,8 @@ struct Sweep {
 
 class Elimination {
   public:
-    Elimination(const Optics& optics, const Unknowns& unknowns, const Points& points, const Curves& curves,
-                const Loss& loss, bool newton)
-        : sums_(optics, unknowns),
-          points_(points),
-          curves_(curves),
-          loss_(loss),
+    Elimination(const Optics& optics, const Unknowns& unknowns, const Observed& seen, bool newton)
+        : sums_(optics, unknowns, seen),
           newton_(newton),
           count_(unknowns.shared()),
           size_(unknowns.size()),
@@ -41,7 +37,7 @@ class Elimination {
         move(kept, step, moved);
         double cost = INFINITY, promise = INFINITY, damping = 0.0;
         for (int trial = 0; trial < MOST_STEPS; ++trial) {
-            const double found = sums_.normal_equations(sight, moved, points_, curves_, loss_, newton_, trial_.data());
+            const double found = sums_.normal_equations(sight, moved, newton_, trial_.data());
             if (found <= cost) {
                 std::copy_n(moved, 12, pose), normal_.swap(trial_);
                 cost = found, damping *= 0.1;
@@ -137,9 +133,6 @@ class Elimination {
     }
 
     Sums sums_;
-    const Points& points_;
-    const Curves& curves_;
-    const Loss& loss_;
     const bool newton_;
     const int count_, size_;
     std::vector<double> normal_, trial_, gain_;

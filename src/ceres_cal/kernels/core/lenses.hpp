@@ -1,4 +1,4 @@
-// The table of the lenses.
+// The lenses that are compiled.
 #pragma once
 
 #include <memory>
@@ -11,27 +11,12 @@
 
 namespace ceres_cal {
 
-template <class Kind>
-std::unique_ptr<Lens> make(const Making& from) {
-    return std::make_unique<Kind>(from);
-}
-
-struct Known {
-    std::string_view kind;
-    std::unique_ptr<Lens> (*make)(const Making&);
-};
-
-constexpr Known LENSES[] = {
-    {"radial", make<Radial>},
-    {"brown", make<Brown>},
-    {"kannala-brandt", make<KannalaBrandt>},
-    {"spline", make<Spline>},
-};
-
 // Null for one that Python has alone.
 inline std::unique_ptr<Lens> make_lens(std::string_view kind, const Making& from) {
-    for (const Known& known : LENSES)
-        if (known.kind == kind) return known.make(from);
+    if (kind == "radial") return std::make_unique<Radial>(from);
+    if (kind == "brown") return std::make_unique<Brown>(from);
+    if (kind == "kannala-brandt") return std::make_unique<KannalaBrandt>(from);
+    if (kind == "spline") return std::make_unique<Spline>(from);
     return nullptr;
 }
 

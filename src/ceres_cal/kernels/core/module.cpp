@@ -88,7 +88,7 @@ void grouped_scatter(const Read<N, N>& values, const Bounds& bounds, const Fille
     const size_t size = values.shape(1);
     require(scatter.shape(1) == size && scatter.shape(2) == size, "scatter is (G, K, K)");
     each_group(bounds, values.shape(0), scatter.shape(0), [&](int64_t g, int64_t start, int64_t n) {
-        scatter_of(n, static_cast<int64_t>(size), row(values, start), row(scatter, g));
+        scatter_of(n, whole(size), row(values, start), row(scatter, g));
     });
 }
 
@@ -126,11 +126,10 @@ bool block(Tuple optics, Tuple unknowns, Tuple points, Tuple curves, Tuple loss,
                 "jacobians: as many rows as residuals times the block's size");
         return kept[k].data();
     };
-    const Jacobians blocks{filled(0, own.count), filled(1, 6), filled(2, 6), filled(3, own.structure)};
+    double* const blocks[4] = {filled(0, own.count), filled(1, 6), filled(2, 6), filled(3, own.structure)};
     const Optics made = seen.optics.make();
     return unlocked([&] {
-        return evaluate_block(made, own, seen.points, seen.curves, seen.loss, station.data(), placement.data(),
-                              residuals.data(), blocks);
+        return evaluate_block(made, own, seen.observed, station.data(), placement.data(), residuals.data(), blocks);
     });
 }
 
@@ -149,7 +148,7 @@ void eliminate_placements(int64_t first, int64_t last, Tuple optics, Tuple unkno
             "change is (K,) of the shared numbers, gains (S, 6, K), reduced (K + 1, K + 1)");
     const Optics made = seen.optics.make();
     unlocked([&] {
-        Elimination elimination(made, seen.unknowns, seen.points, seen.curves, seen.loss, newton);
+        Elimination elimination(made, seen.unknowns, seen.observed, newton);
         const Sweep filled{poses.data(), gains.data(), costs.data(), reduced.data()};
         for (int64_t v = first; v < last; ++v) elimination.eliminate(v, tolerance, change.data(), filled);
     });
@@ -167,15 +166,14 @@ void sight_normals(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tu
             "units are (K,), normals (S, K, K)");
     const Optics made = seen.optics.make();
     unlocked([&] {
-        Sums sums(made, seen.unknowns);
+        Sums sums(made, seen.unknowns, seen.observed);
         for (int64_t v = first; v < last; ++v) {
             double* normal = row(normals, v - first);
-            costs.data()[v - first] =
-                sums.normal_equations(v, row(poses, v), seen.points, seen.curves, seen.loss, newton, normal);
+            costs.data()[v - first] = sums.normal_equations(v, row(poses, v), newton, normal);
             for (size_t i = 0; i < size; ++i) {
                 for (size_t j = 0; j <= i; ++j) normal[size * i + j] *= units.data()[i] * units.data()[j];
-                for (size_t j = 0; j < i; ++j) normal[size * j + i] = normal[size * i + j];
             }
+            mirror(whole(size), normal);
         }
     });
 }
@@ -193,50 +191,34 @@ bool each_sight(int64_t first, int64_t last, const OpticsGiven& optics, const Po
     });
 }
 
-void find_point_residuals(int64_t first, int64_t last, Tuple optics, const Poses& poses, Tuple points,
-                          const Array<const int64_t, N>& rows, const Filled<N, 2>& residuals) {
-    const PointsGiven seen(points, first, last, INT32_MAX);
-    const Points view = seen.view();
-    require(rows.size() == seen.count(), "rows are (N,)");
-    for (int64_t k = first < last ? view.bounds[first] : 0; first < last && k < view.bounds[last]; ++k)
-        require(rows.data()[k] >= 0 && rows.data()[k] < static_cast<int64_t>(residuals.shape(0)),
-                "rows: there are fewer residuals");
+// rows: where each observation's residuals go, or empty: in order.
+template <class Given, int many>
+void find_residuals(int64_t first, int64_t last, Tuple optics, const Poses& poses, Tuple columns, const Bounds& rows,
+                    const Filled<N, many>& residuals) {
+    const Given seen(columns, first, last, INT32_MAX);
+    const int64_t room = static_cast<int64_t>(residuals.shape(0)), *places = rows.size() > 0 ? rows.data() : nullptr;
+    require(rows.size() == seen.count() || (rows.size() == 0 && residuals.shape(0) == seen.count()),
+            "rows are (N,), residuals as many without them");
+    for (int64_t k = first < last ? seen.view.bounds[first] : 0; first < last && k < seen.view.bounds[last]; ++k)
+        require(places == nullptr || (places[k] >= 0 && places[k] < room), "rows: there are fewer residuals");
     each_sight(first, last, OpticsGiven(optics), poses, [&](int64_t v, Projection& shown, const double* pose) {
-        return residuals_of(v, shown, pose, view, rows.data(), residuals.data());
+        return residuals_of(v, shown, pose, seen.view, places, residuals.data());
     });
 }
 
-void find_curve_residuals(Tuple optics, const Poses& poses, Tuple curves, const Filled<N>& residuals) {
-    const int64_t sights = static_cast<int64_t>(poses.shape(0));
-    const CurvesGiven seen(curves, 0, sights, INT32_MAX);
-    require(residuals.size() == seen.count(), "residuals are (M,)");
-    each_sight(0, sights, OpticsGiven(optics), poses, [&](int64_t v, Projection& shown, const double* pose) {
-        return residuals_of(v, shown, pose, seen.view(), nullptr, residuals.data());
-    });
-}
-
-void find_point_rows(Tuple optics, const Poses& poses, Tuple points, const Filled<N, 2, N>& rows) {
+// normals: of curves alone.
+template <class Given, int many>
+bool find_rows(Tuple optics, const Poses& poses, Tuple columns, const Filled<N, many, N>& rows,
+               const Filled<N, 2>& normals) {
     const int64_t sights = static_cast<int64_t>(poses.shape(0));
     const OpticsGiven camera(optics);
-    const PointsGiven seen(points, 0, sights, INT32_MAX);
-    require(seen.has_bends(), "points: bends are needed");
+    const Given seen(columns, 0, sights, INT32_MAX);
+    seen.require_directions();
     require(rows.shape(0) == seen.count() && rows.shape(2) == camera.intrinsics.size() + 6 + BUILT,
-            "rows are (N, 2, intrinsics + 6 + 7)");
-    each_sight(0, sights, camera, poses, [&](int64_t v, Projection& shown, const double* pose) {
-        return rows_of(v, shown, pose, seen.view(), rows.data(), nullptr);
-    });
-}
-
-bool find_curve_rows(Tuple optics, const Poses& poses, Tuple curves, const Filled<N, N>& rows,
-                     const Filled<N, 2>& normals) {
-    const int64_t sights = static_cast<int64_t>(poses.shape(0));
-    const OpticsGiven camera(optics);
-    const CurvesGiven seen(curves, 0, sights, INT32_MAX);
-    require(rows.shape(0) == seen.count() && normals.shape(0) == seen.count() &&
-                rows.shape(1) == camera.intrinsics.size() + 6 + BUILT,
-            "rows are (M, intrinsics + 6 + 7), normals (M, 2)");
+            "rows are (N, residuals, intrinsics + 6 + 7)");
+    require(normals.shape(0) == (many == 1 ? seen.count() : 0), "normals are (M, 2) of curves");
     return each_sight(0, sights, camera, poses, [&](int64_t v, Projection& shown, const double* pose) {
-        return rows_of(v, shown, pose, seen.view(), rows.data(), normals.data());
+        return rows_of(v, shown, pose, seen.view, rows.data(), normals.data());
     });
 }
 
@@ -266,10 +248,10 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("evaluate_block", &block);
     m.def("eliminate_placements", &eliminate_placements);
     m.def("sight_normals", &sight_normals);
-    m.def("point_residuals", &find_point_residuals);
-    m.def("curve_residuals", &find_curve_residuals);
-    m.def("point_rows", &find_point_rows);
-    m.def("curve_rows", &find_curve_rows);
+    m.def("point_residuals", &find_residuals<PointsGiven, 2>);
+    m.def("curve_residuals", &find_residuals<CurvesGiven, 1>);
+    m.def("point_rows", &find_rows<PointsGiven, 2>);
+    m.def("curve_rows", &find_rows<CurvesGiven, 1>);
 }
 
 }  // namespace ceres_cal

@@ -49,6 +49,13 @@ struct Loss {
     double scale;
 };
 
+// What sights show, and the loss that it is judged by.
+struct Observed {
+    Points points;
+    Curves curves;
+    Loss loss;
+};
+
 // Which numbers take part: A is [free intrinsics | structure | 6 pose | residual].
 struct Unknowns {
     const int64_t* free;

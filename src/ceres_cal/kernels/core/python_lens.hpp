@@ -17,11 +17,7 @@ class PythonLens final : public Lens {
   public:
     // lens: `scene.lens.Lens` with the coefficients of the intrinsics.
     PythonLens(nb::object lens, const Making& from)
-        : lens_(std::move(lens)),
-          phi_(from.intrinsics[0]),
-          aspect_(from.intrinsics[1]),
-          unit_(from.unit),
-          coefficients_(from.intrinsics.count - 4) {}
+        : Lens(from), lens_(std::move(lens)), coefficients_(from.intrinsics.count - 4) {}
 
     bool distort(int n, const Rays& rays, Image& image) override {
         const nb::gil_scoped_acquire lock;
@@ -43,11 +39,10 @@ class PythonLens final : public Lens {
         const nb::gil_scoped_acquire lock;
         const Found found = ask("slopes_by_number", 1 + coefficients_, nb::make_tuple(unit_));
         for (int k = 0; k <= coefficients_; ++k) {
-            const int row = k == 0 ? 0 : 3 + k;
-            rows.shown[row] = true;
+            double* row = rows.show(k == 0 ? 0 : 3 + k);
             for (int i = 0; i < count_; ++i) {
                 const double* own = found.data() + 2 * (1 + coefficients_) * i + k;
-                rows.x(row)[i] = own[0], rows.y(row)[i] = aspect_ * own[1 + coefficients_];
+                row[i] = own[0], row[rows.n + i] = aspect_ * own[1 + coefficients_];
             }
         }
     }
@@ -67,7 +62,6 @@ class PythonLens final : public Lens {
     }
 
     nb::object lens_;
-    double phi_, aspect_, unit_;
     int coefficients_, count_ = 0;
     double rays_[3 * CHUNK];
 };

@@ -5,18 +5,13 @@
 #include <cmath>
 #include <vector>
 
-#include "growing.hpp"
 #include "lens.hpp"
 
 namespace ceres_cal {
 
 class Radial final : public Lens {
   public:
-    explicit Radial(const Making& from)
-        : powers_(from.form.values, from.form.values + from.form.count),
-          unit_(from.unit),
-          phi_(from.intrinsics[0]),
-          aspect_(from.intrinsics[1]) {
+    explicit Radial(const Making& from) : Lens(from), powers_(from.form.values, from.form.values + from.form.count) {
         for (const double power : powers_)
             if (!(power >= 2.0 && power <= MOST)) throw std::invalid_argument("radial: powers are 2 to 64");
         dense_.assign(powers_.empty() ? 1 : static_cast<size_t>(*std::max_element(powers_.begin(), powers_.end())),
@@ -60,8 +55,7 @@ class Radial final : public Lens {
         each(n, [&](int i) { x[i] = u_[i] * per_slope_[i], y[i] = aspect_ * v_[i] * per_slope_[i]; });
         for (size_t k = 0; k < powers_.size(); ++k) {
             const int row = 4 + static_cast<int>(k), power = static_cast<int>(powers_[k]);
-            x = rows.x(row), y = rows.y(row);
-            rows.shown[row] = true;
+            x = rows.show(row), y = rows.y(row);
             each(n, [&](int i) {
                 double d = -unit_ * per_slope_[i] / m_[i];
                 for (int j = 0; j < power; ++j) d *= s_[i];
@@ -95,7 +89,7 @@ class Radial final : public Lens {
     }
 
     std::vector<double> powers_, dense_;
-    double unit_, phi_, aspect_, limit_ = 0.0;
+    double limit_ = 0.0;
     Lane u_, v_, m_, ideal_, s_, value_, slope_, per_slope_;
 };
 

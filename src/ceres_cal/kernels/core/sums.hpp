@@ -22,8 +22,9 @@ inline double along(const double* by_camera, const double* pose, const double* d
 
 class Sums {
   public:
-    Sums(const Optics& optics, const Unknowns& unknowns)
+    Sums(const Optics& optics, const Unknowns& unknowns, const Observed& seen)
         : unknowns_(unknowns),
+          seen_(seen),
           shown_(optics),
           products_(static_cast<size_t>(unknowns.size() + 3) * static_cast<size_t>(unknowns.size() + 3)) {
         own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
@@ -33,35 +34,27 @@ class Sums {
     // `normal`, of the unknowns' size squared.
     //
     // newton: whether A takes rho'' along, for a step, or rho' alone, as the weight that each observation has.
-    double normal_equations(int64_t sight, const double* pose, const Points& points, const Curves& curves,
-                            const Loss& loss, bool newton, double* normal) {
+    double normal_equations(int64_t sight, const double* pose, bool newton, double* normal) {
         std::fill_n(normal, static_cast<size_t>(unknowns_.size()) * unknowns_.size(), 0.0);
-        return with_loss(loss.code, [&](auto code) {
-            const Task task{pose, loss, newton, normal};
-            double cost = 0.0;
-            const auto add_all = [&](const auto& seen) {
-                all_chunks(seen, sight, [&](int64_t start, int n) {
-                    cost += add<decltype(code)::value>(start, n, task, seen);
+        pose_ = pose, newton_ = newton, normal_ = normal;
+        double cost = 0.0;
+        with_loss(seen_.loss.code, [&](auto code) {
+            const auto add_all = [&](const auto& columns) {
+                return all_chunks(columns, sight, [&](int64_t start, int n) {
+                    cost += add<decltype(code)::value>(start, n, columns);
                     return true;
                 });
             };
-            add_all(points), add_all(curves);
-            return cost;
+            add_all(seen_.points), add_all(seen_.curves);
         });
+        return cost;
     }
 
   private:
-    struct Task {
-        const double* pose;
-        const Loss& loss;
-        bool newton;
-        double* normal;
-    };
-
     template <LossCode code, class Columns>
-    double add(int64_t start, int n, const Task& task, const Columns& seen) {
+    double add(int64_t start, int n, const Columns& seen) {
         constexpr int MANY = Columns::RESIDUALS;
-        if (!shown_.show(start, n, task.pose, seen)) return NO_ANSWER;
+        if (!shown_.show(start, n, pose_, seen)) return NO_ANSWER;
         choose_rows();
         const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
         for (int i = 0; i < filled; ++i) weight_[i] = i < n ? seen.weights[start + i] : 0.0;
@@ -69,7 +62,7 @@ class Sums {
         each(filled, [&](int i) {
             const double w = weight_[i], ex = w * (MANY == 2 ? shown_.off_x[i] : shown_.distance(i));
             const double ey = MANY == 2 ? w * shown_.off_y[i] : 0.0, squared = ex * ex + ey * ey;
-            const Robust one = robust<code>(task.loss.scale, squared);
+            const Robust one = robust<code>(seen_.loss.scale, squared);
             const double root = std::sqrt(one.slope), factor = root * w;
             cost += one.rho, squared_[i] = squared;
             factor_[i] = MANY == 2 ? factor : factor * shown_.normal_x[i];
@@ -84,12 +77,12 @@ class Sums {
             else
                 each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
         }
-        if (task.newton) bend_rows<code>(n, MANY, task.loss);
-        add_products(MANY * filled, task.normal);
+        if (newton_) bend_rows<code>(n, MANY);
+        add_products(MANY * filled);
         for (int i = 0; i < n && seen.slots != nullptr; ++i) {
             double directions[BUILT][3] = {};
             shown_.directions(seen, start + i, i, directions);
-            add_structure<Columns>(i, seen.slots + Columns::MOVED * seen.moved(start + i), directions, task);
+            add_structure<Columns>(i, seen.slots + Columns::MOVED * seen.moved(start + i), directions);
         }
         return cost;
     }
@@ -109,7 +102,7 @@ class Sums {
 
     // normal += P P^T over the rows' first n places, lower triangle; four rows by three, to read each one less. (Of
     // more sums at once than the processor has registers for each takes longer.)
-    void add_products(int n, double* normal) {
+    void add_products(int n) {
         const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(), stride = size + 3,
                   end = n & ~(LANES - 1);
         for (int k = 0; k < count; k += 4) {
@@ -126,28 +119,26 @@ class Sums {
                     dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
                 }
                 const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
-                double* first = products_.data() + stride * k + j;
-                for (int row = 0; row < 4; ++row)
-                    for (int column = 0; column < 3; ++column) first[stride * row + column] = sums[row][column];
+                for (int row = 0; row < 4; ++row) std::copy_n(sums[row], 3, products_.data() + stride * (k + row) + j);
             }
         }
         for (int k = 0; k < count; ++k) {
-            double* own = normal + size * places_[k];
+            double* own = normal_ + size * places_[k];
             for (int j = 0; j <= k; ++j) own[places_[j]] += products_[stride * k + j];
         }
     }
 
     // Take the second derivative of rho into the rows: Newton's step on the loss, its gradient unchanged.
     template <LossCode code>
-    void bend_rows(int n, int components, const Loss& loss) {
+    void bend_rows(int n, int components) {
         constexpr double FLAT = 0.7, MOSTLY_FLAT = 0.5;  // a bend; share beyond which it says nothing of the minimum
         if constexpr (code != LossCode::huber && code != LossCode::soft_l1) return;
         const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
         int flat = 0;
-        for (int i = 0; i < n; ++i) flat += bend(loss, squared_[i]) < FLAT;
+        for (int i = 0; i < n; ++i) flat += bend(seen_.loss, squared_[i]) < FLAT;
         if (flat > MOSTLY_FLAT * n) return;
         for (int i = 0; i < n; ++i) {
-            const double left = bend(loss, squared_[i]);
+            const double left = bend(seen_.loss, squared_[i]);
             if (left == 1.0) continue;
             double length2 = 0.0;
             for (int c = 0; c < components; ++c) length2 += own_[last][c * filled + i] * own_[last][c * filled + i];
@@ -163,7 +154,7 @@ class Sums {
 
     // The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
     template <class Columns>
-    void add_structure(int i, const int32_t* slots, const double (&directions)[BUILT][3], const Task& task) {
+    void add_structure(int i, const int32_t* slots, const double (&directions)[BUILT][3]) {
         const int filled = shown_.rows.n, count = static_cast<int>(own_.size()), size = unknowns_.size();
         for (int c = 0; c < Columns::RESIDUALS; ++c) {
             const auto row = [&](int k) { return own_[k][c * filled + i]; };
@@ -172,10 +163,10 @@ class Sums {
             for (int a = 0; a < Columns::MOVED; ++a) {
                 if (slots[a] < 0) continue;
                 const auto add = [&](int place, int other, double value) {
-                    task.normal[size * std::max(place, other) + std::min(place, other)] += column[a] * value;
+                    normal_[size * std::max(place, other) + std::min(place, other)] += column[a] * value;
                 };
                 const int place = unknowns_.count + slots[a];
-                column[a] = along(by_place, task.pose, directions[a]);
+                column[a] = along(by_place, pose_, directions[a]);
                 for (int k = 0; k < count; ++k) add(place, places_[k], row(k));
                 for (int b = 0; b <= a; ++b)
                     if (slots[b] >= 0) add(place, unknowns_.count + slots[b], column[b]);
@@ -184,6 +175,10 @@ class Sums {
     }
 
     const Unknowns unknowns_;
+    const Observed& seen_;
+    const double* pose_ = nullptr;
+    bool newton_ = false;
+    double* normal_ = nullptr;
     Projection shown_;
     Lane weight_, squared_;
     alignas(64) double factor_[2 * CHUNK];
