@@ -28,7 +28,6 @@ from ceres_cal.kernels.calls import (
     point_residuals,
     point_rows,
     sight_normals,
-    usual_by_radius,
 )
 
 __all__ = [
@@ -57,5 +56,4 @@ __all__ = [
     "point_residuals",
     "point_rows",
     "sight_normals",
-    "usual_by_radius",
 ]

@@ -59,13 +59,6 @@ def alignment_errors(bounds: Indices, x: Array, p: Array, h12: Array, h3: Array,
     core().alignment_errors(bounds, x, p, h12, h3, profile, errors)
 
 
-def usual_by_radius(errors: Array, radius: Array, usual: Array) -> None:
-    """The median error at each point's distance from the centre, to `usual` (N,): profiles fit worst where lenses bend
-    most.
-    """
-    core().usual_by_radius(errors, radius, usual)
-
-
 def plane_homographies(
     bounds: Indices, plane: Array, offsets: Array, profile: Array, unit: float, wrong: float, homographies: Array,
     errors: Array,

@@ -77,28 +77,6 @@ inline void alignment_errors(const Aligned& seen, const double* h, const double*
     }
 }
 
-// The median error at each point's distance from the centre: profiles fit worst where lenses bend most.
-inline void usual_by_radius(int64_t n, const double* errors, const double* radius, double* usual) {
-    if (n == 0) return;
-    const int64_t rings = std::min<int64_t>(std::max<int64_t>(n / 200, 1), 16);    // with few points in a ring its
-    const double farthest = std::max(*std::max_element(radius, radius + n), 0.0);  // outliers would be the usual there
-    std::vector<int64_t> ring(static_cast<size_t>(n));
-    std::vector<double> inside;
-    for (int64_t i = 0; i < n; ++i) {
-        const double place = radius[i] * static_cast<double>(rings) / (farthest + 1e-300);
-        ring[i] = place < static_cast<double>(rings) ? static_cast<int64_t>(std::max(0.0, place)) : rings - 1;
-    }
-    for (int64_t number = 0; number < rings; ++number) {
-        inside.clear();
-        for (int64_t i = 0; i < n; ++i)
-            if (ring[i] == number) inside.push_back(errors[i]);
-        if (inside.empty()) continue;
-        const double middle = std::max(median(inside), 1e-12);
-        for (int64_t i = 0; i < n; ++i)
-            if (ring[i] == number) usual[i] = middle;
-    }
-}
-
 // Mean of (v - mean)(v - mean)^T over values (n, size), to scatter, (size, size).
 inline void scatter_of(int64_t n, int size, const double* values, double* scatter) {
     std::vector<double> mean(static_cast<size_t>(size)), off(mean.size());

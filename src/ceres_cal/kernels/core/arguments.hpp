@@ -86,15 +86,12 @@ struct OpticsGiven {
         intrinsics.assign(own.data(), own.data() + own.size());
     }
 
-    Optics make() const {
-        const int count = whole(intrinsics.size());
-        const Making from{{form.data(), whole(form.size())}, {intrinsics.data(), count - 1}, unit};
-        std::unique_ptr<Lens> made = make_lens(kind, from);
-        if (!made) {
-            nb::ndarray<nb::numpy, const double, nb::ndim<1>> own(intrinsics.data() + 4, {intrinsics.size() - 5});
-            made = std::make_unique<PythonLens>(lens.attr("with_scaled")(own.cast(nb::rv_policy::copy), unit), from);
-        }
-        return {std::move(made), intrinsics.data(), count};
+    std::unique_ptr<Lens> make() const {
+        const int count = whole(intrinsics.size()) - 1;
+        const Making from{{form.data(), whole(form.size())}, {intrinsics.data(), count}, intrinsics.back(), unit};
+        if (std::unique_ptr<Lens> made = make_lens(kind, from)) return made;
+        nb::ndarray<nb::numpy, const double, nb::ndim<1>> own(intrinsics.data() + 4, {intrinsics.size() - 5});
+        return std::make_unique<PythonLens>(lens.attr("with_scaled")(own.cast(nb::rv_policy::copy), unit), from);
     }
 };
 

@@ -45,11 +45,11 @@ inline void copy_columns(int size, const double* upper, int first, int count, co
 
 // What Ceres asks of the block of the first sight; false where an observation cannot be projected. jacobians: of
 // camera, station, placement and structure, null where one is held.
-inline bool evaluate_block(const Optics& optics, const Unknowns& unknowns, const Observed& seen, const double* station,
+inline bool evaluate_block(Lens& lens, const Unknowns& unknowns, const Observed& seen, const double* station,
                            const double* placement, double* residuals, double* const* jacobians) {
     const int size = unknowns.size(), last = size - 1;
     const Chain chain(station, placement);
-    Sums sums(optics, unknowns, seen);
+    Sums sums(lens, unknowns, seen);
     std::vector<double> normal(static_cast<size_t>(size) * size), upper(normal.size());
     double missing = 0.0;
     for (const bool newton : {true, false}) {

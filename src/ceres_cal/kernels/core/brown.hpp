@@ -30,7 +30,7 @@ class Brown final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double phi = phi_, p1 = p1_, p2 = p2_, k1 = k_[1], k2 = k_[2], k3 = k_[3], k4 = q_[1], k5 = q_[2],
+        const double phi = this->phi, p1 = p1_, p2 = p2_, k1 = k_[1], k2 = k_[2], k3 = k_[3], k4 = q_[1], k5 = q_[2],
                      k6 = q_[3], s1 = s_[0], s2 = s_[1], s3 = s_[2], s4 = s_[3], limit2 = limit_ * limit_;
         int bad = 0;
         each(n, [&](int i) {
@@ -55,7 +55,7 @@ class Brown final : public Lens {
     }
 
     void differentiate(const Rows& rows) override {
-        const double phi = phi_, aspect = aspect_;
+        const double phi = this->phi, aspect = this->aspect;
         const int n = rows.n;
         double *x[5], *y[5];
         for (int k = 0; k < 5; ++k) x[k] = rows.show(4 + k), y[k] = rows.y(4 + k);

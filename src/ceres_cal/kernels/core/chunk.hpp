@@ -7,10 +7,8 @@
 #define CERES_CAL_INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
 #elif defined(__GNUC__)
 #define CERES_CAL_INDEPENDENT _Pragma("GCC ivdep")
-#elif defined(_MSC_VER)
-#define CERES_CAL_INDEPENDENT __pragma(loop(ivdep))
 #else
-#define CERES_CAL_INDEPENDENT
+#define CERES_CAL_INDEPENDENT __pragma(loop(ivdep))
 #endif
 
 namespace ceres_cal {

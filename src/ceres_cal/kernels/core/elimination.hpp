@@ -17,8 +17,8 @@ struct Sweep {
 
 class Elimination {
   public:
-    Elimination(const Optics& optics, const Unknowns& unknowns, const Observed& seen, bool newton)
-        : sums_(optics, unknowns, seen),
+    Elimination(Lens& lens, const Unknowns& unknowns, const Observed& seen, bool newton)
+        : sums_(lens, unknowns, seen),
           newton_(newton),
           count_(unknowns.shared()),
           size_(unknowns.size()),

@@ -17,7 +17,7 @@ class KannalaBrandt final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double phi = phi_, k1 = k_[0], k2 = k_[1], k3 = k_[2], k4 = k_[3];
+        const double phi = this->phi, k1 = k_[0], k2 = k_[1], k3 = k_[2], k4 = k_[3];
         each(n, [&](int i) { across_[i] = std::sqrt(rays.x[i] * rays.x[i] + rays.y[i] * rays.y[i]) + TINY; });
         for (int i = 0; i < n; ++i) angle_[i] = std::atan2(across_[i], rays.z[i]);
         int bad = 0;
@@ -39,7 +39,7 @@ class KannalaBrandt final : public Lens {
     }
 
     void differentiate(const Rows& rows) override {
-        const double phi = phi_, aspect = aspect_;
+        const double phi = this->phi, aspect = this->aspect;
         double *x[4], *y[4];
         for (int k = 0; k < 4; ++k) x[k] = rows.show(4 + k), y[k] = rows.y(4 + k);
         each(rows.n, [&](int i) {
@@ -73,7 +73,7 @@ class KannalaBrandt final : public Lens {
     }
 
     void add_tangential(int n, const Rays& rays, Image& image) {
-        const double phi = phi_, p1 = p1_, p2 = p2_;
+        const double phi = this->phi, p1 = p1_, p2 = p2_;
         each(n, [&](int i) {
             const double x = rays.x[i], y = rays.y[i], z = rays.z[i], across = across_[i];
             const double across2 = x * x + y * y, range2 = across2 + z * z;

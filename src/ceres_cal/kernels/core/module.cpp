@@ -67,12 +67,6 @@ void normalised_planes(const Bounds& bounds, const Read<N, 2>& plane, const Fill
     });
 }
 
-void find_usual_by_radius(const Read<N>& errors, const Read<N>& radius, const Filled<N>& usual) {
-    const size_t rows = errors.size();
-    require(radius.size() == rows && usual.size() == rows, "errors, radius and usual are (N,)");
-    unlocked([&] { usual_by_radius(static_cast<int64_t>(rows), errors.data(), radius.data(), usual.data()); });
-}
-
 void plane_homographies(const Bounds& bounds, const Read<N, 2>& plane, const Read<N, 2>& offsets,
                         const Read<N>& profile, double unit, double wrong, const Filled<N, 3, 3>& homographies,
                         const Filled<N>& errors) {
@@ -127,9 +121,9 @@ bool block(Tuple optics, Tuple unknowns, Tuple points, Tuple curves, Tuple loss,
         return kept[k].data();
     };
     double* const blocks[4] = {filled(0, own.count), filled(1, 6), filled(2, 6), filled(3, own.structure)};
-    const Optics made = seen.optics.make();
+    const std::unique_ptr<Lens> made = seen.optics.make();
     return unlocked([&] {
-        return evaluate_block(made, own, seen.observed, station.data(), placement.data(), residuals.data(), blocks);
+        return evaluate_block(*made, own, seen.observed, station.data(), placement.data(), residuals.data(), blocks);
     });
 }
 
@@ -146,9 +140,9 @@ void eliminate_placements(int64_t first, int64_t last, Tuple optics, Tuple unkno
     require(change.size() == shared && gains.shape(2) == shared && reduced.shape(0) == shared + 1 &&
                 reduced.shape(1) == shared + 1,
             "change is (K,) of the shared numbers, gains (S, 6, K), reduced (K + 1, K + 1)");
-    const Optics made = seen.optics.make();
+    const std::unique_ptr<Lens> made = seen.optics.make();
     unlocked([&] {
-        Elimination elimination(made, seen.unknowns, seen.observed, newton);
+        Elimination elimination(*made, seen.unknowns, seen.observed, newton);
         const Sweep filled{poses.data(), gains.data(), costs.data(), reduced.data()};
         for (int64_t v = first; v < last; ++v) elimination.eliminate(v, tolerance, change.data(), filled);
     });
@@ -164,9 +158,9 @@ void sight_normals(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tu
     require(poses.shape(0) >= static_cast<size_t>(last), "there are fewer poses");
     require(units.size() == size && normals.shape(1) == size && normals.shape(2) == size,
             "units are (K,), normals (S, K, K)");
-    const Optics made = seen.optics.make();
+    const std::unique_ptr<Lens> made = seen.optics.make();
     unlocked([&] {
-        Sums sums(made, seen.unknowns, seen.observed);
+        Sums sums(*made, seen.unknowns, seen.observed);
         for (int64_t v = first; v < last; ++v) {
             double* normal = row(normals, v - first);
             costs.data()[v - first] = sums.normal_equations(v, row(poses, v), newton, normal);
@@ -182,9 +176,9 @@ void sight_normals(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tu
 template <class OfSight>
 bool each_sight(int64_t first, int64_t last, const OpticsGiven& optics, const Poses& poses, OfSight of_sight) {
     require(poses.shape(0) >= static_cast<size_t>(last), "there are fewer poses");
-    const Optics made = optics.make();
+    const std::unique_ptr<Lens> made = optics.make();
     return unlocked([&] {
-        Projection shown(made);
+        Projection shown(*made);
         bool good = true;
         for (int64_t v = first; v < last; ++v) good &= of_sight(v, shown, row(poses, v));
         return good;
@@ -240,7 +234,6 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("align_sights", &align_sights);
     m.def("alignment_errors", &find_alignment_errors);
     m.def("normalised_planes", &normalised_planes);
-    m.def("usual_by_radius", &find_usual_by_radius);
     m.def("plane_homographies", &plane_homographies);
     m.def("grouped_scatter", &grouped_scatter);
     m.def("cholesky", &factor);

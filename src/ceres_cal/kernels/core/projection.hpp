@@ -7,21 +7,21 @@
 #include <cmath>
 #include <memory>
 
+#include "lens.hpp"
 #include "observations.hpp"
-#include "optics.hpp"
 
 namespace ceres_cal {
 
 class Projection {
   public:
-    explicit Projection(const Optics& optics)
-        : optics(optics),
-          pose_row(optics.count),
-          last_row(optics.count + 6),
+    explicit Projection(Lens& lens)
+        : lens(lens),
+          pose_row(lens.count),
+          last_row(lens.count + 6),
           buffer_(new double[2 * static_cast<size_t>(CHUNK) * (last_row + 1)]),
           shown_(new bool[last_row + 1]) {}
 
-    const Optics& optics;
+    Lens& lens;
     const int pose_row, last_row;  // after the intrinsics' rows the pose's six, then one for the residual
 
     Rows rows;
@@ -39,10 +39,10 @@ class Projection {
             x_[i] = place[0], y_[i] = place[1], z_[i] = place[2];
         }
         to_camera(pose);
-        const bool good = optics.distort(rows.n, rays_, image);
+        const bool good = lens.project(rows.n, rays_, image);
         each(rows.n, [&](int i) {
-            off_x[i] = optics.cx + image.x[i] - pixel_x_[i];
-            off_y[i] = optics.cy + optics.aspect * image.y[i] - pixel_y_[i];
+            off_x[i] = lens.cx + image.x[i] - pixel_x_[i];
+            off_y[i] = lens.cy + lens.aspect * image.y[i] - pixel_y_[i];
         });
         return good;
     }
@@ -57,7 +57,7 @@ class Projection {
         for (int step = 0; step < FOOT_STEPS; ++step) {
             place_on_tracks();
             to_camera(pose);
-            if (!optics.distort(rows.n, rays_, image)) return false;
+            if (!lens.project(rows.n, rays_, image)) return false;
             if (find_steps(pose, step > 0) < FOOT_TOLERANCE_PX) break;
             each(rows.n, [&](int i) { s_[i] += step_[i]; });
         }
@@ -76,7 +76,7 @@ class Projection {
     // The rows: derivatives of the chunk's pixels by the intrinsics (but not where the pose alone is free) and the
     // pose.
     void differentiate(bool alone) {
-        if (!alone) optics.differentiate(image, rows);
+        if (!alone) lens.fill(image, rows);
         const int n = rows.n;
         double* own[6];
         for (int k = 0; k < 6; ++k) own[k] = rows.x(pose_row + k);
@@ -89,7 +89,7 @@ class Projection {
             });
         };
         component(1.0, image.xx, image.xy, image.xz, 0);
-        component(optics.aspect, image.yx, image.yy, image.yz, n);
+        component(lens.aspect, image.yx, image.yy, image.yz, n);
     }
 
     // Where the foot of observation k, the chunk's i, goes: rows (x, y, z) for each structure number of its track. To
@@ -161,7 +161,7 @@ class Projection {
 
     // Where each foot goes next; the answer is how far the farthest goes, px.
     double find_steps(const double* pose, bool again) {
-        const double aspect = optics.aspect, cx = optics.cx, cy = optics.cy;
+        const double aspect = lens.aspect, cx = lens.cx, cy = lens.cy;
         double worst = 0.0;
         each(rows.n, [&](int i) {
             const double tx = tangent_x[i], ty = tangent_y[i], tz = tangent_z[i];

@@ -28,7 +28,7 @@ class Radial final : public Lens {
             const double iz = 1.0 / rays.z[i], u = rays.x[i] * iz, v = rays.y[i] * iz;
             const double m = std::sqrt(u * u + v * v) + TINY;
             u_[i] = u, v_[i] = v, m_[i] = m;
-            ideal_[i] = phi_ * m / unit_;
+            ideal_[i] = phi * m / unit;
             s_[i] = std::min(ideal_[i], limit_);
         });
         double worst = 1.0;
@@ -37,8 +37,8 @@ class Radial final : public Lens {
         each(n, [&](int i) {
             const double u = u_[i], v = v_[i], m = m_[i], s = s_[i], z = rays.z[i], iz = 1.0 / z;
             const double per_slope = 1.0 / slope_[i];
-            const double stretch = unit_ * s / m;  // px per unit of the ideal point
-            const double bend = (phi_ * per_slope - stretch) / (m * m);
+            const double stretch = unit * s / m;  // px per unit of the ideal point
+            const double bend = (phi * per_slope - stretch) / (m * m);
             const double xx = (stretch + bend * u * u) * iz, xy = bend * u * v * iz, yy = (stretch + bend * v * v) * iz;
             per_slope_[i] = per_slope;
             image.x[i] = stretch * u, image.y[i] = stretch * v;
@@ -52,14 +52,14 @@ class Radial final : public Lens {
     void differentiate(const Rows& rows) override {
         const int n = rows.n;
         double *x = rows.x(0), *y = rows.y(0);
-        each(n, [&](int i) { x[i] = u_[i] * per_slope_[i], y[i] = aspect_ * v_[i] * per_slope_[i]; });
+        each(n, [&](int i) { x[i] = u_[i] * per_slope_[i], y[i] = aspect * v_[i] * per_slope_[i]; });
         for (size_t k = 0; k < powers_.size(); ++k) {
             const int row = 4 + static_cast<int>(k), power = static_cast<int>(powers_[k]);
             x = rows.show(row), y = rows.y(row);
             each(n, [&](int i) {
-                double d = -unit_ * per_slope_[i] / m_[i];
+                double d = -unit * per_slope_[i] / m_[i];
                 for (int j = 0; j < power; ++j) d *= s_[i];
-                x[i] = d * u_[i], y[i] = aspect_ * d * v_[i];
+                x[i] = d * u_[i], y[i] = aspect * d * v_[i];
             });
         }
     }

@@ -43,7 +43,7 @@ class Spline final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double scale = 2.0 * phi_ / (unit_ * rim_), per_scale = 1.0 / scale, unit = unit_, rim = rim_;
+        const double scale = 2.0 * phi / (unit * rim_), per_scale = 1.0 / scale, unit = this->unit, rim = rim_;
         each(n, [&](int i) {
             const double x = rays.x[i], y = rays.y[i], z = rays.z[i], length = std::sqrt(x * x + y * y + z * z);
             const double s = scale / (length + z), u = s * x, v = s * y;
@@ -81,7 +81,7 @@ class Spline final : public Lens {
     }
 
     void differentiate(const Rows& rows) override {
-        const double unit = unit_, aspect = aspect_, rim = rim_, per_phi = 1.0 / phi_;
+        const double unit = this->unit, aspect = this->aspect, rim = rim_, per_phi = 1.0 / phi;
         const int n = rows.n;
         double *x = rows.x(0), *y = rows.y(0), *rim_x = rows.show(4), *rim_y = rows.y(4);
         each(n, [&](int i) {
@@ -166,9 +166,9 @@ class Spline final : public Lens {
             double *p = rows.show(conrady_ + 2 * k), *q = rows.show(conrady_ + 2 * k + 1);
             each(n, [&](int i) {
                 const double u = u_[i], v = v_[i], x = u * u - v * v, y = 2.0 * u * v, s = u * u + v * v;
-                const double size = unit_ / 3.0 * (k > 0 ? s : 1.0) * (k > 1 ? s : 1.0);
-                p[i] = size * (2.0 * s + x), p[n + i] = aspect_ * size * y;
-                q[i] = size * y, q[n + i] = aspect_ * size * (2.0 * s - x);
+                const double size = unit / 3.0 * (k > 0 ? s : 1.0) * (k > 1 ? s : 1.0);
+                p[i] = size * (2.0 * s + x), p[n + i] = aspect * size * y;
+                q[i] = size * y, q[n + i] = aspect * size * (2.0 * s - x);
             });
         }
     }

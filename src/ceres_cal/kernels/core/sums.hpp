@@ -22,10 +22,10 @@ inline double along(const double* by_camera, const double* pose, const double* d
 
 class Sums {
   public:
-    Sums(const Optics& optics, const Unknowns& unknowns, const Observed& seen)
+    Sums(Lens& lens, const Unknowns& unknowns, const Observed& seen)
         : unknowns_(unknowns),
           seen_(seen),
-          shown_(optics),
+          shown_(lens),
           products_(static_cast<size_t>(unknowns.size() + 3) * static_cast<size_t>(unknowns.size() + 3)) {
         own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
     }
