@@ -73,13 +73,6 @@ def plane_homographies(
     core().plane_homographies(bounds, plane, offsets, profile, unit, wrong, homographies, errors)
 
 
-def grouped_scatter(values: Array, bounds: Indices, scatter: Array) -> None:
-    """Mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] for every group g, to `scatter`, (groups, k,
-    k).
-    """
-    core().grouped_scatter(values, bounds, scatter)
-
-
 # ---- residuals and their derivatives --------------------------------------------------------------------------------
 
 

@@ -77,17 +77,4 @@ inline void alignment_errors(const Aligned& seen, const double* h, const double*
     }
 }
 
-// Mean of (v - mean)(v - mean)^T over values (n, size), to scatter, (size, size).
-inline void scatter_of(int64_t n, int size, const double* values, double* scatter) {
-    std::vector<double> mean(static_cast<size_t>(size)), off(mean.size());
-    std::fill_n(scatter, mean.size() * mean.size(), 0.0);
-    for (int64_t k = 0; k < n; ++k)
-        for (int i = 0; i < size; ++i) mean[i] += values[size * k + i] / static_cast<double>(n);
-    for (int64_t k = 0; k < n; ++k) {
-        for (int i = 0; i < size; ++i) off[i] = values[size * k + i] - mean[i];
-        add_product(size, 1.0 / static_cast<double>(n), off.data(), scatter);
-    }
-    mirror(size, scatter);
-}
-
 }  // namespace ceres_cal

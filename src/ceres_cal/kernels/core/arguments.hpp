@@ -8,9 +8,12 @@
 #include <string>
 
 #include "block.hpp"
+#include "brown.hpp"
 #include "elimination.hpp"
-#include "lenses.hpp"
+#include "kannala_brandt.hpp"
 #include "python_lens.hpp"
+#include "radial.hpp"
+#include "spline.hpp"
 
 namespace ceres_cal {
 
@@ -68,7 +71,7 @@ auto* row(const Of& array, int64_t number) {
     return array.data() + number * array.stride(0);
 }
 
-// The optics of a camera, and what they need to live.
+// The optics of a camera: the lenses that are compiled, or one that Python has alone.
 struct OpticsGiven {
     nb::object lens;
     std::string kind;
@@ -89,7 +92,10 @@ struct OpticsGiven {
     std::unique_ptr<Lens> make() const {
         const int count = whole(intrinsics.size()) - 1;
         const Making from{{form.data(), whole(form.size())}, {intrinsics.data(), count}, intrinsics.back(), unit};
-        if (std::unique_ptr<Lens> made = make_lens(kind, from)) return made;
+        if (kind == "radial") return std::make_unique<Radial>(from);
+        if (kind == "brown") return std::make_unique<Brown>(from);
+        if (kind == "kannala-brandt") return std::make_unique<KannalaBrandt>(from);
+        if (kind == "spline") return std::make_unique<Spline>(from);
         nb::ndarray<nb::numpy, const double, nb::ndim<1>> own(intrinsics.data() + 4, {intrinsics.size() - 5});
         return std::make_unique<PythonLens>(lens.attr("with_scaled")(own.cast(nb::rv_policy::copy), unit), from);
     }

@@ -22,8 +22,6 @@ struct alignas(64) Lane {
     double operator[](int i) const { return value[i]; }
 };
 
-inline int filled_up(int n) { return (n + LANES - 1) / LANES * LANES; }
-
 // body(i) for i from 0 to n, a multiple of LANES; no i has to do with another one.
 template <class Body>
 inline void each(int n, Body body) {

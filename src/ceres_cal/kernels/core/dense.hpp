@@ -39,13 +39,6 @@ inline void add_product(int size, double weight, const double* row, double* norm
         for (int j = 0; j <= k; ++j) normal[static_cast<size_t>(size) * k + j] += weight * row[k] * row[j];
 }
 
-// The upper triangle from the lower.
-inline void mirror(int size, double* normal) {
-    for (int k = 0; k < size; ++k)
-        for (int j = 0; j < k; ++j)
-            normal[static_cast<size_t>(size) * j + k] = normal[static_cast<size_t>(size) * k + j];
-}
-
 // x <- (U^T U)^-1 x by forward and back substitution; U of full rank.
 inline void substitute(int size, const double* upper, double* x) {
     for (int k = 0; k < size; ++k) {

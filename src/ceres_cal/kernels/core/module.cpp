@@ -78,14 +78,6 @@ void plane_homographies(const Bounds& bounds, const Read<N, 2>& plane, const Rea
     });
 }
 
-void grouped_scatter(const Read<N, N>& values, const Bounds& bounds, const Filled<N, N, N>& scatter) {
-    const size_t size = values.shape(1);
-    require(scatter.shape(1) == size && scatter.shape(2) == size, "scatter is (G, K, K)");
-    each_group(bounds, values.shape(0), scatter.shape(0), [&](int64_t g, int64_t start, int64_t n) {
-        scatter_of(n, whole(size), row(values, start), row(scatter, g));
-    });
-}
-
 void factor(const Read<N, N>& normal, const Filled<N, N>& upper) {
     const size_t size = normal.shape(0);
     require(normal.shape(1) == size && upper.shape(0) == size && upper.shape(1) == size, "normal and upper are (K, K)");
@@ -165,9 +157,9 @@ void sight_normals(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tu
             double* normal = row(normals, v - first);
             costs.data()[v - first] = sums.normal_equations(v, row(poses, v), newton, normal);
             for (size_t i = 0; i < size; ++i) {
-                for (size_t j = 0; j <= i; ++j) normal[size * i + j] *= units.data()[i] * units.data()[j];
+                for (size_t j = 0; j <= i; ++j)
+                    normal[size * j + i] = normal[size * i + j] *= units.data()[i] * units.data()[j];
             }
-            mirror(whole(size), normal);
         }
     });
 }
@@ -235,7 +227,6 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("alignment_errors", &find_alignment_errors);
     m.def("normalised_planes", &normalised_planes);
     m.def("plane_homographies", &plane_homographies);
-    m.def("grouped_scatter", &grouped_scatter);
     m.def("cholesky", &factor);
     m.def("loss_weights", &loss_weights);
     m.def("evaluate_block", &block);

@@ -4,7 +4,6 @@
 #include <cstdint>
 #include <vector>
 
-#include "chunk.hpp"
 #include "dense.hpp"
 
 namespace ceres_cal {

@@ -26,8 +26,6 @@ class Projection {
 
     Rows rows;
     Image image;
-    // The image of the point, or of the foot, less the pixel, px.
-    Lane off_x, off_y;
     // Of curves: tangents dC/ds in the frame of the target, and the image normal.
     Lane tangent_x, tangent_y, tangent_z, normal_x, normal_y;
 
@@ -39,12 +37,7 @@ class Projection {
             x_[i] = place[0], y_[i] = place[1], z_[i] = place[2];
         }
         to_camera(pose);
-        const bool good = lens.project(rows.n, rays_, image);
-        each(rows.n, [&](int i) {
-            off_x[i] = lens.cx + image.x[i] - pixel_x_[i];
-            off_y[i] = lens.cy + lens.aspect * image.y[i] - pixel_y_[i];
-        });
-        return good;
+        return lens.project(rows.n, rays_, image);
     }
 
     // The feet of the perpendiculars from n pixels, tau . (project(C(s)) - p) = 0 (design, section 5), to curves.feet.
@@ -69,9 +62,13 @@ class Projection {
         return true;
     }
 
+    // The image of the point, or of the foot, less the pixel, px.
+    double off_x(int i) const { return lens.cx + image.x[i] - pixel_x_[i]; }
+    double off_y(int i) const { return lens.cy + lens.aspect * image.y[i] - pixel_y_[i]; }
+
     // The signed distance along the normal. By the envelope theorem its derivative is that of the projected foot with s
     // held, along the normal.
-    double distance(int i) const { return normal_x[i] * off_x[i] + normal_y[i] * off_y[i]; }
+    double distance(int i) const { return normal_x[i] * off_x(i) + normal_y[i] * off_y(i); }
 
     // The rows: derivatives of the chunk's pixels by the intrinsics (but not where the pose alone is free) and the
     // pose.
@@ -117,7 +114,7 @@ class Projection {
     static constexpr double FOOT_TOLERANCE_PX = 1e-9;
 
     void fill(int64_t start, int n, const double* pixels) {
-        rows = {buffer_.get(), shown_.get(), filled_up(n)};
+        rows = {buffer_.get(), shown_.get(), (n + LANES - 1) / LANES * LANES};
         for (int i = 0; i < rows.n; ++i) {
             const double* pixel = pixels + 2 * (start + std::min(i, n - 1));
             pixel_x_[i] = pixel[0], pixel_y_[i] = pixel[1];
@@ -161,7 +158,7 @@ class Projection {
 
     // Where each foot goes next; the answer is how far the farthest goes, px.
     double find_steps(const double* pose, bool again) {
-        const double aspect = lens.aspect, cx = lens.cx, cy = lens.cy;
+        const double aspect = lens.aspect;
         double worst = 0.0;
         each(rows.n, [&](int i) {
             const double tx = tangent_x[i], ty = tangent_y[i], tz = tangent_z[i];
@@ -169,13 +166,12 @@ class Projection {
                          z = pose[8] * tx + pose[9] * ty + pose[10] * tz;
             const double to_x = image.xx[i] * x + image.xy[i] * y + image.xz[i] * z;
             const double to_y = aspect * (image.yx[i] * x + image.yy[i] * y + image.yz[i] * z);
-            const double dx = cx + image.x[i] - pixel_x_[i], dy = cy + aspect * image.y[i] - pixel_y_[i];
-            const double along = to_x * dx + to_y * dy, size = to_x * to_x + to_y * to_y;
+            const double along = to_x * off_x(i) + to_y * off_y(i), size = to_x * to_x + to_y * to_y;
             const double went = s_[i] - s_before_[i], secant = (along - along_before_[i]) / went;
             const double bounded = std::max(0.25 * size, std::min(secant, 4.0 * size));
             const double slope = again && went != 0.0 ? bounded : size;
             const double step = std::max(-0.5, std::min(-along / slope, 0.5));
-            tau_x_[i] = to_x, tau_y_[i] = to_y, off_x[i] = dx, off_y[i] = dy, length2_[i] = size;
+            tau_x_[i] = to_x, tau_y_[i] = to_y, length2_[i] = size;
             s_before_[i] = s_[i], along_before_[i] = along, step_[i] = step;
             worst = std::max(worst, std::abs(step) * std::sqrt(size));
         });

@@ -16,8 +16,8 @@ inline bool residuals_of(int64_t sight, Projection& shown, const double* pose, c
         if (!shown.show(start, n, pose, seen)) return false;
         for (int i = 0; i < n; ++i) {
             double* own = place(start + i);
-            own[0] = MANY == 2 ? shown.off_x[i] : shown.distance(i);
-            if (MANY == 2) own[1] = shown.off_y[i];
+            own[0] = MANY == 2 ? shown.off_x(i) : shown.distance(i);
+            if (MANY == 2) own[1] = shown.off_y(i);
         }
         return true;
     };

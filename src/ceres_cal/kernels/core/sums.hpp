@@ -60,8 +60,8 @@ class Sums {
         for (int i = 0; i < filled; ++i) weight_[i] = i < n ? seen.weights[start + i] : 0.0;
         double *error = own_[last], cost = 0.0;
         each(filled, [&](int i) {
-            const double w = weight_[i], ex = w * (MANY == 2 ? shown_.off_x[i] : shown_.distance(i));
-            const double ey = MANY == 2 ? w * shown_.off_y[i] : 0.0, squared = ex * ex + ey * ey;
+            const double w = weight_[i], ex = w * (MANY == 2 ? shown_.off_x(i) : shown_.distance(i));
+            const double ey = MANY == 2 ? w * shown_.off_y(i) : 0.0, squared = ex * ex + ey * ey;
             const Robust one = robust<code>(seen_.loss.scale, squared);
             const double root = std::sqrt(one.slope), factor = root * w;
             cost += one.rho, squared_[i] = squared;
