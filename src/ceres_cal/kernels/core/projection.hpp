@@ -18,7 +18,7 @@ class Projection {
         : lens(lens),
           pose_row(lens.count),
           last_row(lens.count + 6),
-          buffer_(new double[2 * static_cast<size_t>(CHUNK) * (last_row + 1)]),
+          buffer_(new Lane[2 * (static_cast<size_t>(last_row) + 1)]),
           shown_(new bool[last_row + 1]) {}
 
     Lens& lens;
@@ -114,7 +114,7 @@ class Projection {
     static constexpr double FOOT_TOLERANCE_PX = 1e-9;
 
     void fill(int64_t start, int n, const double* pixels) {
-        rows = {buffer_.get(), shown_.get(), (n + LANES - 1) / LANES * LANES};
+        rows = {buffer_[0].value, shown_.get(), (n + LANES - 1) / LANES * LANES};
         for (int i = 0; i < rows.n; ++i) {
             const double* pixel = pixels + 2 * (start + std::min(i, n - 1));
             pixel_x_[i] = pixel[0], pixel_y_[i] = pixel[1];
@@ -178,7 +178,7 @@ class Projection {
         return worst;
     }
 
-    std::unique_ptr<double[]> buffer_;
+    std::unique_ptr<Lane[]> buffer_;  // aligned as they are
     std::unique_ptr<bool[]> shown_;
     Rays rays_;
     Lane x_, y_, z_, turned_x_, turned_y_, turned_z_;
