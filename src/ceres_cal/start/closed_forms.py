@@ -215,7 +215,7 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
 
 
 def _rings(radius: Array) -> tuple[Indices, Indices]:
-    """Points (N,) by rings around the centre, and how many there are in each: profiles fit worst where lenses bend most."""
+    """Points (N,) by rings around the centre, and how many are in each: profiles fit worst where lenses bend most."""
     rings = min(max(len(radius) // 200, 1), 16)  # with few points in a ring its outliers would be the usual there
     ring = np.minimum(radius * rings / (np.max(radius, initial=0.0) + 1e-300), rings - 1).astype(np.int16)
     return np.argsort(ring, kind="stable"), np.bincount(ring, minlength=rings)

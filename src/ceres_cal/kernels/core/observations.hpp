@@ -42,7 +42,7 @@ inline bool all_chunks(const Columns& seen, int64_t sight, OfChunk of_chunk) {
     return good;
 }
 
-enum class LossCode : int { trivial, huber, soft_l1, cauchy, tukey };
+enum class LossCode : uint8_t { trivial, huber, soft_l1, cauchy, tukey };
 
 struct Loss {
     LossCode code;
