@@ -169,7 +169,7 @@ def test_what_needs_no_solve_loads_no_compiled_kernel(tmp_path: Path) -> None:
     assert done.returncode == 0 and done.stderr.splitlines()[-1] == "", done.stderr
 
 
-WHEEL_MB, INSTALL_MB = 2.0, 520.0
+WHEEL_MB = 2.0
 _OURS = ("PYTHONPATH", "XDG_CACHE_HOME")
 BARE = {name: value for name, value in os.environ.items() if name not in _OURS}
 

@@ -425,8 +425,9 @@ def uncompressed(
     e = residuals(np.zeros(count + 12))
     pairs, alone = e[: 2 * len(seen[0].places)].reshape(-1, 2), e[2 * len(seen[0].places) :]
     lengths = np.concatenate([np.linalg.norm(pairs, axis=1), np.abs(alone)])
-    rho, weighted, s = np.array([loss_of(loss, scale, length) for length in lengths]).T
-    slope = weighted / s
+    rho = np.array([loss_of(loss, scale, length)[0] for length in lengths])
+    s, slope = lengths**2, np.empty(len(lengths))
+    kernels.loss_weights(Loss(kernels.LOSS_CODES[loss], scale), s, slope)
     row = np.concatenate([np.repeat(np.arange(len(pairs)), 2), len(pairs) + np.arange(len(alone))])
     weights = slope[row]
     along = np.zeros((len(lengths), count + 12))

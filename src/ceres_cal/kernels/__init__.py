@@ -21,14 +21,12 @@ from ceres_cal.kernels.calls import (
     curve_rows,
     eliminate_placements,
     evaluate_block,
-    grouped_scatter,
     loss_weights,
     normalised_planes,
     plane_homographies,
     point_residuals,
     point_rows,
     sight_normals,
-    usual_by_radius,
 )
 
 __all__ = [
@@ -50,12 +48,10 @@ __all__ = [
     "curve_rows",
     "eliminate_placements",
     "evaluate_block",
-    "grouped_scatter",
     "loss_weights",
     "normalised_planes",
     "plane_homographies",
     "point_residuals",
     "point_rows",
     "sight_normals",
-    "usual_by_radius",
 ]

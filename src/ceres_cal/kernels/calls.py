@@ -17,6 +17,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 
+IN_ORDER, NO_NORMALS = np.empty(0, dtype=np.int64), np.empty((0, 2))
+
 
 @cache
 def core() -> Any:
@@ -57,13 +59,6 @@ def alignment_errors(bounds: Indices, x: Array, p: Array, h12: Array, h3: Array,
     core().alignment_errors(bounds, x, p, h12, h3, profile, errors)
 
 
-def usual_by_radius(errors: Array, radius: Array, usual: Array) -> None:
-    """The median error at each point's distance from the centre, to `usual` (N,): profiles fit worst where lenses bend
-    most.
-    """
-    core().usual_by_radius(errors, radius, usual)
-
-
 def plane_homographies(
     bounds: Indices, plane: Array, offsets: Array, profile: Array, unit: float, wrong: float, homographies: Array,
     errors: Array,
@@ -76,13 +71,6 @@ def plane_homographies(
         wrong: of the median error, how much more than it no clean point has.
     """
     core().plane_homographies(bounds, plane, offsets, profile, unit, wrong, homographies, errors)
-
-
-def grouped_scatter(values: Array, bounds: Indices, scatter: Array) -> None:
-    """Mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] for every group g, to `scatter`, (groups, k,
-    k).
-    """
-    core().grouped_scatter(values, bounds, scatter)
 
 
 # ---- residuals and their derivatives --------------------------------------------------------------------------------
@@ -99,7 +87,7 @@ def point_residuals(
 
 def curve_residuals(optics: Optics, poses: Array, curves: CurveColumns, residuals: Array) -> None:
     """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
-    core().curve_residuals(optics, poses, curves, residuals)
+    core().curve_residuals(0, len(poses), optics, poses, curves, IN_ORDER, residuals[:, None])
 
 
 def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) -> None:
@@ -109,7 +97,7 @@ def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
     """
-    core().point_rows(optics, poses, points, rows)
+    core().point_rows(optics, poses, points, rows, NO_NORMALS)
 
 
 def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, normals: Array) -> bool:
@@ -121,7 +109,7 @@ def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, 
         See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
             lies at the pixel plus the signed distance along it.
     """
-    return bool(core().curve_rows(optics, poses, curves, rows, normals))
+    return bool(core().curve_rows(optics, poses, curves, rows[:, None], normals))
 
 
 def loss_weights(loss: Loss, squared: Array, weights: Array) -> None:

@@ -18,7 +18,7 @@ from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
-from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies, usual_by_radius
+from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies
 
 _POINT_NS = 100.0  # that a point's share of a homography takes
 # Medians of the errors: no clean residual is that long, nine standard deviations. Nothing changes at half of it.
@@ -193,24 +193,32 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
     Rounds of reweighting keep wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
     """
     p = data.offsets / unit_px
-    radius = np.linalg.norm(p, axis=1)
     sights = len(data.bounds) - 1
     x, lifts = np.empty((2, len(p))), np.empty((sights, 3))
     normalised_planes(data.bounds, data.plane, x, lifts)
     h12, shares, errors = np.empty((sights, 6)), np.empty((sights, 3, terms + 1)), np.empty(len(p))
     usual, weights = np.empty(len(p)), np.ones(len(p))
+    order, counts = _rings(np.linalg.norm(p, axis=1))
     for _ in range(rounds):
         reduced = np.zeros((terms + 1, terms + 1))
         align_sights(data.bounds, x, p, weights, h12, shares, reduced)
         c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
         h3 = shares[:, :, terms] - shares[:, :, :terms] @ c
         alignment_errors(data.bounds, x, p, h12, h3, np.asarray(c, dtype=float), errors)
-        usual_by_radius(errors, radius, usual)
+        parts = np.split(errors[order], np.cumsum(counts)[:-1])
+        usual[order] = np.repeat([max(median(part), 1e-12) for part in parts], counts)
         weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
     homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
     return RadialAlignment(
         RadialProfile(tuple(float(v) for v in c), unit_px), homographies, errors * unit_px, errors / usual
     )
+
+
+def _rings(radius: Array) -> tuple[Indices, Indices]:
+    """Points (N,) by rings around the centre, and how many are in each: profiles fit worst where lenses bend most."""
+    rings = min(max(len(radius) // 200, 1), 16)  # with few points in a ring its outliers would be the usual there
+    ring = np.minimum(radius * rings / (np.max(radius, initial=0.0) + 1e-300), rings - 1).astype(np.int16)
+    return np.argsort(ring, kind="stable"), np.bincount(ring, minlength=rings)
 
 
 def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Array, Array]:

@@ -14,7 +14,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.native import kept_signals
-from ceres_cal.kernels import grouped_scatter
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.start.closed_forms import (
     PlaneData,
@@ -158,16 +157,17 @@ def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile
 
 
 def _scatter(values: Array, bounds: Indices) -> Array:
-    """See `kernels.grouped_scatter`."""
-    scatter = np.empty((len(bounds) - 1, values.shape[1], values.shape[1]))
-    grouped_scatter(values, bounds, scatter)
-    return scatter
+    """(k, k, groups) mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] (N, k); no group is empty."""
+    first, counts = bounds[:-1], np.diff(bounds)
+    columns = np.ascontiguousarray(values.T)  # column by column: ten times as fast as row by row
+    off = [column - np.repeat(np.add.reduceat(column, first) / counts, counts) for column in columns]
+    return np.array([[np.add.reduceat(one * other, first) / counts for other in off] for one in off])
 
 
 def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: RadialProfile) -> Homographies:
     """The homographies of sights of points that send the plane to more than a point or a line."""
     matrices = _homographies_of_boards(board, data, profile)
-    sizes = np.sqrt(np.trace(_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
+    sizes = np.sqrt(np.trace(_scatter(data.offsets, data.bounds)))
     heights = board.points[board.point_bounds[:-1], 2]
     b = matrices[:, :, :2]
     m = np.swapaxes(b, 1, 2) @ b
@@ -181,8 +181,8 @@ def _flat_sights_of_points(sights: Sights) -> tuple[Indices, Sights]:
     candidates = np.flatnonzero(few)
     board = sights.take(candidates)
     scatter = _scatter(board.points, board.point_bounds)
-    xx, xy, yy = scatter[:, 0, 0], scatter[:, 0, 1], scatter[:, 1, 1]
-    flat = np.flatnonzero((scatter[:, 2, 2] < 1e-18) & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2))
+    xx, xy, yy = scatter[0, 0], scatter[0, 1], scatter[1, 1]
+    flat = np.flatnonzero((scatter[2, 2] < 1e-18) & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2))
     return candidates[flat], board.take(flat)
 
 

@@ -18,8 +18,7 @@ inline void align(const Aligned& seen, double* h) {
     for (int64_t i = 0; i < seen.n; ++i) {
         const double a = seen.p[2 * i], b = seen.p[2 * i + 1], x = seen.x[i], y = seen.y[i];
         const double row[6] = {-b * x, -b * y, -b, a * x, a * y, a};
-        for (int k = 0; k < 6; ++k)
-            for (int j = 0; j <= k; ++j) normal[6 * k + j] += seen.weights[i] * row[k] * row[j];
+        add_product(6, seen.weights[i], row, normal);
     }
     for (int k = 0; k < 6; ++k) h[k] = 1.0 + 0.1 * k;
     least_direction<6>(normal, h);
@@ -42,8 +41,7 @@ inline void add_depths(const Aligned& seen, const double* h, int columns, double
         row[0] = r * seen.x[i], row[1] = r * seen.y[i], row[2] = r, row[size - 1] = q;
         double power = -q;
         for (int k = 3; k < size - 1; ++k) power *= r * r, row[k] = power;
-        for (int k = 0; k < size; ++k)
-            for (int j = 0; j <= k; ++j) products[size * k + j] += seen.weights[i] * row[k] * row[j];
+        add_product(size, seen.weights[i], row.data(), products.data());
     }
     const double trace = products[0] + products[size + 1] + products[2 * (size + 1)];
     for (int k = 0; k < 3; ++k) products[(size + 1) * k] += 1e-12 * trace;
@@ -77,46 +75,6 @@ inline void alignment_errors(const Aligned& seen, const double* h, const double*
         const double along = r - q * (1.0 + w) / (std::abs(depth) > 1e-9 ? depth : 1e-9);
         errors[i] = std::sqrt(across * across + along * along);
     }
-}
-
-// The median error at each point's distance from the centre: profiles fit worst where lenses bend most.
-inline void usual_by_radius(int64_t n, const double* errors, const double* radius, double* usual) {
-    if (n == 0) return;
-    const int64_t rings = std::min<int64_t>(std::max<int64_t>(n / 200, 1), 16);    // with few points in a ring its
-    const double farthest = std::max(*std::max_element(radius, radius + n), 0.0);  // outliers would be the usual there
-    std::vector<int64_t> ring(static_cast<size_t>(n));
-    std::vector<double> inside;
-    for (int64_t i = 0; i < n; ++i) {
-        const double place = radius[i] * static_cast<double>(rings) / (farthest + 1e-300);
-        ring[i] = place < static_cast<double>(rings) ? static_cast<int64_t>(std::max(0.0, place)) : rings - 1;
-    }
-    for (int64_t number = 0; number < rings; ++number) {
-        inside.clear();
-        for (int64_t i = 0; i < n; ++i)
-            if (ring[i] == number) inside.push_back(errors[i]);
-        if (inside.empty()) continue;
-        const double middle = std::max(median(inside), 1e-12);
-        for (int64_t i = 0; i < n; ++i)
-            if (ring[i] == number) usual[i] = middle;
-    }
-}
-
-// Mean of (v - mean)(v - mean)^T over values (n, size), to scatter, (size, size).
-inline void scatter_of(int64_t n, int64_t size, const double* values, double* scatter) {
-    std::vector<double> mean(static_cast<size_t>(size));
-    std::fill_n(scatter, static_cast<size_t>(size * size), 0.0);
-    for (int64_t k = 0; k < n; ++k)
-        for (int64_t i = 0; i < size; ++i) mean[i] += values[size * k + i];
-    for (double& one : mean) one /= static_cast<double>(n);
-    for (int64_t k = 0; k < n; ++k)
-        for (int64_t i = 0; i < size; ++i)
-            for (int64_t j = 0; j <= i; ++j)
-                scatter[size * i + j] += (values[size * k + i] - mean[i]) * (values[size * k + j] - mean[j]);
-    for (int64_t i = 0; i < size; ++i)
-        for (int64_t j = 0; j <= i; ++j) {
-            scatter[size * i + j] /= static_cast<double>(n);
-            scatter[size * j + i] = scatter[size * i + j];
-        }
 }
 
 }  // namespace ceres_cal

@@ -17,66 +17,43 @@ struct Chain {
 
     // With R = R_s R_p and t = R_s t_p + t_s: dw = dw_s + R_s dw_p, dt = dw_s x (R_s t_p) + dt_s + R_s dt_p.
     Chain(const double* station, const double* placement) {
-        double first[9], second[9], left[9], turned[3];
+        double first[9], second[9], left[9], turned[3], across[9];
         rotation(station, first), rotation(placement, second);
-        for (int j = 0; j < 3; ++j) {
-            for (int k = 0; k < 3; ++k)
-                pose[4 * j + k] =
-                    first[3 * j] * second[k] + first[3 * j + 1] * second[3 + k] + first[3 * j + 2] * second[6 + k];
-            turned[j] = first[3 * j] * placement[3] + first[3 * j + 1] * placement[4] + first[3 * j + 2] * placement[5];
-            pose[4 * j + 3] = turned[j] + station[3 + j];
-        }
+        multiply(3, 3, 3, first, 3, second, 3, pose, 4);
+        multiply(3, 3, 1, first, 3, placement + 3, 1, turned, 1);
+        turn(turned, 0.0, 0.0, -1.0, across);
         left_jacobian(station, left);
+        multiply(3, 3, 3, across, 3, left, 3, to_station + 18, 6);
         for (int k = 0; k < 3; ++k) {
-            const double x = left[k], y = left[3 + k], z = left[6 + k];
-            to_station[k] = x, to_station[6 + k] = y, to_station[12 + k] = z;
-            to_station[18 + k] = y * turned[2] - z * turned[1];
-            to_station[24 + k] = z * turned[0] - x * turned[2];
-            to_station[30 + k] = x * turned[1] - y * turned[0];
-            to_station[21 + 7 * k] = 1.0;
+            pose[4 * k + 3] = turned[k] + station[3 + k];
+            std::copy_n(left + 3 * k, 3, to_station + 6 * k), to_station[21 + 7 * k] = 1.0;
+            std::copy_n(first + 3 * k, 3, to_placement + 21 + 6 * k);
         }
         left_jacobian(placement, left);
-        for (int j = 0; j < 3; ++j)
-            for (int k = 0; k < 3; ++k) {
-                to_placement[6 * j + k] =
-                    first[3 * j] * left[k] + first[3 * j + 1] * left[3 + k] + first[3 * j + 2] * left[6 + k];
-                to_placement[21 + 6 * j + k] = first[3 * j + k];
-            }
+        multiply(3, 3, 3, first, 3, left, 3, to_placement, 6);
     }
 };
 
-// Columns of U from `first` on as the row-major Jacobian of one block; nothing where the block is held.
-inline void copy_plain(int size, const double* upper, int first, int count, double* jacobian) {
+// Columns of U from `first` on, times the chain rule where there is one, as the row-major Jacobian of one block;
+// nothing where the block is held.
+inline void copy_columns(int size, const double* upper, int first, int count, const double* chain, double* jacobian) {
     if (jacobian == nullptr) return;
     std::fill_n(jacobian, static_cast<size_t>(size) * count, 0.0);
+    if (chain != nullptr) return multiply(size - 1, 6, 6, upper + first, size, chain, 6, jacobian, 6);
     for (int row = 0; row < size - 1; ++row) std::copy_n(upper + size * row + first, count, jacobian + count * row);
 }
 
-// U's pose columns times the chain rule, as the row-major Jacobian of one 6-vector block.
-inline void copy_chained(int size, const double* upper, int first, const double* chain, double* jacobian) {
-    if (jacobian == nullptr) return;
-    std::fill_n(jacobian, static_cast<size_t>(size) * 6, 0.0);
-    for (int row = 0; row < size - 1; ++row)
-        for (int j = 0; j < 6; ++j)
-            for (int k = 0; k < 6; ++k) jacobian[6 * row + k] += upper[size * row + first + j] * chain[6 * j + k];
-}
-
-// One array for each of Ceres's parameter blocks of a sight, null where the block is held.
-struct Jacobians {
-    double *camera, *station, *placement, *structure;
-};
-
-// What Ceres asks of the block of the first sight; false where an observation cannot be projected.
-inline bool evaluate_block(const Optics& optics, const Unknowns& unknowns, const Points& points, const Curves& curves,
-                           const Loss& loss, const double* station, const double* placement, double* residuals,
-                           const Jacobians& jacobians) {
+// What Ceres asks of the block of the first sight; false where an observation cannot be projected. jacobians: of
+// camera, station, placement and structure, null where one is held.
+inline bool evaluate_block(Lens& lens, const Unknowns& unknowns, const Observed& seen, const double* station,
+                           const double* placement, double* residuals, double* const* jacobians) {
     const int size = unknowns.size(), last = size - 1;
     const Chain chain(station, placement);
-    Sums sums(optics, unknowns);
+    Sums sums(lens, unknowns, seen);
     std::vector<double> normal(static_cast<size_t>(size) * size), upper(normal.size());
     double missing = 0.0;
     for (const bool newton : {true, false}) {
-        const double cost = sums.normal_equations(0, chain.pose, points, curves, loss, newton, normal.data());
+        const double cost = sums.normal_equations(0, chain.pose, newton, normal.data());
         if (!std::isfinite(cost)) return false;
         cholesky(size, normal.data(), size, upper.data());
         missing = cost;
@@ -87,10 +64,10 @@ inline bool evaluate_block(const Optics& optics, const Unknowns& unknowns, const
         if (missing > -ROUNDING * cost) break;  // else Newton's step promises more than there is
     }
     residuals[last] = std::sqrt(std::max(missing, 0.0));
-    copy_plain(size, upper.data(), 0, unknowns.count, jacobians.camera);
-    copy_plain(size, upper.data(), unknowns.count, unknowns.structure, jacobians.structure);
-    copy_chained(size, upper.data(), unknowns.shared(), chain.to_station, jacobians.station);
-    copy_chained(size, upper.data(), unknowns.shared(), chain.to_placement, jacobians.placement);
+    copy_columns(size, upper.data(), 0, unknowns.count, nullptr, jacobians[0]);
+    copy_columns(size, upper.data(), unknowns.count, unknowns.structure, nullptr, jacobians[3]);
+    copy_columns(size, upper.data(), unknowns.shared(), 6, chain.to_station, jacobians[1]);
+    copy_columns(size, upper.data(), unknowns.shared(), 6, chain.to_placement, jacobians[2]);
     return true;
 }
 

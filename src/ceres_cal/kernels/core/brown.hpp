@@ -3,7 +3,6 @@
 
 #include <algorithm>
 
-#include "growing.hpp"
 #include "lens.hpp"
 
 namespace ceres_cal {
@@ -11,8 +10,7 @@ namespace ceres_cal {
 class Brown final : public Lens {
   public:
     explicit Brown(const Making& from)
-        : phi_(from.intrinsics[0]),
-          aspect_(from.intrinsics[1]),
+        : Lens(from),
           p1_(from.intrinsics[6]),
           p2_(from.intrinsics[7]),
           rational_(static_cast<int>(from.form[0])),
@@ -32,7 +30,7 @@ class Brown final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double phi = phi_, p1 = p1_, p2 = p2_, k1 = k_[1], k2 = k_[2], k3 = k_[3], k4 = q_[1], k5 = q_[2],
+        const double phi = this->phi, p1 = p1_, p2 = p2_, k1 = k_[1], k2 = k_[2], k3 = k_[3], k4 = q_[1], k5 = q_[2],
                      k6 = q_[3], s1 = s_[0], s2 = s_[1], s3 = s_[2], s4 = s_[3], limit2 = limit_ * limit_;
         int bad = 0;
         each(n, [&](int i) {
@@ -57,10 +55,10 @@ class Brown final : public Lens {
     }
 
     void differentiate(const Rows& rows) override {
-        const double phi = phi_, aspect = aspect_;
+        const double phi = this->phi, aspect = this->aspect;
         const int n = rows.n;
         double *x[5], *y[5];
-        for (int k = 0; k < 5; ++k) x[k] = rows.x(4 + k), y[k] = rows.y(4 + k), rows.shown[4 + k] = true;
+        for (int k = 0; k < 5; ++k) x[k] = rows.show(4 + k), y[k] = rows.y(4 + k);
         each(n, [&](int i) {
             const double u = u_[i], v = v_[i], r2 = r2_[i], a = below_[i] * phi * u, b = below_[i] * aspect * phi * v;
             const double r4 = r2 * r2, r6 = r4 * r2;
@@ -72,8 +70,7 @@ class Brown final : public Lens {
         });
         for (int k = 0; k < 3 && rational_ > 0; ++k) {
             const double* over = rows.x(k == 2 ? 8 : 4 + k);  // k1, k2 and k3 have the same powers over the line
-            double* own = rows.x(rational_ + k);
-            rows.shown[rational_ + k] = true;
+            double* own = rows.show(rational_ + k);
             each(n, [&](int i) { own[i] = -radial_[i] * over[i], own[n + i] = -radial_[i] * over[n + i]; });
         }
         for (int k = 0; k < 4 && prism_ > 0; ++k) {
@@ -87,7 +84,7 @@ class Brown final : public Lens {
   private:
     static constexpr double FAR = 6.0;  // ideal radii: nothing is observed farther out
 
-    double phi_, aspect_, p1_, p2_, k_[4] = {1.0}, q_[4] = {1.0}, s_[4] = {}, limit_ = 0.0;
+    double p1_, p2_, k_[4] = {1.0}, q_[4] = {1.0}, s_[4] = {}, limit_ = 0.0;
     int rational_, prism_;
     Lane u_, v_, r2_, below_, radial_;
 };

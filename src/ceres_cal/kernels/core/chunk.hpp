@@ -7,10 +7,8 @@
 #define CERES_CAL_INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
 #elif defined(__GNUC__)
 #define CERES_CAL_INDEPENDENT _Pragma("GCC ivdep")
-#elif defined(_MSC_VER)
-#define CERES_CAL_INDEPENDENT __pragma(loop(ivdep))
 #else
-#define CERES_CAL_INDEPENDENT
+#define CERES_CAL_INDEPENDENT __pragma(loop(ivdep))
 #endif
 
 namespace ceres_cal {
@@ -23,14 +21,6 @@ struct alignas(64) Lane {
     double& operator[](int i) { return value[i]; }
     double operator[](int i) const { return value[i]; }
 };
-
-inline int filled_up(int n) { return (n + LANES - 1) / LANES * LANES; }
-
-// How many observations the chunk from `start` has, so that all chunks up to `end` are about as long.
-inline int chunk_from(int64_t start, int64_t end) {
-    const int64_t left = end - start, chunks = (left + CHUNK - 1) / CHUNK;
-    return static_cast<int>((left + chunks - 1) / chunks);
-}
 
 // body(i) for i from 0 to n, a multiple of LANES; no i has to do with another one.
 template <class Body>
@@ -57,11 +47,12 @@ struct Rows {
     int n;
     double* x(int row) const { return base + 2 * static_cast<int64_t>(n) * row; }
     double* y(int row) const { return x(row) + n; }
+    // A row to be filled.
+    double* show(int row) const { return shown[row] = true, x(row); }
     // A row to be added to, 0 at first.
     void open(int row) const {
         if (shown[row]) return;
-        shown[row] = true;
-        double* own = x(row);
+        double* own = show(row);
         each(2 * n, [=](int i) { own[i] = 0.0; });
     }
 };

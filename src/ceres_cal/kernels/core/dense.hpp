@@ -33,6 +33,12 @@ inline void cholesky(int size, const double* normal, int stride, double* upper) 
     }
 }
 
+// normal += weight row row^T, lower triangle.
+inline void add_product(int size, double weight, const double* row, double* normal) {
+    for (int k = 0; k < size; ++k)
+        for (int j = 0; j <= k; ++j) normal[static_cast<size_t>(size) * k + j] += weight * row[k] * row[j];
+}
+
 // x <- (U^T U)^-1 x by forward and back substitution; U of full rank.
 inline void substitute(int size, const double* upper, double* x) {
     for (int k = 0; k < size; ++k) {
@@ -43,6 +49,17 @@ inline void substitute(int size, const double* upper, double* x) {
         for (int j = k + 1; j < size; ++j) x[k] -= upper[size * k + j] * x[j];
         x[k] /= upper[size * k + k];
     }
+}
+
+// out (rows, columns) = a (rows, inner) b (inner, columns), their rows so many numbers apart.
+inline void multiply(int rows, int inner, int columns, const double* a, int a_apart, const double* b, int b_apart,
+                     double* out, int out_apart) {
+    for (int j = 0; j < rows; ++j)
+        for (int k = 0; k < columns; ++k) {
+            double sum = 0.0;
+            for (int i = 0; i < inner; ++i) sum += a[a_apart * j + i] * b[b_apart * i + k];
+            out[out_apart * j + k] = sum;
+        }
 }
 
 // Squared angle of a rotation vector, sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3, also where a is tiny.

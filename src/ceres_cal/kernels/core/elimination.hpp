@@ -17,12 +17,8 @@ struct Sweep {
 
 class Elimination {
   public:
-    Elimination(const Optics& optics, const Unknowns& unknowns, const Points& points, const Curves& curves,
-                const Loss& loss, bool newton)
-        : sums_(optics, unknowns),
-          points_(points),
-          curves_(curves),
-          loss_(loss),
+    Elimination(Lens& lens, const Unknowns& unknowns, const Observed& seen, bool newton)
+        : sums_(lens, unknowns, seen),
           newton_(newton),
           count_(unknowns.shared()),
           size_(unknowns.size()),
@@ -41,7 +37,7 @@ class Elimination {
         move(kept, step, moved);
         double cost = INFINITY, promise = INFINITY, damping = 0.0;
         for (int trial = 0; trial < MOST_STEPS; ++trial) {
-            const double found = sums_.normal_equations(sight, moved, points_, curves_, loss_, newton_, trial_.data());
+            const double found = sums_.normal_equations(sight, moved, newton_, trial_.data());
             if (found <= cost) {
                 std::copy_n(moved, 12, pose), normal_.swap(trial_);
                 cost = found, damping *= 0.1;
@@ -79,12 +75,8 @@ class Elimination {
     static void move(const double* pose, const double* step, double* moved) {
         double turned[9];
         rotation(step, turned);
-        for (int j = 0; j < 3; ++j) {
-            for (int k = 0; k < 3; ++k)
-                moved[4 * j + k] =
-                    turned[3 * j] * pose[k] + turned[3 * j + 1] * pose[4 + k] + turned[3 * j + 2] * pose[8 + k];
-            moved[4 * j + 3] = pose[4 * j + 3] + step[3 + j];
-        }
+        multiply(3, 3, 3, turned, 3, pose, 4, moved, 4);
+        for (int j = 0; j < 3; ++j) moved[4 * j + 3] = pose[4 * j + 3] + step[3 + j];
     }
 
     // gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is. The
@@ -141,9 +133,6 @@ class Elimination {
     }
 
     Sums sums_;
-    const Points& points_;
-    const Curves& curves_;
-    const Loss& loss_;
     const bool newton_;
     const int count_, size_;
     std::vector<double> normal_, trial_, gain_;

@@ -1,4 +1,4 @@
-// What a lens does for the solve: a chunk of rays at a time.
+// What a lens does for the solve, as the camera's optics: a chunk of rays at a time.
 #pragma once
 
 #include <stdexcept>
@@ -18,10 +18,11 @@ struct Numbers {
     }
 };
 
-// What a lens is made from: `Lens.form` of Python, the intrinsics without the skew, and half the image diagonal, px.
+// What a lens is made from: `Lens.form` of Python; phi, aspect, cx, cy and the scaled coefficients; skew; and half the
+// image diagonal, px.
 struct Making {
     Numbers form, intrinsics;
-    double unit;
+    double skew, unit;
 };
 
 // Brown's decentring of a point (a, b): where it moves to, and the derivatives of that, which are symmetric.
@@ -34,13 +35,58 @@ struct Decentring {
     double yy(double a, double b) const { return 6.0 * p1 * b + 2.0 * p2 * a; }
 };
 
+// A lens under phi, aspect, principal point and skew.
 class Lens {
   public:
-    Lens() = default;
+    explicit Lens(const Making& from)
+        : count(from.intrinsics.count + 1),
+          phi(from.intrinsics[0]),
+          aspect(from.intrinsics[1]),
+          cx(from.intrinsics[2]),
+          cy(from.intrinsics[3]),
+          skew(from.skew),
+          unit(from.unit) {}
     Lens(const Lens&) = delete;
     Lens& operator=(const Lens&) = delete;
     virtual ~Lens() = default;
 
+    const int count;  // of the intrinsics, the skew last
+    const double phi, aspect, cx, cy, skew, unit;
+
+    // Of the first n rays; false where any has no answer. A skew of the pixels leans the lens's own image.
+    bool project(int n, const Rays& rays, Image& image) {
+        const bool good = distort(n, rays, image);
+        if (skew != 0.0)
+            each(n, [&](int i) {
+                image.x[i] += skew * image.y[i];
+                image.xx[i] += skew * image.yx[i];
+                image.xy[i] += skew * image.yy[i];
+                image.xz[i] += skew * image.yz[i];
+            });
+        return good;
+    }
+
+    // Derivatives of the pixels that were projected last by phi, aspect, principal point, coefficients and skew.
+    void fill(const Image& image, const Rows& rows) {
+        const int n = rows.n, last = count - 1;
+        for (int k = 0; k < count; ++k) rows.shown[k] = k < 4 || k == last;
+        double *by_phi = rows.x(0), *by_aspect = rows.x(1), *by_cx = rows.x(2), *by_cy = rows.x(3),
+               *by_skew = rows.x(last);
+        each(n, [&](int i) {
+            by_phi[i] = (image.x[i] - skew * image.y[i]) / phi, by_phi[n + i] = aspect * image.y[i] / phi;
+            by_aspect[i] = 0.0, by_aspect[n + i] = image.y[i];
+            by_cx[i] = 1.0, by_cx[n + i] = 0.0, by_cy[i] = 0.0, by_cy[n + i] = 1.0;
+            by_skew[i] = image.y[i], by_skew[n + i] = 0.0;
+        });
+        differentiate(rows);
+        for (int k = 0; k < last && skew != 0.0; ++k) {
+            if (!rows.shown[k] || (k >= 1 && k <= 3)) continue;
+            double* own = rows.x(k);
+            each(n, [&](int i) { own[i] += skew / aspect * own[n + i]; });
+        }
+    }
+
+  protected:
     // Fills the first n places of the image; false where any ray has no answer.
     virtual bool distort(int n, const Rays& rays, Image& image) = 0;
 
@@ -51,5 +97,27 @@ class Lens {
 };
 
 constexpr double TINY = 1e-150;  // its square is still a number
+
+// d/dx of x (d_0 + d_1 x + d_2 x^2 ...).
+inline double radial_slope(const double* dense, int count, double x) {
+    double total = 0.0;
+    for (int k = count - 1; k >= 0; --k) total = total * x + (k + 1) * dense[k];
+    return total;
+}
+
+// Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `far`, the end of what can be observed.
+inline double growing_until(const double* dense, int count, double far) {
+    constexpr int STEPS = 96, HALVINGS = 50;
+    const double step = far / STEPS;
+    int i = 1;
+    while (i <= STEPS && radial_slope(dense, count, i * step) > 0.0) ++i;
+    if (i > STEPS) return far;
+    double low = (i - 1) * step, high = i * step;
+    for (int half = 0; half < HALVINGS; ++half) {
+        const double middle = 0.5 * (low + high);
+        (radial_slope(dense, count, middle) > 0.0 ? low : high) = middle;
+    }
+    return low;
+}
 
 }  // namespace ceres_cal

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <type_traits>
 
-#include "chunk.hpp"
 #include "observations.hpp"
 
 namespace ceres_cal {

@@ -4,7 +4,6 @@
 #include <cstdint>
 #include <vector>
 
-#include "chunk.hpp"
 #include "dense.hpp"
 
 namespace ceres_cal {
@@ -94,6 +93,7 @@ class Homographies {
     // normal (9, 9), lower triangle: of q_w (h1 . X) - q_x (h3 . X) = 0 and q_w (h2 . X) - q_y (h3 . X) = 0.
     void add_moments(int64_t n, double* normal) const {
         constexpr int PLACES[5][2] = {{0, 0}, {3, 3}, {6, 0}, {6, 3}, {6, 6}};
+        constexpr int PRODUCTS[3][3] = {{0, 1, 3}, {1, 2, 4}, {3, 4, 5}};
         double sums[5][6] = {};
         const double *x = x_.data(), *y = y_.data(), *qa = a_.data(), *qb = b_.data(), *qc = c_.data();
         for (int64_t i = 0; i < n; ++i) {
@@ -106,11 +106,8 @@ class Homographies {
         std::copy_n(sums[1], 6, sums[0]);
         std::fill_n(normal, 81, 0.0);
         for (int f = 0; f < 5; ++f) {
-            const double xx = sums[f][0], xy = sums[f][1], yy = sums[f][2], own_x = sums[f][3], own_y = sums[f][4];
-            double *first = normal + 9 * PLACES[f][0] + PLACES[f][1], *second = first + 9, *third = first + 18;
-            first[0] = xx, first[1] = xy, first[2] = own_x;
-            second[0] = xy, second[1] = yy, second[2] = own_y;
-            third[0] = own_x, third[1] = own_y, third[2] = sums[f][5];
+            for (int j = 0; j < 3; ++j)
+                for (int k = 0; k < 3; ++k) normal[9 * (PLACES[f][0] + j) + PLACES[f][1] + k] = sums[f][PRODUCTS[j][k]];
         }
     }
 

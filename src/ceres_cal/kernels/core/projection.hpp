@@ -7,85 +7,119 @@
 #include <cmath>
 #include <memory>
 
+#include "lens.hpp"
 #include "observations.hpp"
-#include "optics.hpp"
 
 namespace ceres_cal {
 
 class Projection {
   public:
-    explicit Projection(const Optics& optics)
-        : optics(optics),
-          pose_row(optics.count),
-          last_row(optics.count + 6),
-          buffer_(new double[2 * static_cast<size_t>(CHUNK) * (last_row + 1)]),
+    explicit Projection(Lens& lens)
+        : lens(lens),
+          pose_row(lens.count),
+          last_row(lens.count + 6),
+          buffer_(new Lane[2 * (static_cast<size_t>(last_row) + 1)]),
           shown_(new bool[last_row + 1]) {}
 
-    const Optics& optics;
+    Lens& lens;
     const int pose_row, last_row;  // after the intrinsics' rows the pose's six, then one for the residual
 
     Rows rows;
     Image image;
-    // Of curves: tangents dC/ds in the frame of the target; tau, the tangent in the image, px; its squared length; the
-    // foot less the pixel, px.
-    Lane tangent_x, tangent_y, tangent_z, tau_x, tau_y, length2, off_x, off_y;
+    // Of curves: tangents dC/ds in the frame of the target, and the image normal.
+    Lane tangent_x, tangent_y, tangent_z, normal_x, normal_y;
 
     // The images of n points; false where any of them cannot be projected.
-    bool show_points(int64_t start, int n, const double* pose, const Points& points) {
-        fill(n);
+    bool show(int64_t start, int n, const double* pose, const Points& points) {
+        fill(start, n, points.pixels);
         for (int i = 0; i < rows.n; ++i) {
             const double* place = points.places + 3 * (start + std::min(i, n - 1));
             x_[i] = place[0], y_[i] = place[1], z_[i] = place[2];
         }
         to_camera(pose);
-        return optics.distort(rows.n, rays_, image);
+        return lens.project(rows.n, rays_, image);
     }
 
     // The feet of the perpendiculars from n pixels, tau . (project(C(s)) - p) = 0 (design, section 5), to curves.feet.
     //
     // Gauss-Newton steps whose slope is corrected by the secant, so that the curve's own bend is seen without second
     // derivatives. False, and nothing moved, where any curve cannot be projected.
-    bool show_feet(int64_t start, int n, const double* pose, const Curves& curves) {
-        fill(n);
+    bool show(int64_t start, int n, const double* pose, const Curves& curves) {
+        fill(start, n, curves.pixels);
         load_tracks(start, n, curves);
         for (int step = 0; step < FOOT_STEPS; ++step) {
             place_on_tracks();
             to_camera(pose);
-            if (!optics.distort(rows.n, rays_, image)) return false;
+            if (!lens.project(rows.n, rays_, image)) return false;
             if (find_steps(pose, step > 0) < FOOT_TOLERANCE_PX) break;
             each(rows.n, [&](int i) { s_[i] += step_[i]; });
         }
         std::copy_n(s_.value, n, curves.feet + start);
+        each(rows.n, [&](int i) {
+            const double length = std::sqrt(length2_[i]);
+            normal_x[i] = -tau_y_[i] / length, normal_y[i] = tau_x_[i] / length;
+        });
         return true;
     }
+
+    // The image of the point, or of the foot, less the pixel, px.
+    double off_x(int i) const { return lens.cx + image.x[i] - pixel_x_[i]; }
+    double off_y(int i) const { return lens.cy + lens.aspect * image.y[i] - pixel_y_[i]; }
+
+    // The signed distance along the normal. By the envelope theorem its derivative is that of the projected foot with s
+    // held, along the normal.
+    double distance(int i) const { return normal_x[i] * off_x(i) + normal_y[i] * off_y(i); }
 
     // The rows: derivatives of the chunk's pixels by the intrinsics (but not where the pose alone is free) and the
     // pose.
     void differentiate(bool alone) {
-        if (!alone) optics.differentiate(image, rows);
-        const double aspect = optics.aspect;
+        if (!alone) lens.fill(image, rows);
         const int n = rows.n;
         double* own[6];
         for (int k = 0; k < 6; ++k) own[k] = rows.x(pose_row + k);
-        each(n, [&](int i) {
-            const double dx = image.xx[i], dy = image.xy[i], dz = image.xz[i], x = turned_x_[i], y = turned_y_[i],
-                         z = turned_z_[i];
-            own[0][i] = dz * y - dy * z, own[1][i] = dx * z - dz * x, own[2][i] = dy * x - dx * y;
-            own[3][i] = dx, own[4][i] = dy, own[5][i] = dz;
-        });
-        each(n, [&](int i) {
-            const double dx = aspect * image.yx[i], dy = aspect * image.yy[i], dz = aspect * image.yz[i],
-                         x = turned_x_[i], y = turned_y_[i], z = turned_z_[i];
-            own[0][n + i] = dz * y - dy * z, own[1][n + i] = dx * z - dz * x, own[2][n + i] = dy * x - dx * y;
-            own[3][n + i] = dx, own[4][n + i] = dy, own[5][n + i] = dz;
-        });
+        const auto component = [&](double factor, const Lane& by_x, const Lane& by_y, const Lane& by_z, int to) {
+            each(n, [&](int i) {
+                const double dx = factor * by_x[i], dy = factor * by_y[i], dz = factor * by_z[i];
+                const double x = turned_x_[i], y = turned_y_[i], z = turned_z_[i];
+                own[0][to + i] = dz * y - dy * z, own[1][to + i] = dx * z - dz * x, own[2][to + i] = dy * x - dx * y;
+                own[3][to + i] = dx, own[4][to + i] = dy, own[5][to + i] = dz;
+            });
+        };
+        component(1.0, image.xx, image.xy, image.xz, 0);
+        component(lens.aspect, image.yx, image.yy, image.yz, n);
+    }
+
+    // Where the foot of observation k, the chunk's i, goes: rows (x, y, z) for each structure number of its track. To
+    // the left of a segment; with the centre and outwards on an arc.
+    void directions(const Curves& curves, int64_t k, int i, double (&rows)[BUILT][3]) const {
+        const int64_t track = curves.track[k];
+        const bool arc = curves.is_arc[track];
+        // The tangent's right side is outside; turned by a quarter it is the radius' own direction.
+        const double x = arc ? -tangent_x[i] : curves.tracks[9 * track + 3];
+        const double y = arc ? -tangent_y[i] : curves.tracks[9 * track + 4];
+        const double length = std::sqrt(x * x + y * y) + 1e-300;
+        double* left = rows[arc ? 2 : 0];
+        if (arc) rows[0][0] = rows[1][1] = 1.0;
+        left[0] = -y / length, left[1] = x / length;
+    }
+
+    // Where a point goes: along x and y, and along z as much as each part of its board's warp says.
+    void directions(const Points& points, int64_t k, int, double (&rows)[BUILT][3]) const {
+        rows[0][0] = rows[1][1] = 1.0;
+        for (int a = 2; a < BUILT; ++a) rows[a][2] = points.bends[(BUILT - 2) * k + a - 2];
     }
 
   private:
     static constexpr int FOOT_STEPS = 30;
     static constexpr double FOOT_TOLERANCE_PX = 1e-9;
 
-    void fill(int n) { rows = {buffer_.get(), shown_.get(), filled_up(n)}; }
+    void fill(int64_t start, int n, const double* pixels) {
+        rows = {buffer_[0].value, shown_.get(), (n + LANES - 1) / LANES * LANES};
+        for (int i = 0; i < rows.n; ++i) {
+            const double* pixel = pixels + 2 * (start + std::min(i, n - 1));
+            pixel_x_[i] = pixel[0], pixel_y_[i] = pixel[1];
+        }
+    }
 
     void to_camera(const double* pose) {
         each(rows.n, [&](int i) {
@@ -104,7 +138,6 @@ class Projection {
             is_arc_[i] = curves.is_arc[k];
             bends_ |= is_arc_[i];
             s_[i] = curves.feet[j];
-            pixel_x_[i] = curves.pixels[2 * j], pixel_y_[i] = curves.pixels[2 * j + 1];
         }
     }
 
@@ -125,7 +158,7 @@ class Projection {
 
     // Where each foot goes next; the answer is how far the farthest goes, px.
     double find_steps(const double* pose, bool again) {
-        const double aspect = optics.aspect, cx = optics.cx, cy = optics.cy;
+        const double aspect = lens.aspect;
         double worst = 0.0;
         each(rows.n, [&](int i) {
             const double tx = tangent_x[i], ty = tangent_y[i], tz = tangent_z[i];
@@ -133,48 +166,25 @@ class Projection {
                          z = pose[8] * tx + pose[9] * ty + pose[10] * tz;
             const double to_x = image.xx[i] * x + image.xy[i] * y + image.xz[i] * z;
             const double to_y = aspect * (image.yx[i] * x + image.yy[i] * y + image.yz[i] * z);
-            const double dx = cx + image.x[i] - pixel_x_[i], dy = cy + aspect * image.y[i] - pixel_y_[i];
-            const double along = to_x * dx + to_y * dy, size = to_x * to_x + to_y * to_y;
+            const double along = to_x * off_x(i) + to_y * off_y(i), size = to_x * to_x + to_y * to_y;
             const double went = s_[i] - s_before_[i], secant = (along - along_before_[i]) / went;
             const double bounded = std::max(0.25 * size, std::min(secant, 4.0 * size));
             const double slope = again && went != 0.0 ? bounded : size;
             const double step = std::max(-0.5, std::min(-along / slope, 0.5));
-            tau_x[i] = to_x, tau_y[i] = to_y, off_x[i] = dx, off_y[i] = dy, length2[i] = size;
+            tau_x_[i] = to_x, tau_y_[i] = to_y, length2_[i] = size;
             s_before_[i] = s_[i], along_before_[i] = along, step_[i] = step;
             worst = std::max(worst, std::abs(step) * std::sqrt(size));
         });
         return worst;
     }
 
-    std::unique_ptr<double[]> buffer_;
+    std::unique_ptr<Lane[]> buffer_;  // aligned as they are
     std::unique_ptr<bool[]> shown_;
     Rays rays_;
     Lane x_, y_, z_, turned_x_, turned_y_, turned_z_;
     Lane track_[9], pixel_x_, pixel_y_, s_, f_, g_, df_, dg_, s_before_, along_before_, step_;
+    Lane tau_x_, tau_y_, length2_;  // the tangent in the image, px
     bool is_arc_[CHUNK], bends_ = false;
 };
-
-// Where the foot on track k goes, rows (x, y, z) for each of its structure numbers: to the left of a segment; with the
-// centre and outwards on an arc.
-inline void curve_directions(const Curves& curves, int64_t k, double tangent_x, double tangent_y, double* directions) {
-    std::fill_n(directions, 3 * ON_TRACK, 0.0);
-    if (curves.is_arc[k]) {
-        // The tangent's right side is outside; turned by a quarter it is the radius' own direction.
-        const double length = std::sqrt(tangent_x * tangent_x + tangent_y * tangent_y);
-        directions[0] = 1.0, directions[4] = 1.0;
-        directions[6] = tangent_y / length, directions[7] = -tangent_x / length;
-    } else {
-        const double x = curves.tracks[9 * k + 3], y = curves.tracks[9 * k + 4];
-        const double length = std::sqrt(x * x + y * y) + 1e-300;
-        directions[0] = -y / length, directions[1] = x / length;
-    }
-}
-
-// Where a point goes: along x and y, and along z as much as each part of its board's warp says.
-inline void point_directions(const double* bends, double* directions) {
-    std::fill_n(directions, 3 * BUILT, 0.0);
-    directions[0] = 1.0, directions[4] = 1.0;
-    for (int k = 2; k < BUILT; ++k) directions[3 * k + 2] = bends[k - 2];
-}
 
 }  // namespace ceres_cal

@@ -17,17 +17,11 @@ class PythonLens final : public Lens {
   public:
     // lens: `scene.lens.Lens` with the coefficients of the intrinsics.
     PythonLens(nb::object lens, const Making& from)
-        : lens_(std::move(lens)),
-          phi_(from.intrinsics[0]),
-          aspect_(from.intrinsics[1]),
-          unit_(from.unit),
-          coefficients_(from.intrinsics.count - 4) {}
+        : Lens(from), lens_(std::move(lens)), coefficients_(from.intrinsics.count - 4) {}
 
     bool distort(int n, const Rays& rays, Image& image) override {
         const nb::gil_scoped_acquire lock;
-        count_ = n;
-        for (int i = 0; i < n; ++i)
-            rays_[3 * i] = rays.x[i], rays_[3 * i + 1] = rays.y[i], rays_[3 * i + 2] = rays.z[i];
+        count_ = n, rays_ = &rays;
         const Found found = ask("slopes_by_ray", 4, nb::make_tuple());
         bool good = true;
         for (int i = 0; i < n; ++i) {
@@ -41,13 +35,12 @@ class PythonLens final : public Lens {
 
     void differentiate(const Rows& rows) override {
         const nb::gil_scoped_acquire lock;
-        const Found found = ask("slopes_by_number", 1 + coefficients_, nb::make_tuple(unit_));
+        const Found found = ask("slopes_by_number", 1 + coefficients_, nb::make_tuple(unit));
         for (int k = 0; k <= coefficients_; ++k) {
-            const int row = k == 0 ? 0 : 3 + k;
-            rows.shown[row] = true;
+            double* row = rows.show(k == 0 ? 0 : 3 + k);
             for (int i = 0; i < count_; ++i) {
                 const double* own = found.data() + 2 * (1 + coefficients_) * i + k;
-                rows.x(row)[i] = own[0], rows.y(row)[i] = aspect_ * own[1 + coefficients_];
+                row[i] = own[0], row[rows.n + i] = aspect * own[1 + coefficients_];
             }
         }
     }
@@ -57,8 +50,9 @@ class PythonLens final : public Lens {
 
     // lens.method(rays, phi, *more), (n, 2, columns).
     Found ask(const char* method, int columns, const nb::tuple& more) const {
-        nb::ndarray<nb::numpy, const double, nb::ndim<2>> rays(rays_, {static_cast<size_t>(count_), 3});
-        const nb::object answer = lens_.attr(method)(rays.cast(nb::rv_policy::copy), phi_, *more);
+        nb::ndarray<nb::numpy, const double, nb::ndim<2>> rays(rays_, {static_cast<size_t>(count_), 3}, nb::handle(),
+                                                               {1, CHUNK});
+        const nb::object answer = lens_.attr(method)(rays.cast(nb::rv_policy::copy), phi, *more);
         Found found;
         if (!nb::try_cast(answer, found) || found.shape(0) != static_cast<size_t>(count_) ||
             found.shape(2) != static_cast<size_t>(columns))
@@ -67,9 +61,8 @@ class PythonLens final : public Lens {
     }
 
     nb::object lens_;
-    double phi_, aspect_, unit_;
     int coefficients_, count_ = 0;
-    double rays_[3 * CHUNK];
+    const Rays* rays_ = nullptr;
 };
 
 }  // namespace ceres_cal

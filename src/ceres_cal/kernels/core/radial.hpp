@@ -5,7 +5,6 @@
 #include <cmath>
 #include <vector>
 
-#include "growing.hpp"
 #include "lens.hpp"
 
 namespace ceres_cal {
@@ -13,11 +12,9 @@ namespace ceres_cal {
 class Radial final : public Lens {
   public:
     explicit Radial(const Making& from)
-        : powers_(from.form.values + 1, from.form.values + from.form.count),
-          tangential_(static_cast<int>(from.form[0])),
-          unit_(from.unit),
-          phi_(from.intrinsics[0]),
-          aspect_(from.intrinsics[1]) {
+        : Lens(from),
+          powers_(from.form.values + 1, from.form.values + from.form.count),
+          tangential_(static_cast<int>(from.form[0])) {
         for (const double power : powers_)
             if (!(power >= 2.0 && power <= MOST)) throw std::invalid_argument("radial: powers are 2 to 64");
         dense_.assign(powers_.empty() ? 1 : static_cast<size_t>(*std::max_element(powers_.begin(), powers_.end())),
@@ -35,7 +32,7 @@ class Radial final : public Lens {
             const double iz = 1.0 / rays.z[i], u = rays.x[i] * iz, v = rays.y[i] * iz;
             const double m = std::sqrt(u * u + v * v) + TINY;
             u_[i] = u, v_[i] = v, m_[i] = m;
-            ideal_[i] = phi_ * m / unit_;
+            ideal_[i] = phi * m / unit;
             s_[i] = std::min(ideal_[i], limit_);
         });
         double worst = 1.0;
@@ -45,13 +42,13 @@ class Radial final : public Lens {
         each(n, [&](int i) {
             const double u = u_[i], v = v_[i], m = m_[i], s = s_[i], z = rays.z[i], iz = 1.0 / z;
             const double per_slope = 1.0 / slope_[i];
-            const double stretch = unit_ * s / m;  // px per unit of the ideal point
-            const double bend = (phi_ * per_slope - stretch) / (m * m);
-            const double xx = (stretch + bend * u * u + phi_ * across.xx(u, v)) * iz;
-            const double xy = (bend * u * v + phi_ * across.xy(u, v)) * iz;
-            const double yy = (stretch + bend * v * v + phi_ * across.yy(u, v)) * iz;
+            const double stretch = unit * s / m;  // px per unit of the ideal point
+            const double bend = (phi * per_slope - stretch) / (m * m);
+            const double xx = (stretch + bend * u * u + phi * across.xx(u, v)) * iz;
+            const double xy = (bend * u * v + phi * across.xy(u, v)) * iz;
+            const double yy = (stretch + bend * v * v + phi * across.yy(u, v)) * iz;
             per_slope_[i] = per_slope;
-            image.x[i] = stretch * u + phi_ * across.x(u, v), image.y[i] = stretch * v + phi_ * across.y(u, v);
+            image.x[i] = stretch * u + phi * across.x(u, v), image.y[i] = stretch * v + phi * across.y(u, v);
             image.xx[i] = xx, image.xy[i] = xy, image.yx[i] = xy, image.yy[i] = yy;
             image.xz[i] = -(xx * u + xy * v), image.yz[i] = -(xy * u + yy * v);
             bad += !((z > 0.0) & (slope_[i] > 0.0) & (s < limit_));
@@ -65,23 +62,21 @@ class Radial final : public Lens {
         const Decentring across = across_;
         each(n, [&](int i) {
             const double u = u_[i], v = v_[i];
-            x[i] = u * per_slope_[i] + across.x(u, v), y[i] = aspect_ * (v * per_slope_[i] + across.y(u, v));
+            x[i] = u * per_slope_[i] + across.x(u, v), y[i] = aspect * (v * per_slope_[i] + across.y(u, v));
         });
         for (size_t k = 0; k < powers_.size(); ++k) {
             const int row = 4 + static_cast<int>(k), power = static_cast<int>(powers_[k]);
-            x = rows.x(row), y = rows.y(row);
-            rows.shown[row] = true;
+            x = rows.show(row), y = rows.y(row);
             each(n, [&](int i) {
-                double d = -unit_ * per_slope_[i] / m_[i];
+                double d = -unit * per_slope_[i] / m_[i];
                 for (int j = 0; j < power; ++j) d *= s_[i];
-                x[i] = d * u_[i], y[i] = aspect_ * d * v_[i];
+                x[i] = d * u_[i], y[i] = aspect * d * v_[i];
             });
         }
         for (int k = 0; k < 2 && tangential_ > 0; ++k) {
-            const Decentring one = {k == 0 ? phi_ : 0.0, k == 1 ? phi_ : 0.0};
-            x = rows.x(tangential_ + k), y = rows.y(tangential_ + k);
-            rows.shown[tangential_ + k] = true;
-            each(n, [&](int i) { x[i] = one.x(u_[i], v_[i]), y[i] = aspect_ * one.y(u_[i], v_[i]); });
+            const Decentring one = {k == 0 ? phi : 0.0, k == 1 ? phi : 0.0};
+            x = rows.show(tangential_ + k), y = rows.y(tangential_ + k);
+            each(n, [&](int i) { x[i] = one.x(u_[i], v_[i]), y[i] = aspect * one.y(u_[i], v_[i]); });
         }
     }
 
@@ -112,7 +107,7 @@ class Radial final : public Lens {
     std::vector<double> powers_, dense_;
     int tangential_;
     Decentring across_;
-    double unit_, phi_, aspect_, limit_ = 0.0;
+    double limit_ = 0.0;
     Lane u_, v_, m_, ideal_, s_, value_, slope_, per_slope_;
 };
 

@@ -18,9 +18,7 @@ namespace ceres_cal {
 class Spline final : public Lens {
   public:
     explicit Spline(const Making& from)
-        : unit_(from.unit),
-          phi_(from.intrinsics[0]),
-          aspect_(from.intrinsics[1]),
+        : Lens(from),
           rim_(from.intrinsics[4] > 0.0 ? from.intrinsics[4] : 1.0),
           conrady_(static_cast<int>(from.form[0])) {
         const Numbers &form = from.form, &intrinsics = from.intrinsics;
@@ -45,7 +43,7 @@ class Spline final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double scale = 2.0 * phi_ / (unit_ * rim_), per_scale = 1.0 / scale, unit = unit_, rim = rim_;
+        const double scale = 2.0 * phi / (unit * rim_), per_scale = 1.0 / scale, unit = this->unit, rim = rim_;
         each(n, [&](int i) {
             const double x = rays.x[i], y = rays.y[i], z = rays.z[i], length = std::sqrt(x * x + y * y + z * z);
             const double s = scale / (length + z), u = s * x, v = s * y;
@@ -83,10 +81,9 @@ class Spline final : public Lens {
     }
 
     void differentiate(const Rows& rows) override {
-        const double unit = unit_, aspect = aspect_, rim = rim_, per_phi = 1.0 / phi_;
+        const double unit = this->unit, aspect = this->aspect, rim = rim_, per_phi = 1.0 / phi;
         const int n = rows.n;
-        double *x = rows.x(0), *y = rows.y(0), *rim_x = rows.x(4), *rim_y = rows.y(4);
-        rows.shown[4] = true;
+        double *x = rows.x(0), *y = rows.y(0), *rim_x = rows.show(4), *rim_y = rows.y(4);
         each(n, [&](int i) {
             x[i] = along_x_[i] * per_phi, y[i] = aspect * along_y_[i] * per_phi;
             rim_x[i] = unit * u_[i] - along_x_[i] / rim, rim_y[i] = aspect * (unit * v_[i] - along_y_[i] / rim);
@@ -107,8 +104,7 @@ class Spline final : public Lens {
         if (conrady_ > 0) differentiate_conrady(rows);
         for (const Monomial& one : monomials_) {
             const Lane &a_ = power_x_[one.m], &b_ = power_y_[one.m], &c_ = power_x_[one.n], &d_ = power_y_[one.n];
-            double *p = rows.x(one.at), *q = rows.x(one.at + 1);
-            rows.shown[one.at] = rows.shown[one.at + 1] = true;
+            double *p = rows.show(one.at), *q = rows.show(one.at + 1);
             each(n, [&](int i) {
                 const double re = unit * (a_[i] * c_[i] + b_[i] * d_[i]), im = unit * (b_[i] * c_[i] - a_[i] * d_[i]);
                 p[i] = re, p[n + i] = aspect * im, q[i] = -im, q[n + i] = aspect * re;
@@ -167,13 +163,12 @@ class Spline final : public Lens {
     void differentiate_conrady(const Rows& rows) const {
         const int n = rows.n;
         for (int k = 0; k < CONRADY; ++k) {
-            double *p = rows.x(conrady_ + 2 * k), *q = rows.x(conrady_ + 2 * k + 1);
-            rows.shown[conrady_ + 2 * k] = rows.shown[conrady_ + 2 * k + 1] = true;
+            double *p = rows.show(conrady_ + 2 * k), *q = rows.show(conrady_ + 2 * k + 1);
             each(n, [&](int i) {
                 const double u = u_[i], v = v_[i], x = u * u - v * v, y = 2.0 * u * v, s = u * u + v * v;
-                const double size = unit_ / 3.0 * (k > 0 ? s : 1.0) * (k > 1 ? s : 1.0);
-                p[i] = size * (2.0 * s + x), p[n + i] = aspect_ * size * y;
-                q[i] = size * y, q[n + i] = aspect_ * size * (2.0 * s - x);
+                const double size = unit / 3.0 * (k > 0 ? s : 1.0) * (k > 1 ? s : 1.0);
+                p[i] = size * (2.0 * s + x), p[n + i] = aspect * size * y;
+                q[i] = size * y, q[n + i] = aspect * size * (2.0 * s - x);
             });
         }
     }
@@ -230,8 +225,7 @@ class Spline final : public Lens {
         }
     }
 
-    double unit_, phi_, aspect_, rim_, limit_ = END, c_[2 * CONRADY] = {}, profile_[INTERVALS][ORDER] = {},
-                                       pieces_[TABLE];
+    double rim_, limit_ = END, c_[2 * CONRADY] = {}, profile_[INTERVALS][ORDER] = {}, pieces_[TABLE];
     int conrady_, highest_ = 0;
     std::vector<Monomial> monomials_;
     std::unique_ptr<Surface> surface_;

@@ -11,11 +11,21 @@ namespace ceres_cal {
 
 constexpr double NO_ANSWER = std::numeric_limits<double>::quiet_NaN();
 
+// What a direction of the target's frame moves, by what the camera's x, y and z move: the target moved along it moves
+// the point by R times it.
+inline double along(const double* by_camera, const double* pose, const double* direction) {
+    double sum = 0.0;
+    for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) sum += by_camera[j] * pose[4 * j + k] * direction[k];
+    return sum;
+}
+
 class Sums {
   public:
-    Sums(const Optics& optics, const Unknowns& unknowns)
+    Sums(Lens& lens, const Unknowns& unknowns, const Observed& seen)
         : unknowns_(unknowns),
-          shown_(optics),
+          seen_(seen),
+          shown_(lens),
           products_(static_cast<size_t>(unknowns.size() + 3) * static_cast<size_t>(unknowns.size() + 3)) {
         own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
     }
@@ -24,102 +34,55 @@ class Sums {
     // `normal`, of the unknowns' size squared.
     //
     // newton: whether A takes rho'' along, for a step, or rho' alone, as the weight that each observation has.
-    double normal_equations(int64_t sight, const double* pose, const Points& points, const Curves& curves,
-                            const Loss& loss, bool newton, double* normal) {
+    double normal_equations(int64_t sight, const double* pose, bool newton, double* normal) {
         std::fill_n(normal, static_cast<size_t>(unknowns_.size()) * unknowns_.size(), 0.0);
-        return with_loss(loss.code, [&](auto code) {
-            const Task task{pose, loss, newton, normal};
-            double cost = 0.0;
-            for (int64_t start = points.bounds[sight], end = points.bounds[sight + 1]; start < end && cost == cost;) {
-                const int n = chunk_from(start, end);
-                cost += add_points<decltype(code)::value>(start, n, task, points);
-                start += n;
-            }
-            for (int64_t start = curves.bounds[sight], end = curves.bounds[sight + 1]; start < end && cost == cost;) {
-                const int n = chunk_from(start, end);
-                cost += add_curves<decltype(code)::value>(start, n, task, curves);
-                start += n;
-            }
-            return cost;
+        pose_ = pose, newton_ = newton, normal_ = normal;
+        double cost = 0.0;
+        with_loss(seen_.loss.code, [&](auto code) {
+            const auto add_all = [&](const auto& columns) {
+                return all_chunks(columns, sight, [&](int64_t start, int n) {
+                    cost += add<decltype(code)::value>(start, n, columns);
+                    return true;
+                });
+            };
+            add_all(seen_.points), add_all(seen_.curves);
         });
-    }
-
-  private:
-    struct Task {
-        const double* pose;
-        const Loss& loss;
-        bool newton;
-        double* normal;
-    };
-
-    template <LossCode code>
-    double add_points(int64_t start, int n, const Task& task, const Points& points) {
-        if (!shown_.show_points(start, n, task.pose, points)) return NO_ANSWER;
-        choose_rows();
-        const Rows& rows = shown_.rows;
-        const int filled = rows.n;
-        for (int i = 0; i < filled; ++i) {
-            const int64_t j = start + std::min(i, n - 1);
-            weight_[i] = i < n ? points.weights[j] : 0.0;
-            pixel_x_[i] = points.pixels[2 * j], pixel_y_[i] = points.pixels[2 * j + 1];
-        }
-        const Optics& optics = shown_.optics;
-        double *error = rows.x(shown_.last_row), cost = 0.0;
-        each(filled, [&](int i) {
-            const double w = weight_[i], dx = w * (optics.cx + shown_.image.x[i] - pixel_x_[i]);
-            const double dy = w * (optics.cy + optics.aspect * shown_.image.y[i] - pixel_y_[i]);
-            const double squared = dx * dx + dy * dy;
-            const Robust one = robust<code>(task.loss.scale, squared);
-            const double root = std::sqrt(one.slope);
-            cost += one.rho, squared_[i] = squared;
-            factor_[i] = factor_[filled + i] = root * w;
-            error[i] = root * dx, error[filled + i] = root * dy;
-        });
-        const int last = static_cast<int>(own_.size()) - 1;
-        for (int k = 0; k < last; ++k) {
-            double* own = own_[k];
-            each(2 * filled, [=](int i) { own[i] *= factor_[i]; });
-        }
-        if (task.newton) bend_rows<code>(n, 2, task.loss);
-        add_products(2 * filled, task.normal);
-        for (int i = 0; i < n && points.slots != nullptr; ++i) {
-            point_directions(points.bends + (BUILT - 2) * (start + i), directions_);
-            add_structure(i, 2, BUILT, points.slots + BUILT * (start + i), task);
-        }
         return cost;
     }
 
-    // One residual each, the distance along the image normal at the foot. By the envelope theorem its derivative is
-    // that of the projected foot with s held, along the normal.
-    template <LossCode code>
-    double add_curves(int64_t start, int n, const Task& task, const Curves& curves) {
-        if (!shown_.show_feet(start, n, task.pose, curves)) return NO_ANSWER;
+  private:
+    template <LossCode code, class Columns>
+    double add(int64_t start, int n, const Columns& seen) {
+        constexpr int MANY = Columns::RESIDUALS;
+        if (!shown_.show(start, n, pose_, seen)) return NO_ANSWER;
         choose_rows();
-        const Rows& rows = shown_.rows;
-        const int filled = rows.n;
-        for (int i = 0; i < filled; ++i) weight_[i] = i < n ? curves.weights[start + i] : 0.0;
-        double *error = rows.x(shown_.last_row), cost = 0.0;
+        const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
+        for (int i = 0; i < filled; ++i) weight_[i] = i < n ? seen.weights[start + i] : 0.0;
+        double *error = own_[last], cost = 0.0;
         each(filled, [&](int i) {
-            const double length = std::sqrt(shown_.length2[i]);
-            const double nx = -shown_.tau_y[i] / length, ny = shown_.tau_x[i] / length;
-            const double e = weight_[i] * (nx * shown_.off_x[i] + ny * shown_.off_y[i]);
-            const Robust one = robust<code>(task.loss.scale, e * e);
-            const double root = std::sqrt(one.slope), factor = root * weight_[i];
-            cost += one.rho, squared_[i] = e * e;
-            factor_[i] = factor * nx, factor_[filled + i] = factor * ny;
-            error[i] = root * e;
+            const double w = weight_[i], ex = w * (MANY == 2 ? shown_.off_x(i) : shown_.distance(i));
+            const double ey = MANY == 2 ? w * shown_.off_y(i) : 0.0, squared = ex * ex + ey * ey;
+            const Robust one = robust<code>(seen_.loss.scale, squared);
+            const double root = std::sqrt(one.slope), factor = root * w;
+            cost += one.rho, squared_[i] = squared;
+            factor_[i] = MANY == 2 ? factor : factor * shown_.normal_x[i];
+            factor_[filled + i] = MANY == 2 ? factor : factor * shown_.normal_y[i];
+            error[i] = root * ex;
+            if (MANY == 2) error[filled + i] = root * ey;
         });
-        const int last = static_cast<int>(own_.size()) - 1;
         for (int k = 0; k < last; ++k) {
             double* own = own_[k];
-            each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
+            if constexpr (MANY == 2)
+                each(2 * filled, [=](int i) { own[i] *= factor_[i]; });
+            else
+                each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
         }
-        if (task.newton) bend_rows<code>(n, 1, task.loss);
-        add_products(filled, task.normal);
-        for (int i = 0; i < n && curves.slots != nullptr; ++i) {
-            const int64_t k = curves.track[start + i];
-            curve_directions(curves, k, shown_.tangent_x[i], shown_.tangent_y[i], directions_);
-            add_structure(i, 1, ON_TRACK, curves.slots + ON_TRACK * k, task);
+        if (newton_) bend_rows<code>(n, MANY);
+        add_products(MANY * filled);
+        for (int i = 0; i < n && seen.slots != nullptr; ++i) {
+            double directions[BUILT][3] = {};
+            shown_.directions(seen, start + i, i, directions);
+            add_structure<Columns>(i, seen.slots + Columns::MOVED * seen.moved(start + i), directions);
         }
         return cost;
     }
@@ -139,7 +102,7 @@ class Sums {
 
     // normal += P P^T over the rows' first n places, lower triangle; four rows by three, to read each one less. (Of
     // more sums at once than the processor has registers for each takes longer.)
-    void add_products(int n, double* normal) {
+    void add_products(int n) {
         const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(), stride = size + 3,
                   end = n & ~(LANES - 1);
         for (int k = 0; k < count; k += 4) {
@@ -156,28 +119,26 @@ class Sums {
                     dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
                 }
                 const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
-                double* first = products_.data() + stride * k + j;
-                for (int row = 0; row < 4; ++row)
-                    for (int column = 0; column < 3; ++column) first[stride * row + column] = sums[row][column];
+                for (int row = 0; row < 4; ++row) std::copy_n(sums[row], 3, products_.data() + stride * (k + row) + j);
             }
         }
         for (int k = 0; k < count; ++k) {
-            double* own = normal + size * places_[k];
+            double* own = normal_ + size * places_[k];
             for (int j = 0; j <= k; ++j) own[places_[j]] += products_[stride * k + j];
         }
     }
 
     // Take the second derivative of rho into the rows: Newton's step on the loss, its gradient unchanged.
     template <LossCode code>
-    void bend_rows(int n, int components, const Loss& loss) {
+    void bend_rows(int n, int components) {
         constexpr double FLAT = 0.7, MOSTLY_FLAT = 0.5;  // a bend; share beyond which it says nothing of the minimum
         if constexpr (code != LossCode::huber && code != LossCode::soft_l1) return;
         const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
         int flat = 0;
-        for (int i = 0; i < n; ++i) flat += bend(loss, squared_[i]) < FLAT;
+        for (int i = 0; i < n; ++i) flat += bend(seen_.loss, squared_[i]) < FLAT;
         if (flat > MOSTLY_FLAT * n) return;
         for (int i = 0; i < n; ++i) {
-            const double left = bend(loss, squared_[i]);
+            const double left = bend(seen_.loss, squared_[i]);
             if (left == 1.0) continue;
             double length2 = 0.0;
             for (int c = 0; c < components; ++c) length2 += own_[last][c * filled + i] * own_[last][c * filled + i];
@@ -192,43 +153,35 @@ class Sums {
     }
 
     // The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
-    //
-    // Moving the target along one of the directions, a slot each, moves the point by R times it in the camera frame:
-    // the pose's translation rows say what that does.
-    void add_structure(int i, int components, int many, const int32_t* slots, const Task& task) {
+    template <class Columns>
+    void add_structure(int i, const int32_t* slots, const double (&directions)[BUILT][3]) {
         const int filled = shown_.rows.n, count = static_cast<int>(own_.size()), size = unknowns_.size();
-        double column[BUILT][2];
-        for (int a = 0; a < many; ++a) {
-            if (slots[a] < 0) continue;
-            const int place = unknowns_.count + slots[a];
-            for (int c = 0; c < components; ++c) {
-                column[a][c] = 0.0;
-                for (int j = 0; j < 3; ++j) {
-                    double turned = 0.0;
-                    for (int k = 0; k < 3; ++k) turned += task.pose[4 * j + k] * directions_[3 * a + k];
-                    column[a][c] += own_[count - 4 + j][c * filled + i] * turned;
-                }
-            }
-            for (int k = 0; k < count; ++k) {
-                double value = 0.0;
-                for (int c = 0; c < components; ++c) value += column[a][c] * own_[k][c * filled + i];
-                task.normal[size * std::max(place, places_[k]) + std::min(place, places_[k])] += value;
-            }
-            for (int b = 0; b <= a; ++b) {
-                if (slots[b] < 0) continue;
-                const int other = unknowns_.count + slots[b];
-                double value = 0.0;
-                for (int c = 0; c < components; ++c) value += column[a][c] * column[b][c];
-                task.normal[size * std::max(place, other) + std::min(place, other)] += value;
+        for (int c = 0; c < Columns::RESIDUALS; ++c) {
+            const auto row = [&](int k) { return own_[k][c * filled + i]; };
+            const double by_place[3] = {row(count - 4), row(count - 3), row(count - 2)};
+            double column[BUILT];
+            for (int a = 0; a < Columns::MOVED; ++a) {
+                if (slots[a] < 0) continue;
+                const auto add = [&](int place, int other, double value) {
+                    normal_[size * std::max(place, other) + std::min(place, other)] += column[a] * value;
+                };
+                const int place = unknowns_.count + slots[a];
+                column[a] = along(by_place, pose_, directions[a]);
+                for (int k = 0; k < count; ++k) add(place, places_[k], row(k));
+                for (int b = 0; b <= a; ++b)
+                    if (slots[b] >= 0) add(place, unknowns_.count + slots[b], column[b]);
             }
         }
     }
 
     const Unknowns unknowns_;
+    const Observed& seen_;
+    const double* pose_ = nullptr;
+    bool newton_ = false;
+    double* normal_ = nullptr;
     Projection shown_;
-    Lane weight_, pixel_x_, pixel_y_, squared_;
+    Lane weight_, squared_;
     alignas(64) double factor_[2 * CHUNK];
-    double directions_[3 * BUILT];
     std::vector<double*> own_;
     std::vector<int> places_;
     std::vector<double> products_;  // room for three rows and columns more

@@ -25,11 +25,11 @@ class Surface {
           wide_(side(intrinsics[at])),
           high_(side(intrinsics[at + 1])) {}
 
-    Displacement look_up(int i, double u, double v) {
+    const Displacement& look_up(int i, double u, double v) {
         Place& place = places_[i];
         place.first = cell(u / wide_, COLUMNS, 1.0 / wide_, place.along, place.along_slope) * ROWS;
         place.first += cell(v / high_, ROWS, 1.0 / high_, place.down, place.down_slope);
-        Displacement sum;
+        Displacement& sum = place.sum = {};
         for (int j = 0; j < 4; ++j) {
             const double* node = nodes_ + 2 * (place.first + j * ROWS);
             double a = 0.0, b = 0.0, a_slope = 0.0, b_slope = 0.0;
@@ -41,7 +41,7 @@ class Surface {
             sum.xu += place.along_slope[j] * a, sum.yu += place.along_slope[j] * b;
             sum.xv += place.along[j] * a_slope, sum.yv += place.along[j] * b_slope;
         }
-        place.u = u, place.v = v, place.sum = sum;
+        place.u = u, place.v = v;
         return sum;
     }
 
