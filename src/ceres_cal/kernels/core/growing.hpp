@@ -1,6 +1,8 @@
 // Where a polynomial along the radius stops growing.
 #pragma once
 
+#include <algorithm>
+
 namespace ceres_cal {
 
 // d/dx of x (d_0 + d_1 x + d_2 x^2 ...).
@@ -10,23 +12,20 @@ inline double radial_slope(const double* dense, int count, double x) {
     return total;
 }
 
-// Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `far`, the end of what can be observed.
-inline double growing_until(const double* dense, int count, double far) {
+// Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `farthest`, the end of what can be observed. It is looked
+// for in equal steps up to `far`, and in growing ones beyond.
+inline double growing_until(const double* dense, int count, double far, double farthest) {
     constexpr int STEPS = 96, HALVINGS = 50;
-    const double step = far / STEPS;
-    double low = 0.0, high = far;
-    for (int i = 1; i <= STEPS; ++i) {
-        if (radial_slope(dense, count, i * step) <= 0.0) {
-            low = (i - 1) * step, high = i * step;
-            break;
-        }
-        low = i * step;
+    constexpr double GROWTH = 1.1;
+    double low = 0.0, high = far / STEPS;
+    while (radial_slope(dense, count, high) > 0.0) {
+        if (high >= farthest) return farthest;
+        low = high;
+        high = std::min(high < far ? high + far / STEPS : GROWTH * high, farthest);
     }
-    if (high < far || radial_slope(dense, count, far) <= 0.0) {
-        for (int i = 0; i < HALVINGS; ++i) {
-            const double middle = 0.5 * (low + high);
-            (radial_slope(dense, count, middle) > 0.0 ? low : high) = middle;
-        }
+    for (int i = 0; i < HALVINGS; ++i) {
+        const double middle = 0.5 * (low + high);
+        (radial_slope(dense, count, middle) > 0.0 ? low : high) = middle;
     }
     return low;
 }
