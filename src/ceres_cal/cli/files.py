@@ -161,7 +161,7 @@ def require_ending(path: Path | None, what: str, *endings: str) -> None:
 
 
 def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
-    """`require_output` of output and report, and that they are two files."""
+    """`require_output` of output and report, that they are two files, and that the report is called like a page."""
     require_output(args.output, inputs)
     require_output(args.report, inputs)
     if (
@@ -170,6 +170,7 @@ def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None
         and os.path.realpath(args.output) == os.path.realpath(args.report)
     ):
         raise InputError(f"{args.report}: is named as output and as report: give them two names")
+    require_ending(args.report, "a report is", ".html", ".htm")
 
 
 @contextmanager
