@@ -21,7 +21,7 @@ from accuracy.scenes import Problem as Case
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
@@ -31,10 +31,10 @@ from ceres_cal.diagnostics.advice.ranking import _chosen, _prepared, _weighting
 from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.uncertainty import Uncertainty
-from ceres_cal.problem.parameters import Options, make_layout
+from ceres_cal.problem.parameters import Estimate, Options, make_layout
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.reduced import information
+from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.structure import Tolerance, make_structure
 from ceres_cal.scene.targets import checkerboard, rings
 from ceres_cal.simulate import Disturbance, board_scene, simulate
@@ -166,6 +166,20 @@ def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None
         expected = there.map_sd_mm(advice.station, 0.15)
         assert promise.after.worst_mm == pytest.approx(expected.worst_mm, rel=1e-6)
         assert promise.after.mean_mm == pytest.approx(expected.mean_mm, rel=1e-6)
+
+
+def test_what_cannot_be_projected_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the end of a valley along phi, for example; the other measurements are advised all the same."""
+
+    def of_tape_alone(problem: Problem, estimate: Estimate) -> ReducedInformation:
+        if len(problem.sights):
+            raise SolutionError("an observation cannot be projected")
+        return information(problem, estimate)
+
+    monkeypatch.setattr("ceres_cal.diagnostics.advice.measurements.information", of_tape_alone)
+    advice = advise(calibrated("whole field, 8 deg"))
+    told = {one.measurement.kind for one in advice.promises if one.after.worst_mm < 0.9 * advice.before.worst_mm}
+    assert told == {"tape"} and {one.measurement.kind for one in advice.promises} == KINDS
 
 
 # ---- what is obtained -----------------------------------------------------------------------------------------------

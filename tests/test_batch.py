@@ -20,6 +20,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each, processes
 from ceres_cal.base.threads import available
 from ceres_cal.cli import main
+from ceres_cal.cli.batch import _of_calibration
 from ceres_cal.cli.files import finishing
 from ceres_cal.cli.jobs import RESULTS, Job, Outcome, remember, remembered
 from ceres_cal.cli.plan import read_plan
@@ -274,3 +275,10 @@ def test_folds_and_advice_are_the_same_over_an_executor() -> None:
     ]
     ground, outlook = _prepared(straight, None, ROBOT_TOP_M)  # what processes would be handed
     assert pickle.loads(pickle.dumps(ground.information_of)).__self__.keys == ground.keys and pickle.dumps(outlook)
+
+
+def test_a_report_that_could_not_be_made_is_said() -> None:
+    verdict = {"level": "good", "headline": "It can be trusted.", "reasons": []}
+    data = {"verdict": verdict, "uncertainty": None, "not_made": {"report": "a.jpg: no image"}}
+    outcome = _of_calibration(Job("a", "calibrate", ()), data)
+    assert (outcome.level, outcome.reasons) == ("care", ("no report: a.jpg: no image",))

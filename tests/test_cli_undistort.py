@@ -162,6 +162,13 @@ def test_refusals(say: Say, folder: Path, tmp_path: Path) -> None:
     assert "is an input" in refused(say("undistort", folder / "c.json", straight, "-o", straight))
 
 
+def test_a_folder_whose_name_is_no_utf8(say: Say, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "ou\udce9t"
+    assert say("undistort", folder / "c.json", folder / "in", "-o", out, "--size", "64x48", "--json").code == 0
+    (picture,) = json.loads((out / "straight.json").read_text())["pictures"]
+    assert picture["output"] == str(tmp_path / "ou\\udce9t" / "shot-straight.png")
+
+
 # ---- the report -----------------------------------------------------------------------------------------------------
 
 
@@ -188,6 +195,10 @@ def test_photographs_that_do_not_belong(say: Say, folder: Path, tmp_path: Path) 
     command = ("calibrate", folder / "obs.json", "--report", tmp_path / "page.html", "--quiet", "--images")
     assert "called like a frame of the observations, such as 'shot'" in refused(say(*command, wrong))
     wrong.rename(tmp_path / "shot.png")
-    assert "64 x 48 px, but camera 'camera' has 1280 x 960" in refused(say(*command, tmp_path / "shot.png"))
+    # What can be seen only once the report is made leaves the calibration as it is.
+    said = say(*command, tmp_path / "shot.png", "-o", tmp_path / "c.json")
+    assert said.code == 1 and said.err == "" and (tmp_path / "c.json").exists()
+    why = f"{tmp_path / 'shot.png'}: 64 x 48 px, but camera 'camera' has 1280 x 960"
+    assert f"\nerror     no report: {why}" in said.out and said.out.endswith(f"\nwritten   {tmp_path / 'c.json'}\n")
     assert "--images is for the report" in refused(say("calibrate", folder / "obs.json", "--images", wrong))
     assert not (tmp_path / "page.html").exists()

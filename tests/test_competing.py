@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,8 +27,9 @@ from ceres_cal.robust import competing
 from ceres_cal.robust import wholes as looked_at
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import Segment
 from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.targets import ssl_field
+from ceres_cal.scene.targets import custom, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
@@ -286,3 +288,23 @@ def test_solving_without_a_line_needs_the_placements_that_are_left() -> None:
     others = replace(others, layout=others.layout.of(others.sights.keys))
     end = solve_robustly(others, observations, calibration.estimate)
     assert observations.views[0].placement not in end.problem.layout.placements
+
+
+def test_many_features_are_competed_with_in_bounded_time() -> None:
+    """Where all were looked at together, at the cube of their number, 1350 points in three frames took 25 s."""
+    places = {
+        f"p{column}_{row}": (0.1 * column - 2.0, 0.1 * row - 1.5, 0.0) for column in range(40) for row in range(15)
+    }
+    line = Segment((-2.0, 0.05, 0.0), (2.0, 0.05, 0.0), 0.01)
+    cameras = {"overhead": Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7), (2, 3)))}
+    stations = {"overhead": Station("overhead", overhead_pose(0.1, -0.2, 4.0, tilt_x_deg=9.0, tilt_y_deg=4.0))}
+    scene = field_scene(custom(places, {"line": line}), cameras, stations, frames=3, spacing_m=0.1)
+    observations = simulate(scene, NOISE, seed=0).observations
+    points = observations.points
+    pixels = points.pixels.copy()
+    pixels[points.feature == observations.targets["field"].point_names.index("p7_3")] += (1.1, 0.6)
+    start = time.process_time()
+    calibration = calibrate(replace(observations, points=replace(points, pixels=pixels)), RADIAL)
+    assert time.process_time() - start < 6.0  # measured 1.3
+    assert wholes(calibration) == {"the whole of point 'p7_3' in all 3 frames"}
+    assert np.max(np.abs(error_sd(calibration, scene))) < 4.0  # measured 1.3

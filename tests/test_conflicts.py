@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -22,8 +23,10 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance
+from ceres_cal.report.document import Document, Table
 from ceres_cal.report.grounds import Judgement, judge_quality
 from ceres_cal.report.quality import quality_of
+from ceres_cal.report.summary import calibration_sections
 from ceres_cal.robust.conflicts import _beside
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
@@ -89,6 +92,21 @@ def test_nothing_is_promised_then() -> None:
     assert judged.headline == "Do not trust this calibration: what was known beforehand is contradicted."
     found = diagnose(wrong(), seen())
     assert found.conflicts == wrong().conflicts
+
+
+def test_a_number_that_contradicts_what_was_stated_is_in_conflict_wherever_it_is_shown() -> None:
+    known = wrong().uncertainty
+    words = {(one.key.owner, one.key.quantity): one.verdict for one in known.verdicts}
+    assert [name for name, word in words.items() if word == "in conflict"] == [("overhead", "height")]
+    (row,) = [row for row in known.table() if row["quantity"] == "height"]
+    assert row["verdict"] == "in conflict"
+    sections = list(calibration_sections(quality_of(wrong(), seen()), ["seen.json"]))
+    shown = Document(tuple(sections))
+    assert re.search(r"height 3\.\d+ m ± [\d.]+ mm, in conflict", shown.text())
+    (stated,) = [one for one in shown.data["uncertainty"]["numbers"] if one["key"]["quantity"] == "height"]
+    assert stated["verdict"] == "in conflict"
+    rows = [r for one in sections for piece in one.pieces if isinstance(piece, Table) for r in piece.rows]
+    assert [one[0] for one in rows if "in conflict" in one] == ["height"]
 
 
 def test_files_keep_conflicts(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from ceres_cal.effects.between import _averaged, _expected
 from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.sample import _shown
-from ceres_cal.effects.strands import Strand, StrandFamily, decay
+from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of
 from ceres_cal.moves import refit
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
@@ -336,3 +336,18 @@ def test_rows_without_a_residual_take_no_part() -> None:
     points[5] = np.nan
     shown = _shown(sights, replace(there, points=points))
     assert len(shown.point_rows) == len(sights.point_rows) - 1 and 5 not in shown.point_rows
+
+
+def test_places_far_apart_have_no_correlation_at_all() -> None:
+    """A line every 0.2 m in two frames, at about the same places: with correlations of 1e-155 among its entries, LAPACK
+    found no eigenvalues of this matrix, and a refit was refused.
+    """
+    first = "0 .19911 .4 .60031 .80303 .99905 1.20013 1.39871 1.5986 1.79864 1.99939 2.19921 2.40065 2.59749 2.79885"
+    last = ".0031 .39843 .60204 .80493 1.00232 1.20281 1.40094 1.60028 1.80157 2.40083 2.80022 3.00347 3.19654 3.19674"
+    more = "3.60109 3.77682 3.79786 3.99964 4.19946 4.20242 4.79925"
+    places = np.zeros((36, 3))
+    places[:, 0] = np.sort(np.array(" ".join((first, last, more)).split(), dtype=float))
+    kernel = decay(distances_of(places), 0.0135, smooth=False)
+    assert np.min(kernel[kernel > 0.0]) > 1e-31
+    values, vectors = np.linalg.eigh(kernel)
+    assert values[0] > 0.01 and np.max(np.abs((vectors * values) @ vectors.T - kernel)) < 1e-14  # 1.3e-15 measured

@@ -781,6 +781,14 @@ def test_a_curve_that_cannot_be_projected_has_no_residual(lens: str) -> None:
     assert np.isnan(normal_equations(away, seen)[0])
 
 
+@pytest.mark.parametrize("values", [(0.0,) * 5, (1e-3, 0.0, 0.0, 0.0, 0.0)])
+def test_a_pinhole_shows_what_is_far_off_its_axis(values: tuple[float, ...]) -> None:
+    camera = Camera((1280, 960), 100.0, (640.0, 480.0), Brown(values))
+    points = rays(np.deg2rad(79.0), np.deg2rad(85.0), np.deg2rad(-89.9))
+    seen = with_points(take(looked_at("brown")[1], points=slice(0, 3)), places=points, pixels=np.zeros((3, 2)))
+    assert point_residuals(camera, seen) == pytest.approx(camera.project(points), rel=1e-12)  # measured 2e-16
+
+
 def test_a_fisheye_sees_behind_itself() -> None:
     """130 degrees from the axis, as far as its polynomial grows."""
     camera = Camera((1280, 960), 200.0, (640.0, 480.0), KannalaBrandt((0.01, 0.0, 0.0, 0.0)))

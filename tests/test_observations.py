@@ -607,3 +607,14 @@ def test_a_crash_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyP
         observations.save(path)
     assert path.read_bytes() == b"old"
     assert not list(tmp_path.glob("*.part")) and not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("what", ["camera", "station", "frame"])
+def test_a_name_that_no_file_can_hold(what: str) -> None:
+    """Bytes of a command line that are no UTF-8."""
+    names = {"camera": "c", "station": "s", "frame": "f", what: "ove\udce9head"}
+    view = View(names["frame"], names["camera"], names["station"], "field", None)
+    seen = Points(np.zeros(1, np.int32), np.zeros(1, np.int32), np.full((1, 2), 9.0), np.ones(1))
+    nothing = Curves(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.ones(0), np.zeros(0, np.int8))
+    with pytest.raises(InputError, match=rf"^{what} 'ove\\udce9head': a name must be UTF-8: give another one$"):
+        Observations({"field": ssl_field("B")}, {names["camera"]: (640, 480)}, (view,), seen, nothing)

@@ -353,3 +353,22 @@ def test_names_that_do_not_fit(calibration: Calibration, observations: Observati
     assert result.refitted is not None and "is new" in result.refitted.explanation
     plan = make_plan(calibration, observations, "pose")
     assert plan.loosened("zoom") == {("camera", "overhead", "phi", "px")}
+
+
+@pytest.mark.parametrize("points, rows, seed", [(5, 200, 0), (4, 24, 1), (4, 60, 2), (5, 100, 3)])
+def test_strays_are_neither_another_zoom_nor_mirrored_labels(
+    calibration: Calibration, points: int, rows: int, seed: int
+) -> None:
+    """Three of few points and a fifth of the rows are anywhere in the image; of 90 such scenes ten were refused."""
+    rng = np.random.default_rng(seed)
+    every = seen(MOVED, NOISE, seed, spacing_m=0.15).observations
+    names = [every.targets["field"].point_names[feature] for feature in every.points.feature]
+    few = thinned(every, rng.permutation(names)[:points].tolist(), rows, seed)
+    pixels = [columns.pixels.copy() for columns in (few.points, few.curves)]
+    for own, strays in zip(pixels, (range(3), np.flatnonzero(rng.random(rows) < 0.2)), strict=True):
+        own[strays] = rng.uniform((0.0, 0.0), (1279.0, 959.0), (len(strays), 2))
+    points_now, curves_now = (
+        replace(columns, pixels=own) for columns, own in zip((few.points, few.curves), pixels, strict=True)
+    )
+    result = refit(calibration, replace(few, points=points_now, curves=curves_now))
+    assert np.max(sigmas_off(result, truth_of(result, MOVED))) < MOST_SIGMA

@@ -458,6 +458,8 @@ def test_a_page_that_cannot_be_written_is_said_before_the_work(
     both = str(tmp_path / "both.csv")
     assert main([*command, str(SAMPLE), "-o", both, "--report", both]) == 2
     assert "give them two names" in capsys.readouterr().err
+    assert main([*command, str(SAMPLE), "--report", str(tmp_path / "page.json")]) == 2
+    assert "page.json: a report is written as .html or .htm: give one of these endings" in capsys.readouterr().err
 
 
 def test_the_plotting_library_comes_in_when_a_picture_is_drawn() -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.command import COMMANDS
@@ -54,9 +54,18 @@ def test_a_folder_to_a_camera_and_its_export(
 
 
 @pytest.mark.usefixtures("words_alone")
-def test_what_cannot_be_trusted_is_not_exported(photographs: Path, tmp_path: Path) -> None:
-    wrong = ("--prior", "height_m=3:5mm", "--to", "paper", "-o", str(tmp_path), "--json")
+def test_what_cannot_be_trusted_is_not_exported_and_advice_may_fail(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise SolutionError("no advice can be given")
+
+    monkeypatch.setattr("ceres_cal.diagnostics.advice.advise", fails)
+    wrong = ("--prior", "height_m=3:5mm", "--to", "paper", "-o", str(tmp_path), "--quiet")
     assert main(["run", str(photographs / "0001.jpg"), *FIELD, *wrong]) == 1
+    said = capsys.readouterr()
+    assert "error     no advice: no advice can be given\n" in said.out and said.err == ""
+    assert f"written   {tmp_path}/: calibration.json, field.json, report.html\n" in said.out
     assert (tmp_path / "report.html").exists() and not list(tmp_path.glob("paper*"))
 
 

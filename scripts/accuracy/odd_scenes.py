@@ -229,8 +229,10 @@ def _farthest_known(calibration: Calibration, truth: Estimate) -> tuple[float, s
 
 
 def _is_within(truth: Estimate, calibration: Calibration, camera: str) -> bool:
-    """Whether the lens that was solved for can be the true one: otherwise its principal point is the middle of another
-    distortion, and its coefficients are other numbers.
+    """Whether the lens that was solved for can be the true one.
+
+    Otherwise its principal point is the middle of another distortion and its coefficients are other numbers: the scene
+    has no true value of them. What such a lens shows has one, and is judged always, by places on the floor and above.
     """
     lens, solved = truth.cameras[camera].lens, calibration.cameras[camera].lens
     if lens.kind != solved.kind or lens.names != solved.names:

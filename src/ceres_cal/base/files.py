@@ -20,6 +20,7 @@ from typing import IO, Any, Literal, TypeVar
 import msgspec
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import printable
 from ceres_cal.base.written import note
 
 T = TypeVar("T")
@@ -276,8 +277,30 @@ def _keep_owner(handle: int, target: Path) -> None:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Data as readable JSON; numbers keep every digit."""
-    write_bytes(path, msgspec.json.format(msgspec.json.encode(data), indent=1) + b"\n")
+    """Write `json_text`."""
+    write_bytes(path, json_text(data).encode() + b"\n")
+
+
+def json_text(data: Any) -> str:
+    """Data as readable JSON. Numbers keep every digit, arrays are lists, and what is infinite or NaN is null."""
+    try:
+        encoded = msgspec.json.encode(data, enc_hook=_plain)
+    except UnicodeEncodeError:  # quiet: a file's name that is no UTF-8 has its bytes spelt out
+        encoded = msgspec.json.encode(_all_printable(msgspec.to_builtins(data, enc_hook=_plain)))
+    return msgspec.json.format(encoded, indent=1).decode()
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and numbers of NumPy's as what they hold."""
+    return value.tolist()
+
+
+def _all_printable(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {_all_printable(name): _all_printable(value) for name, value in data.items()}
+    if isinstance(data, list):
+        return [_all_printable(value) for value in data]
+    return printable(data) if isinstance(data, str) else data
 
 
 def make_folder(folder: str | Path) -> Path:

@@ -128,7 +128,7 @@ class Calibration:
         """
         if self.posterior is None:
             raise InputError("this calibration does not say how well it is known: calibrate again")
-        return Uncertainty(self.estimate, self.posterior, self.targets)
+        return Uncertainty(self.estimate, self.posterior, self.targets, self.conflicts)
 
     def disagreement(self, observations: Observations, first: str, second: str) -> Disagreement:
         """What two stations say of what both observed in the observations that this calibration was made from.

@@ -30,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: those of the command line by default.
 
     Returns:
-        0 success, 1 the answer is no, 2 bad usage or input, 3 no usable solution, 130 interrupted, 143 terminated.
+        0 success, 1 the answer is no or a part of it could not be made, 2 bad usage or input, 3 no usable solution,
+        130 interrupted, 143 terminated.
         It says how the work ended, whether or not its words could be written. Every failure is one line on standard
         error, with --json also an object on standard output; with CERES_CAL_DEBUG set an unexpected one is raised
         instead.
@@ -124,6 +125,6 @@ def _overview(beginning: str) -> str:
             *(f"  {name:{width}}  {summary}" for name, summary in summaries.items()),
             "",
             "`ceres-cal COMMAND --help` tells how. Every command prints one JSON object with --json.",
-            "Exit codes: 0 success, 1 the answer is no, 2 bad usage or bad input, 3 no usable solution.",
+            "Exit codes: 0 success, 1 the answer is no or not whole, 2 bad usage or input, 3 no usable solution.",
         ]
     )

@@ -157,7 +157,10 @@ def _of_calibration(job: Job, data: Mapping[str, Any]) -> Outcome:
     finite = [radius for radius in radii if np.isfinite(radius)]
     reasons = [one["text"] for level in ("no", "care") for one in verdict["reasons"] if one["level"] == level]
     worst = max(finite) if finite else None
-    return Outcome(job.name, job.command, verdict["level"], verdict["headline"], tuple(reasons[:_MOST_REASONS]), worst)
+    unmade = [f"no {what}: {why}" for what, why in data.get("not_made", {}).items()]
+    level = "care" if unmade and verdict["level"] == "good" else verdict["level"]
+    told = (*unmade, *reasons)[:_MOST_REASONS]
+    return Outcome(job.name, job.command, level, verdict["headline"], told, worst)
 
 
 def _of_check(job: Job, data: Mapping[str, Any]) -> Outcome:

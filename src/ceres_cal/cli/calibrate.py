@@ -31,7 +31,6 @@ from ceres_cal.cli.files import (
     require_different,
     require_outputs,
     write_results,
-    written,
 )
 from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.terminal import ProgressBar, progress_bar
@@ -160,12 +159,11 @@ def _run(args: CalibrateArguments) -> Document:
 
         workers = {} if client is None else {"client": client}
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
-    page = report_page(args, calibration, observations, photographs)
-    quality = quality_of(calibration, observations)
-    write_results(args, calibration.save, page)
     from ceres_cal.report.summary import calibration_sections
 
-    return Document((*calibration_sections(quality, args.observations), written(args)))
+    page, unmade = report_page(args, calibration, observations, photographs)
+    answer = tuple(calibration_sections(quality_of(calibration, observations), args.observations))
+    return Document((*answer, unmade, write_results(args, calibration.save, page)), 1 if unmade.data else 0)
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import Any, NoReturn, get_type_hints
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import printable, sentence
+from ceres_cal.base.words import sentence
 from ceres_cal.cli.options import Arguments, add_options, filled
 from ceres_cal.cli.terminal import coloured, in_colour
 from ceres_cal.report.document import Document
@@ -77,26 +77,12 @@ def command(name: str, summary: str, *examples: str) -> Callable[[Callable[[Any]
     return lambda run: Command(name, summary, run, examples)
 
 
-def _all_printable(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {_all_printable(name): _all_printable(value) for name, value in data.items()}
-    if isinstance(data, list):
-        return [_all_printable(value) for value in data]
-    return printable(data) if isinstance(data, str) else data
-
-
 def print_answer(answer: Document, *, as_json: bool) -> None:
     """Print an answer."""
     if as_json:
-        import msgspec
+        from ceres_cal.base.files import json_text
 
-        # What is infinite or NaN becomes null; arrays and numbers of NumPy's what they hold.
-        try:
-            encoded = msgspec.json.encode(answer.data, enc_hook=lambda value: value.tolist())
-        except UnicodeEncodeError:  # quiet: a file's name that is no UTF-8 is printed with its bytes spelt out
-            plain = msgspec.to_builtins(answer.data, enc_hook=lambda value: value.tolist())
-            encoded = msgspec.json.encode(_all_printable(plain))
-        print(msgspec.json.format(encoded, indent=1).decode())
+        print(json_text(answer.data))
     else:
         text = answer.text()
         print(coloured(text) if in_colour(sys.stdout) else text)

@@ -22,7 +22,6 @@ from ceres_cal.cli.files import (
     require_ending,
     require_outputs,
     write_results,
-    written,
 )
 from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.terminal import progress_bar
@@ -69,15 +68,15 @@ def _run(args: DiagnoseArguments) -> Document:
         with progress_bar(args) as bar, processes(args.jobs) as executor:
             options = calibration.options
             choice = choose(observations, options, args.folds, progress=bar.update, executor=executor)
-    page = report_page(args, calibration, observations, photographs, diagnosis, choice)
-    write_results(args, diagnosis.table.save, page)
+    page, unmade = report_page(args, calibration, observations, photographs, diagnosis, choice)
     from ceres_cal.report.findings import diagnosis_sections
     from ceres_cal.report.grounds import is_against
 
     # Wrong labels that were taken out do no harm, and a noise is estimated.
     against = [finding for finding in diagnosis.findings if args.strict or is_against(finding)]
-    sections = (*diagnosis_sections(diagnosis, choice), written(args))
-    return Document(sections, 1 if against or diagnosis.conflicts else 0)
+    answer = tuple(diagnosis_sections(diagnosis, choice))
+    sections = (*answer, unmade, write_results(args, diagnosis.table.save, page))
+    return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)
 
 
 def _require_fitting(args: DiagnoseArguments) -> None:

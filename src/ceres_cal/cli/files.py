@@ -8,10 +8,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.cli.arguments import ReportArguments
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Section
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 VIDEO_ENDINGS = {".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
-_WRITTEN = ("output", "report")
+T = TypeVar("T")
 
 
 def images_and_videos(given: Iterable[str]) -> tuple[list[Path], list[Path]]:
@@ -131,12 +132,6 @@ def station_of(path: Path, station: str | None, calibration: Calibration) -> str
 # ---- what is written ------------------------------------------------------------------------------------------------
 
 
-def written(args: ReportArguments) -> Section:
-    """The section that names the files which were asked for."""
-    paths = {name: None if path is None else str(path) for name, path in vars(args).items() if name in _WRITTEN}
-    return Section("written", [path for path in paths.values() if path is not None], paths)
-
-
 # ---- files ----------------------------------------------------------------------------------------------------------
 
 
@@ -166,7 +161,7 @@ def require_ending(path: Path | None, what: str, *endings: str) -> None:
 
 
 def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
-    """`require_output` of output and report, and that they are two files."""
+    """`require_output` of output and report, that they are two files, and that the report is called like a page."""
     require_output(args.output, inputs)
     require_output(args.report, inputs)
     if (
@@ -175,6 +170,7 @@ def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None
         and os.path.realpath(args.output) == os.path.realpath(args.report)
     ):
         raise InputError(f"{args.report}: is named as output and as report: give them two names")
+    require_ending(args.report, "a report is", ".html", ".htm")
 
 
 @contextmanager
@@ -191,15 +187,30 @@ def finishing() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> None:
-    """Write what was asked for: the output by `save`, and the page of the report."""
+def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> Section:
+    """Write the output by `save`, and the page of the report where there is one; the section names the files."""
     from ceres_cal.base.files import write_bytes
 
+    report = None if page is None else args.report
     with finishing():
         if args.output is not None:
             save(args.output)
-        if page is not None and args.report is not None:
-            write_bytes(args.report, page.encode())
+        if page is not None and report is not None:
+            write_bytes(report, page.encode())
+    paths = {"output": args.output, "report": report}
+    named = {name: None if path is None else str(path) for name, path in paths.items()}
+    return Section("written", [path for path in named.values() if path is not None], named)
+
+
+def attempted(what: str, make: Callable[[], T]) -> tuple[T | None, Section]:
+    """What is made once the answer is there. Where that fails the answer stays: the section says so, and is empty else.
+
+    A command whose section is not empty ends with exit code 1.
+    """
+    try:
+        return make(), Section()
+    except CalibrationError as error:  # reads: "error     no report: ..."
+        return None, Section("error", [f"no {what}: {error}"], {"not_made": {what: str(error)}})
 
 
 # ---- the report -----------------------------------------------------------------------------------------------------
@@ -245,11 +256,12 @@ def report_page(
     photographs: FramePhotographs | None,
     diagnosis: Diagnosis | None = None,
     choice: Choice | None = None,
-) -> str | None:
-    """The page that --report asks for, or None."""
+) -> tuple[str | None, Section]:
+    """The page that --report asks for, or None; see `attempted`."""
     if args.report is None:
-        return None
+        return None, Section()
     from ceres_cal.report import make_report
 
     with progress_bar(args) as bar:
-        return make_report(calibration, observations, diagnosis, choice, photographs, bar.update)
+        make = partial(make_report, calibration, observations, diagnosis, choice, photographs, bar.update)
+        return attempted("report", make)

@@ -15,7 +15,6 @@ from ceres_cal.cli.files import (
     report_photographs,
     require_outputs,
     write_results,
-    written,
 )
 from ceres_cal.cli.options import option, switch
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
@@ -73,16 +72,17 @@ def _run(args: RefitArguments) -> Document:
         moved=args.moved or None,
         options=RefitOptions(args.hold_others, args.labels, priors),
     )
-    write_results(args, result.save, report_page(args, result, observations, photographs))
-    quality = quality_of(result, observations)
     from ceres_cal.report.summary import calibration_sections
 
+    page, unmade = report_page(args, result, observations, photographs)
+    answer = tuple(calibration_sections(quality_of(result, observations), args.inputs))
     about = result.refitted
     assert about is not None
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(calibration, result).items()}
     explained = {"what": about.what, "explanation": about.explanation, "moved": moves}
     first = Section("refit", about.explanation.split("; "), explained)
-    return Document((first, shown(detections), *calibration_sections(quality, args.inputs), written(args)))
+    sections = (first, shown(detections), *answer, unmade, write_results(args, result.save, page))
+    return Document(sections, 1 if unmade.data else 0)
 
 
 def _photographed(args: RefitArguments, calibration: Calibration, images: list[Path]) -> KnownDetections:

@@ -19,13 +19,13 @@ from ceres_cal.cli.arguments import (
     prior_option,
 )
 from ceres_cal.cli.command import COMMANDS, command
-from ceres_cal.cli.files import IMAGE_ENDINGS, images_and_videos
+from ceres_cal.cli.files import IMAGE_ENDINGS, attempted, images_and_videos
 from ceres_cal.cli.options import QuietArguments, argument, option
 from ceres_cal.cli.photographs import frames_of_videos
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
-_SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict")
+_SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
 _MOST_NAMES = 3
 _BLANK = Section("", [""])
 
@@ -52,11 +52,12 @@ class RunArguments(QuietArguments):
 
 @dataclass(frozen=True)
 class _Step:
-    """A command that was run, as one would type it, what it answered, and what is worth showing of that."""
+    """A command as one would type it, what is worth showing of its answer, that answer, and its exit code."""
 
     command: str
     lines: Sequence[str]
     data: dict[str, Any]
+    exit_code: int
 
 
 @command(
@@ -82,12 +83,14 @@ def _run(args: RunArguments) -> Document:
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
-        steps.append(_step(args, "advise", [str(args.output / "calibration.json")], most=2))
+        steps.append(_attempted(args, "advise", [str(args.output / "calibration.json")], most=2))
+    asked = [calibrated]
     if level != "no":
-        steps += [_exported(args, name, f"{args.output / name}{ending}") for name, ending in endings.items()]
+        asked += [_exported(args, name, f"{args.output / name}{ending}") for name, ending in endings.items()]
+    steps += asked[1:]
     data = {"images": len(images), "verdict": calibrated.data["verdict"]}
     data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
-    made = level != "no" and all(step.data for step in steps[-len(endings) :])
+    made = level != "no" and not any(step.exit_code for step in asked)
     return Document((Section(data=data), *_sections(args, images, steps, level)), 0 if made else 1)
 
 
@@ -105,7 +108,14 @@ def _step(
     quiet = ["--quiet"] if (args.quiet or args.json) and name != "export" else []
     answer = COMMANDS[name].run(COMMANDS[name].parse([*arguments, *quiet]))
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
-    return _Step(_typed(name, arguments), [*answer.text(titles).splitlines()[:most], *missed], answer.data)
+    lines = [*answer.text(titles).splitlines()[:most], *missed]
+    return _Step(_typed(name, arguments), lines, answer.data, answer.exit_code)
+
+
+def _attempted(args: RunArguments, name: str, arguments: Sequence[str], most: int | None = None) -> _Step:
+    """A step after the calibration is there; without data where it fails: the calibration stays."""
+    step, unmade = attempted("advice" if name == "advise" else name, lambda: _step(args, name, arguments, most))
+    return step or _Step(_typed(name, arguments), tuple(unmade.shown()), {}, 1)
 
 
 def _typed(name: str, arguments: Sequence[str]) -> str:
@@ -135,7 +145,7 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
         except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:
                 raise
-            yield _Step(_typed("detect board", [*rest, *board, *goal]), (str(error),), {})
+            yield _Step(_typed("detect board", [*rest, *board, *goal]), (str(error),), {}, 1)
     if args.target is not None:
         if not rest:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
@@ -158,12 +168,7 @@ def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step
 
 
 def _exported(args: RunArguments, form: str, goal: str) -> _Step:
-    """The step of an export, without data where the format cannot hold the calibration."""
-    arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
-    try:
-        return _step(args, "export", arguments)
-    except InputError as error:  # reads: "error ..." in place of the export
-        return _Step(_typed("export", arguments), tuple(Section("error", [str(error)]).shown()), {})
+    return _attempted(args, "export", [str(args.output / "calibration.json"), "--to", form, "-o", goal])
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------

@@ -14,6 +14,8 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.observations.sights import bounds_of
 from ceres_cal.problem.equations import Equations
 
+# Beside one it is rounding; where squares underflow LAPACK's search for eigenvalues may not end.
+_NO_CORRELATION = 1e-30
 _NEAR, _FAR = 30, 30  # rows of a strand that are looked at: next to one another, and over all of it
 
 
@@ -72,7 +74,8 @@ def distances_of(places: Array) -> Array:
 def decay(distance: Array, length: float, smooth: bool) -> Array:
     """Correlation at distances: of a rough random function, or of a smooth one."""
     relative = distance / length
-    return np.asarray(np.exp(-0.5 * relative**2 if smooth else -relative))
+    correlation = np.exp(-0.5 * relative**2 if smooth else -relative)
+    return np.where(correlation < _NO_CORRELATION, 0.0, correlation)
 
 
 @dataclass(frozen=True, eq=False)

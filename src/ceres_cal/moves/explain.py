@@ -17,7 +17,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate
@@ -36,7 +36,8 @@ _RARE = 1e-4
 # Times the noise of the old calibration, from where on the lens is doubted. Below 1 nothing is quiet enough to be
 # named; at double nothing changes.
 _NOISIER = 1.5
-# Times the noise of the old calibration, from where on nothing is explained. Nothing changes from half to double.
+# Times the noise of the old calibration, from where on nothing is explained, unless most observations lie where they
+# should. Nothing changes from half to double.
 _TOO_NOISY = 4.0
 # Nats by which another explanation must be better: a factor of 20 000. Nothing changes from half to double.
 _SUPPORTED = 10.0
@@ -94,29 +95,35 @@ def old_poses(plan: RefitPlan, search: PoseSearch) -> list[Pose]:
 
 def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError:
     """What else the observations of the stations could be, as the error that refuses them."""
-    for search in searches:
-        words = next(_others(plan, search), None)
-        station = search.sight.key.station
-        if words is not None:
-            return SolutionError(f"station {station!r}: its observations do not fit the known lens and field; {words}")
     names = ", ".join(repr(search.sight.key.station) for search in searches)
-    return SolutionError(
+    return _other_explanation(plan, searches) or SolutionError(
         f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
         "field: check labels, which camera and which field it is"
     )
 
 
+def _other_explanation(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError | None:
+    """The first that fits better than what was known."""
+    for search in searches:
+        words = next(_others(plan, search), None)
+        station = search.sight.key.station
+        if words is not None:
+            return SolutionError(f"station {station!r}: its observations do not fit the known lens and field; {words}")
+    return None
+
+
 def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
-    """Explanations that fit, in words, with what to do."""
+    """Explanations that fit, and better than what was known, in words, with what to do."""
     old = old_poses(plan, search)
+    known = _least_misfit(search, old)
     mirrored = relabelled(search.observations, MIRRORED)
-    if mirrored is not None and _fits(_seen_as(search, mirrored), old):
+    if mirrored is not None and _fits(_seen_as(search, mirrored), old, known):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
     for name, observations in mistaken_targets(search.observations).items():
-        if _fits(_seen_as(search, observations), old):
+        if _fits(_seen_as(search, observations), old, known):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
     zoomed = zoomed_search(search, old)
-    if zoomed is not None and _good(zoomed[1]) and plan.what not in ("zoom", "everything"):
+    if zoomed is not None and _good(zoomed[1], known) and plan.what not in ("zoom", "everything"):
         phi = zoomed[0].camera.phi
         before = search.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
@@ -129,14 +136,20 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
         yield f"with another lens they do: {WORDS['everything']}: calibrate it anew"
 
 
-def _fits(search: PoseSearch, old: list[Pose]) -> bool:
+def _least_misfit(search: PoseSearch, old: list[Pose]) -> float:
+    return min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
+
+
+def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
     candidates = pose_candidates(search, old, patience=0)
-    return bool(candidates) and _good(candidates[0])
+    return bool(candidates) and _good(candidates[0], known)
 
 
-def _good(candidate: PoseCandidate) -> bool:
-    """Whether a pose explains the observations about as well as the old calibration did its own."""
-    return candidate.fits and candidate.scale < _NOISIER
+def _good(candidate: PoseCandidate, known: float) -> bool:
+    """Whether a pose explains the observations about as well as the old calibration did its own, and better than the
+    known lens and labels do, whose least misfit is `known`: strays fit neither.
+    """
+    return candidate.fits and candidate.scale < _NOISIER and candidate.misfit < known - _SUPPORTED
 
 
 def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
@@ -196,11 +209,16 @@ def judged(plan: RefitPlan, what: str, result: Calibration) -> RefitVerdict:
     return RefitVerdict(float(off @ off), len(off), max(noise, default=1.0))
 
 
-def require_supported(plan: RefitPlan, result: Calibration, attempt: Callable[[str, Estimate], Calibration]) -> bool:
+def require_supported(
+    plan: RefitPlan,
+    result: Calibration,
+    searches: Sequence[PoseSearch],
+    attempt: Callable[[str, Estimate], Calibration],
+) -> bool:
     """Whether nothing fits; SolutionError where another explanation than the chosen one is supported.
 
     Args:
-        attempt: solves again with another freedom, from an estimate.
+        searches: of each station that moved. attempt: solves again with another freedom, from an estimate.
     """
     doubtful = judged(plan, plan.what, result).doubtful
     results = {plan.what: result}
@@ -220,7 +238,25 @@ def require_supported(plan: RefitPlan, result: Calibration, attempt: Callable[[s
             f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "
             f"(better by {gain:.0f} nats): refit with --what {best}"
         )
-    return judged(plan, plan.what, result).noise > _TOO_NOISY or best != plan.what
+    if best != plan.what or judged(plan, plan.what, result).noise < _TOO_NOISY:
+        return best != plan.what
+    if not _explains(plan, result):
+        return True
+    other = _other_explanation(plan, searches)
+    if other is not None:
+        raise other
+    return False
+
+
+def _explains(plan: RefitPlan, result: Calibration) -> bool:
+    """Whether most of what each moved station sees lies where the result puts it.
+
+    The noise of its few points alone does not tell: three of five may be strays.
+    """
+    moved = (sight for name, sight in plan.sights.of_world.items() if name in plan.moved)
+    searches = [PoseSearch(plan.observations, sight, result.estimate, plan.scales) for sight in moved]
+    stations = result.estimate.stations
+    return all(candidate_at(one, stations[one.sight.key.station].cam_from_world).fits for one in searches)
 
 
 def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:

@@ -81,8 +81,9 @@ def refit(
 
     result = attempt(what, estimate, assessed=True)
     try:
-        if require_supported(plan, result, attempt):
-            raise why_nothing_fits(plan, [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)])
+        searches = [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)]
+        if require_supported(plan, result, searches, attempt):
+            raise why_nothing_fits(plan, searches)
     except SolutionError as error:
         stated = [conflict.words for conflict in result.conflicts if conflict.kind == "prior"]
         if not stated:

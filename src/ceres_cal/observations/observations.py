@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.words import printable
 from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (
     Alone,
@@ -229,6 +230,10 @@ class Observations(Content):
                 or (placement is not None and placed.setdefault(placement, target) != target)
             ):
                 raise InputError(self._odd_view(number, owner, placed))
+        frames = {view.frame: None for view in self.views}
+        for what, names in (("camera", self.cameras), ("target", self.targets), ("frame", frames), ("station", owner)):
+            _require_letters(what, names)
+        _require_letters("placement", placed)
 
     def _odd_view(self, number: int, owner: Mapping[str, str], placed: Mapping[str, str]) -> str:
         """What is wrong with a view. owner, placed: camera of each station and target of each placement before."""
@@ -340,3 +345,12 @@ def combine(parts: Sequence[Observations]) -> Observations:
         Curves(**joined([part.curves for part in parts])),
         tuple(dict.fromkeys(prior for part in parts for prior in part.priors)),
     )
+
+
+def _require_letters(what: str, names: Iterable[str]) -> None:
+    """Raise InputError where a name holds bytes that are no UTF-8, as words of a command line may: no file can."""
+    try:
+        "".join(names).encode()
+    except UnicodeEncodeError:
+        odd = next(name for name in names if name != printable(name))
+        raise InputError(f"{what} '{printable(odd)}': a name must be UTF-8: give another one") from None

@@ -19,6 +19,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import RigPair, rig_pairs, seam_map
 from ceres_cal.posterior.weak import Verdict, WeakDirection, ratio_sd, unknown_placements, verdicts, weak_directions
 from ceres_cal.problem.parameters import Estimate
+from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.targets import Target
 
 _GRID = 36  # steps along the longer side
@@ -27,16 +28,21 @@ _WIDENED = 1.1  # factor on standard deviations that is worth a word
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well a calibration is known. It holds as far as the model does: see `Posterior`."""
+    """How well a calibration is known. It holds as far as the model does: see `Posterior`.
+
+    Attributes:
+        conflicts: what was stated and everything else contradicts.
+    """
 
     estimate: Estimate
     posterior: Posterior
     targets: Mapping[str, Target]
+    conflicts: tuple[Conflict, ...] = ()
 
     @cached_property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """Known, weak or unknown, of each shared number."""
-        return verdicts(self.estimate, self.posterior)
+        """Known, weak, unknown or in conflict, of each shared number."""
+        return verdicts(self.estimate, self.posterior, self.conflicts)
 
     def table(self) -> list[dict[str, Any]]:
         """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""

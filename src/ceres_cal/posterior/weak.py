@@ -15,10 +15,13 @@ from ceres_cal.posterior.profile import FARTHER
 from ceres_cal.problem.information import PLACEMENT_QUANTITIES, Key, sigma_limits
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes, values_of
+from ceres_cal.robust.stated import Conflict
 
 KNOWN, WEAK = 0.01, 0.3
 """Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
 degrees), up to the second it is weak, beyond it, or with a bound that is open, unknown."""
+CONFLICT = "in conflict"
+_GIVES_WAY = ("usual", "tolerance")  # kinds of conflict in which what was stated is not kept
 _LEARNT = 0.5  # of a tolerance's sigma: what the data must add to call the offset of a line known
 # Of the largest share: smaller ones are not named. Nothing changes from half to double.
 _IN_WORDS = 0.3
@@ -35,7 +38,8 @@ class Verdict:
         sd: by the quadratic picture, infinite where unknown; where phi is followed along its profile, half the distance
             of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural size,
             infinite also for phi and height where the valley is open.
-        verdict: "known", "weak" or "unknown" (see KNOWN and WEAK). by_profile: whether the bounds are the profile's.
+        verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": its sd is the one that was stated,
+            and everything else contradicts it. by_profile: whether the bounds are the profile's.
         factor: standard deviation as the data scatter over that by the model alone.
     """
 
@@ -64,8 +68,13 @@ class WeakDirection:
     shares: tuple[tuple[Key, float], ...]
 
 
-def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
-    """One for each shared number, in the order of the posterior's keys."""
+def verdicts(estimate: Estimate, posterior: Posterior, conflicts: Sequence[Conflict] = ()) -> tuple[Verdict, ...]:
+    """One for each shared number, in the order of the posterior's keys.
+
+    Args:
+        conflicts: what was stated and everything else contradicts.
+    """
+    disputed = {(one.owner, one.quantity, one.unit) for one in conflicts if one.kind not in _GIVES_WAY}
     bounds, values = posterior.bounds, values_of(estimate, posterior.keys)
     half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
     if posterior.profiles:  # a valley that widens farther out is no better known than there
@@ -82,14 +91,14 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
     sd = np.where(followed, half, posterior.sd)
     columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
     return tuple(
-        Verdict(key, value, sigma, bottom, top, share, _word(key, share), by_profile, factor)
+        Verdict(key, value, sigma, bottom, top, share, _word(key, share, key[1:] in disputed), by_profile, factor)
         for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
     )
 
 
-def _word(key: Key, relative: float) -> str:
+def _word(key: Key, relative: float, is_disputed: bool) -> str:
     known, weak = (_LEARNT, 0.95) if key.kind == "structure" else (KNOWN, WEAK)
-    return "known" if relative <= known else "weak" if relative <= weak else "unknown"
+    return "unknown" if relative > weak else CONFLICT if is_disputed else "known" if relative <= known else "weak"
 
 
 def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:

@@ -166,7 +166,7 @@ class Document(NamedTuple):
     """What a command answers: sections in the order in which they are read.
 
     Attributes:
-        exit_code: 0, or 1 where the answer is no.
+        exit_code: 0, or 1 where the answer is no or a part of it could not be made.
     """
 
     sections: tuple[Section, ...]

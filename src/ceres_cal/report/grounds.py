@@ -157,7 +157,7 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     yield from ((level, f"{sentence(words)}.") for words in weak[:_MOST_LINES])
     if len(weak) > _MOST_LINES:
         yield level, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
-    if not weak:
+    if not weak and not disputed(quality):
         yield "good", "Every number of the cameras and stations is known to 1 % or better."
     lost = quality.uncertainty.unknown_placements
     if lost:
@@ -211,7 +211,7 @@ def focal(quality: Quality) -> Iterator[Verdict]:
 
 def level_of_verdict(verdict: Verdict) -> str:
     """Good where it is known, care where it is weak."""
-    return {"known": "good", "weak": "care", "unknown": "no"}[verdict.verdict]
+    return {"known": "good", "weak": "care"}.get(verdict.verdict, "no")
 
 
 def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple[str, str]:

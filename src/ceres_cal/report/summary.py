@@ -224,7 +224,7 @@ def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
     """The numbers on a page."""
     intro = (
         "In the paper's units; coefficients with its a1 = 1 (another a1 goes with a1 a2, a1 a3 and a1 phi). Known "
-        "means to 1 % or better, weak to 30 %."
+        "means to 1 % or better, weak to 30 %, in conflict that everything else contradicts what was stated."
     )
     every = (*number_sections(quality), *accuracy_sections(quality, seams))
     return Chapter("numbers", "The numbers", (Text(intro), *(piece for one in every for piece in one.pieces)))

@@ -38,6 +38,7 @@ from ceres_cal.robust.wholes import (
     inliers_of,
     mostly_rejected,
     rows_looked_at,
+    wholes_looked_at,
     wholes_of,
 )
 
@@ -323,7 +324,7 @@ class _Competition:
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(problem, end.solution.estimate, equations, weights)
-        chosen = np.flatnonzero(wholes.count(rows & (inliers_of(end) | recalled)) >= FEWEST)
+        chosen, share = wholes_looked_at(observations, wholes, end, rows & (inliers_of(end) | recalled), back)
         columns, group = wholes.modes(equations, chosen)
         agreeing = model.used.copy()
         for number in back:
@@ -336,7 +337,9 @@ class _Competition:
             model = make_linear_model(problem, end.solution.estimate, equations, replace(weights, used=agreeing))
         if len(chosen) < 2:
             return chosen, None
-        return chosen, measure_offsets(model, columns, group, fault_of(wholes.of_features))
+        fault = fault_of(wholes.of_features)
+        fault = replace(fault, probability=share * fault.probability)  # that it is one of those that are looked at
+        return chosen, measure_offsets(model, columns, group, fault)
 
 
 def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:

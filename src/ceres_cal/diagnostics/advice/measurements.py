@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior
 from ceres_cal.observations.sights import gather_sights
@@ -79,9 +79,16 @@ class Ground:
     def information_of(self, measurement: Measurement) -> Information:
         """What a measurement would say of the free numbers, its own unknowns integrated out.
 
-        A placement is one of those, and so is how far a pole stands aside. It is nothing where the camera sees nothing.
-        Tolerances that the calibration had already are no news.
+        A placement is one of those, and so is how far a pole stands aside. It is nothing where the camera sees nothing,
+        or cannot project what it sees. Tolerances that the calibration had already are no news.
         """
+        try:
+            return self._told_by(measurement)
+        except (InputError, SolutionError):  # quiet: what tells nothing ranks last
+            return Information.nothing(self.keys)
+
+    def _told_by(self, measurement: Measurement) -> Information:
+        """The same; raises where nothing is told."""
         targets = {**self.targets, **measurement.targets}
         estimate = self._with(measurement, targets)
         observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
@@ -106,12 +113,8 @@ class Ground:
 
 def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:
     """What the views would show where everything is as estimated, without noise, in units of sigma 1."""
-    unseen = Observations(targets, {}, (), NO_POINTS, NO_CURVES)
     if not views:
-        return unseen
+        return Observations(targets, {}, (), NO_POINTS, NO_CURVES)
     stations = {plan.station: estimate.stations[plan.station] for plan in views}
     cameras = {station.camera: estimate.cameras[station.camera] for station in stations.values()}
-    try:
-        return simulate(Scene(targets, cameras, stations, estimate.placements, views)).observations
-    except InputError:  # quiet: the camera sees nothing of it, and what tells nothing ranks last
-        return unseen
+    return simulate(Scene(targets, cameras, stations, estimate.placements, views)).observations

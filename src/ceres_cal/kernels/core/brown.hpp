@@ -26,7 +26,7 @@ class Brown final : public Lens {
             for (int i = 0; i < 4; ++i)
                 rising[2 * (j + i)] += k_[j] * q_[i] * (2.0 * j + 1.0 - 2.0 * i) / (2.0 * (j + i) + 1.0);
         }
-        limit_ = std::min(growing_until(rising, 13, FAR), growing_until(under, 7, FAR));
+        limit_ = std::min(growing_until(rising, 13, FAR, FARTHEST), growing_until(under, 7, FAR, FARTHEST));
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
@@ -82,7 +82,7 @@ class Brown final : public Lens {
     }
 
   private:
-    static constexpr double FAR = 6.0;  // ideal radii: nothing is observed farther out
+    static constexpr double FAR = 6.0, FARTHEST = 1e4;  // ideal radii, of 80.5 and 89.994 degrees off the axis
 
     double p1_, p2_, k_[4] = {1.0}, q_[4] = {1.0}, s_[4] = {}, limit_ = 0.0;
     int rational_, prism_;

@@ -13,7 +13,7 @@ class KannalaBrandt final : public Lens {
         for (int j = 0; j < 4; ++j) k_[j] = from.intrinsics[4 + j];
         if (tangential_ > 0) decentring_ = {from.intrinsics[tangential_], from.intrinsics[tangential_ + 1]};
         const double dense[9] = {1.0, 0.0, k_[0], 0.0, k_[1], 0.0, k_[2], 0.0, k_[3]};
-        limit_ = growing_until(dense, 9, PI);
+        limit_ = growing_until(dense, 9, PI, PI);
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {

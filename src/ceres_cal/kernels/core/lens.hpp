@@ -1,6 +1,7 @@
 // What a lens does for the solve, as the camera's optics: a chunk of rays at a time.
 #pragma once
 
+#include <algorithm>
 #include <stdexcept>
 
 #include "chunk.hpp"
@@ -105,15 +106,18 @@ inline double radial_slope(const double* dense, int count, double x) {
     return total;
 }
 
-// Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `far`, the end of what can be observed.
-inline double growing_until(const double* dense, int count, double far) {
+// Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `farthest`, the end of what can be observed. It is looked
+// for in equal steps up to `far`, and in growing ones beyond.
+inline double growing_until(const double* dense, int count, double far, double farthest) {
     constexpr int STEPS = 96, HALVINGS = 50;
-    const double step = far / STEPS;
-    int i = 1;
-    while (i <= STEPS && radial_slope(dense, count, i * step) > 0.0) ++i;
-    if (i > STEPS) return far;
-    double low = (i - 1) * step, high = i * step;
-    for (int half = 0; half < HALVINGS; ++half) {
+    constexpr double GROWTH = 1.1;
+    double low = 0.0, high = far / STEPS;
+    while (radial_slope(dense, count, high) > 0.0) {
+        if (high >= farthest) return farthest;
+        low = high;
+        high = std::min(high < far ? high + far / STEPS : GROWTH * high, farthest);
+    }
+    for (int i = 0; i < HALVINGS; ++i) {
         const double middle = 0.5 * (low + high);
         (radial_slope(dense, count, middle) > 0.0 ? low : high) = middle;
     }

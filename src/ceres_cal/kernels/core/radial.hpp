@@ -22,7 +22,7 @@ class Radial final : public Lens {
         dense_[0] = 1.0;
         for (size_t k = 0; k < powers_.size(); ++k)
             dense_[static_cast<size_t>(powers_[k]) - 1] += from.intrinsics[4 + static_cast<int>(k)];
-        limit_ = growing_until(dense_.data(), static_cast<int>(dense_.size()), FAR);
+        limit_ = growing_until(dense_.data(), static_cast<int>(dense_.size()), FAR, FAR);
         if (tangential_ > 0) across_ = {from.intrinsics[tangential_], from.intrinsics[tangential_ + 1]};
     }
 
