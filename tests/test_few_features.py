@@ -1,5 +1,6 @@
 """A known camera over few features: two lines and an arc, an arc and a crossing; what is seen alike from two places."""
 
+import re
 from collections.abc import Collection
 from dataclasses import replace
 
@@ -60,10 +61,14 @@ def test_lines_and_an_arc(features: tuple[str, ...]) -> None:
 
 
 def test_seen_alike_from_two_places() -> None:
-    """Three points have up to four poses (Grunert); the height tells them apart."""
+    """Three points have up to four poses (Grunert): the other is named and in the deviations; the height tells."""
     three = seen(("BottomRightCorner", "CenterMark", "RightCircleCrossing"))
-    with pytest.raises(DegenerateError, match=r"station 'hall': what it shows is seen alike from \(.*\) m and from \("):
-        calibrate(three, KNOWN)
+    calibration = calibrate(three, KNOWN)
+    (warning,) = calibration.warnings
+    assert re.match(
+        r"station 'hall': what it shows is seen alike from \(.*\) m and from \(2\.80, 0\.50, 4\.00\)", warning
+    )
+    assert off_in_sd(calibration) < 1.0  # 0.7
     assert off_in_sd(calibrate(replace(three, priors=(HEIGHT,)), KNOWN)) < 3.0  # 0.4
 
 

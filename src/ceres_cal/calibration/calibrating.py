@@ -38,7 +38,7 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
-from ceres_cal.robust.other_minima import least_of_few
+from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.usable import require_fits, require_possible, require_usable
@@ -259,7 +259,7 @@ def solved_from(
     as_built: tuple[AsBuilt, ...] = ()
     if again is None and problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
-    end, others = least_of_few(problem, observations, end) if again is None else (end, ())
+    end, others = least_of_few(problem, observations, end, start.others) if again is None else (end, ())
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     posterior, conflicts, settled = None, Conflicts(), None
@@ -277,7 +277,11 @@ def solved_from(
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
-        warnings = (*warnings, *resting_phi(end, problem))
+        warnings = (
+            *warnings,
+            *resting_phi(end, problem),
+            *seen_alike(others, end.solution.estimate, posterior.half_width),
+        )
     if digest is not None:
         digest.result()  # which the observations remember
     calibration = came_out(start.phi_from, observations, problem, end, explanations)

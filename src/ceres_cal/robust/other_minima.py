@@ -1,4 +1,4 @@
-"""Other minima of few observations: where a solve ends that begins at another phi.
+"""Other minima of few observations: where a solve ends that begins at another phi, or where a start may be as well.
 
 A floor seen by few points and lines may be explained from two places, by two lenses; a start cannot tell which of the
 minima is the least, nor that there are two.
@@ -6,9 +6,11 @@ minima is the least, nor that there are two.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+
+import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
@@ -25,23 +27,24 @@ _FACTORS = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen bega
 _MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hundreds that change nothing here
 # Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
 _OTHER = 0.25
+_APART = 0.05  # of the height: places that are no farther apart are one valley, which the standard deviations show
 _LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
 
 
 def least_of_few(
-    problem: Problem, observations: Observations, end: RobustSolution
+    problem: Problem, observations: Observations, end: RobustSolution, elsewhere: Sequence[Estimate] = ()
 ) -> tuple[RobustSolution, tuple[Solution, ...]]:
     """The end of all rounds in the least minimum that is found from there, and others, with what they cost beyond it;
     where all observations are inliers.
 
     Args:
-        problem: of all the observations. end: of its rounds.
+        problem: of all the observations. end: of its rounds. elsewhere: starts that showed the observations alike.
     """
     count = end.problem.sights.equations
     if count >= _FEW or count < problem.sights.equations:  # what was taken out belongs to the minimum it was judged in
         return end, ()
     least = solve(end.problem, end.solution.estimate)
-    others = list(_elsewhere(end.problem, least.estimate))
+    others = list(_ends(end.problem, (*_at_other_phi(end.problem, least.estimate), *elsewhere)))
     lowest = min(others, key=lambda one: one.cost, default=least)
     if 2.0 * (least.cost - lowest.cost) > _LOWER:
         others.append(least)
@@ -63,14 +66,38 @@ def shifts_to(
     return [d for one, d in shifts if 2.0 * one.cost < min(half_width**2, _OTHER * float(d @ information.matrix @ d))]
 
 
-def _elsewhere(problem: Problem, estimate: Estimate) -> Iterator[Solution]:
-    """Where solves end that begin with other phis; the same minimum may come again."""
+def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[str]:
+    """A warning for each station that may stand elsewhere, with the likeliest other place.
+
+    Args:
+        others, half_width: see `shifts_to`.
+    """
+    for name, station in estimate.stations.items():
+        here = station.cam_from_world.position
+        for one in sorted(others, key=lambda other: other.cost):
+            there = one.estimate.stations[name].cam_from_world.position
+            if 2.0 * one.cost < half_width**2 and np.linalg.norm(there - here) > _APART * abs(here[2]):
+                places = (", ".join(f"{value:.2f}" for value in place) for place in (here, there))
+                first, second = (f"({place}) m" for place in places)
+                yield (
+                    f"station {name!r}: what it shows is seen alike from {first} and from {second}: add a point or a "
+                    "line, or the camera's height as a prior"
+                )
+                break
+
+
+def _ends(problem: Problem, starts: Iterable[Estimate]) -> Iterator[Solution]:
+    """Where solves end; the same minimum may come again."""
     short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
+    for start in starts:
+        with suppress(CalibrationError):  # quiet: nothing is seen from there, so no minimum is
+            solution = solve(replace(problem, options=short), start, is_near=False)
+            if not solution.failed:
+                yield solution
+
+
+def _at_other_phi(problem: Problem, estimate: Estimate) -> Iterator[Estimate]:
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         for factor in _FACTORS:
             camera = estimate.cameras[name]
-            start = replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})
-            with suppress(CalibrationError):  # quiet: nothing is seen from there, so no minimum is
-                solution = solve(replace(problem, options=short), start, is_near=False)
-                if not solution.failed:
-                    yield solution
+            yield replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})

@@ -43,6 +43,17 @@ class RadialProfile:
             w += c * squared**k
         return np.column_stack([offsets, w])
 
+    def slope(self, radius: Array) -> Array:
+        """(N,) derivative of w by the radius r, over r, per px^2."""
+        squared = (radius / self.unit_px) ** 2
+        terms = [2.0 * k * c * squared ** (k - 1) for k, c in enumerate(self.coefficients, start=1)]
+        return np.asarray(sum(terms, np.zeros(len(radius))) / self.unit_px**2)
+
+    def bent(self, bend: float) -> RadialProfile:
+        """With so much more of r^2."""
+        first, *rest = self.coefficients or (0.0,)
+        return RadialProfile((first + bend, *rest), self.unit_px)
+
 
 def null_vector(matrix: ArrayLike) -> Array:
     """Unit vector that a symmetric positive semidefinite matrix shrinks most."""

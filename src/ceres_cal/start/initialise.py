@@ -16,15 +16,15 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, Options, Station, anchored_stations, unit_px
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
-from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
-from ceres_cal.start.few_features import pose_of_few
+from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
 from ceres_cal.start.planes import Homographies, profile_and_homographies
+from ceres_cal.start.world import Placed, beforehand, placed
 
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
@@ -34,6 +34,10 @@ _MARGIN = 1.15  # of what a start takes for the edge of the picture: its profile
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 _RADII = np.linspace(0.02, 1.0, 50)  # of the observed ones, at which lenses are compared
+_ANY_PHI = (
+    0.8  # standard deviation of log phi for a search: lenses of cranes and stands, five half diagonals, are within two
+)
+_LEAST_SD = 1e-3  # of phi, as a share: a start is no better
 _GRAZING = 0.02  # cosine of the angle at which a ray has no ideal radius any more
 
 
@@ -43,11 +47,13 @@ class Start:
 
     Attributes:
         is_near: whether it is near the minimum, but for private placements: no gross error decides from there.
+        others: that show a station's view alike from elsewhere.
     """
 
     estimate: Estimate
     phi_from: Mapping[str, str]
     is_near: bool = False
+    others: tuple[Estimate, ...] = ()
 
 
 @numerical("the initial estimate")
@@ -57,29 +63,63 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
     """
-    cameras, phi_from, numbers, poses = posed_sights(observations, sights, options)
-    stations, placements = chained_poses(observations, sights, numbers, poses)
+    posed = posed_sights(observations, sights, options)
+    stations, placements = chained_poses(observations, sights, posed.numbers, posed.poses, open_numbers=posed.open)
     structure = make_structure(observations.targets, options.tolerances, options.dimensions)
-    return Start(Estimate(cameras, stations, placements, structure), phi_from)
+    estimate = Estimate(posed.cameras, stations, placements, structure)
+    others = tuple(
+        replace(
+            estimate,
+            cameras={**posed.cameras, key.camera: camera},
+            stations={**stations, key.station: Station(key.camera, Pose(pose[:, :3], pose[:, 3]))},
+        )
+        for key, pose, camera in posed.others
+    )
+    return Start(estimate, posed.phi_from, others=others)
 
 
-def posed_sights(
-    observations: Observations, sights: Sights, options: Options
-) -> tuple[dict[str, Camera], dict[str, str], Indices, Array]:
-    """Cameras and where their phi is from, by name; numbers (K,) and poses (K, 3, 4) of the sights that they pose."""
-    cameras: dict[str, Camera] = {}
-    phi_from: dict[str, str] = {}
-    numbers, poses = [], []
+@dataclass(frozen=True, eq=False)
+class PosedSights:
+    """Cameras and the sights that they were posed by.
+
+    Attributes:
+        cameras, phi_from: by name. numbers: (K,) of sights. poses: (K, 3, 4) cam_from_frame.
+        others: sights of the world that are seen alike from elsewhere: pose (3, 4) and the camera there.
+        open: number of a sight -> names of what it leaves open.
+    """
+
+    cameras: dict[str, Camera]
+    phi_from: dict[str, str]
+    numbers: Indices
+    poses: Array
+    others: tuple[tuple[SightKey, Array, Camera], ...]
+    open: dict[int, tuple[str, ...]]
+
+
+def posed_sights(observations: Observations, sights: Sights, options: Options) -> PosedSights:
+    """Every camera with the sights that pose it, each camera by itself."""
+    starts: dict[str, _CameraStart] = {}
+    numbers: list[Indices] = []
+    others: list[tuple[SightKey, Array, Camera]] = []
+    left: dict[int, tuple[str, ...]] = {}
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
         blank = _blank_camera(name, image_size, options, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
         start = _start_camera(blank, seen, options, [p for p in priors if _concerns(p, name, seen)])
-        cameras[name], phi_from[name] = start.camera, start.phi_from
+        starts[name] = start
         numbers.append(own[start.sights])
-        poses.append(start.poses)
-    return cameras, phi_from, np.concatenate(numbers), np.concatenate(poses)
+        others += [(seen.keys[n], pose, camera) for n, pose, camera in start.others]
+        left |= {int(own[n]): names for n, names in start.open.items()}
+    return PosedSights(
+        {name: start.camera for name, start in starts.items()},
+        {name: start.phi_from for name, start in starts.items()},
+        np.concatenate(numbers),
+        np.concatenate([start.poses for start in starts.values()]),
+        tuple(others),
+        left,
+    )
 
 
 # ---- one camera -----------------------------------------------------------------------------------------------------
@@ -87,44 +127,89 @@ def posed_sights(
 
 @dataclass(frozen=True)
 class _CameraStart:
+    """Of one camera.
+
+    Attributes:
+        sights, poses: numbers (K,) and cam_from_frame (K, 3, 4). others: number of a sight, its pose (3, 4) and the
+            camera where that is seen from elsewhere. open: what each other sight of the world leaves open.
+    """
+
     camera: Camera
     phi_from: str
     sights: Indices
     poses: Array
+    others: tuple[tuple[int, Array, Camera], ...]
+    open: Mapping[int, tuple[str, ...]]
 
 
 def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior]) -> _CameraStart:
     """From the sights of one camera about its principal point, and the priors that concern it."""
     unit = unit_px(blank)
-    profile, homographies = profile_and_homographies(sights, unit)
+    given = _held_profile(blank, sights, options)
+    profile, homographies = profile_and_homographies(sights, unit, given)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, priors)
+    poses = dict(zip(homographies.sights.tolist(), _poses_at(homographies, phi), strict=True))
+    sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
+    of_world = sorted((n for n, key in enumerate(sights.keys) if key.placement is None), key=lambda n: -sizes[n])
+    # Boards tell phi and lens better than what no homography explains.
+    told = phi_from == "fixed" or (phi_from != "guess" and len(homographies.sights) > 1)
+    found: dict[int, Placed] = {}
+    for number in of_world:
+        log_phi, may_bend = _known_phi(phi, told, unit, priors), given is None and not told and number not in poses
+        known = beforehand(priors, sights.keys[number].station, log_phi, may_bend=may_bend)
+        one = placed(sights[number], profile, known, poses.get(number), float(np.log(phi)))
+        found[number], best = one, one.places[0]
+        if not told:
+            phi, profile = best.phi, profile.bent(best.bend)
+            known_phi = any(p.quantity in ("phi", "height_m", "position_m") for p in priors)
+            phi_from = "guess" if not one.tells_phi else "prior" if known_phi else "views"
+            poses = dict(zip(homographies.sights.tolist(), _poses_at(homographies, phi), strict=True))
+            told = one.tells_phi
+    poses |= {n: one.places[0].pose for n, one in found.items() if n in poses or not one.open}
+    others = tuple(
+        (n, place.pose, _with_lens(blank, sights, profile.bent(place.bend - one.places[0].bend), place.phi, options))
+        for n, one in found.items()
+        for place in one.places[1:]
+        if n in poses
+    )
+    camera = _with_lens(blank, sights, profile, phi, options)
+    numbers, stack = np.array(list(poses), dtype=np.int64), np.array(list(poses.values())).reshape(-1, 3, 4)
+    lost = {n: one.open for n, one in found.items() if n not in poses}
+    return _CameraStart(camera, phi_from, numbers, stack, others, lost)
+
+
+def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> tuple[float, float]:
+    """Mean and standard deviation of log phi that a search of a sight begins with."""
+    if told:
+        return float(np.log(phi)), 0.0
+    for prior in priors:
+        if prior.quantity == "phi":
+            return float(np.log(prior.value[0])), max(prior.sigma[0] / prior.value[0], _LEAST_SD)
+    return float(np.log(USUAL_PHI * unit)), _ANY_PHI
+
+
+def _with_lens(blank: Camera, sights: Sights, profile: RadialProfile, phi: float, options: Options) -> Camera:
+    """The camera with the lens that comes nearest to a profile."""
     r = _RADII * sights.reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
     seen = LensProfile(r, np.arctan2(r, phi * w))
     beyond = edge_over(blank, sights.reach_px)
     spanning = blank.lens.spanning(float(seen.angles[-1]), phi, beyond, blank.image_size)
-    lens = seen.nearest(spanning, phi, options.held)
-    camera = replace(blank, phi=phi, lens=lens)
-    numbers, poses = homographies.sights, _poses_at(homographies, phi)
-    if phi_from != "guess":
-        more = _poses_of_few(sights, camera, numbers, priors)
-        numbers, poses = np.append(numbers, list(more)).astype(np.int64), np.concatenate([poses, *more.values()])
-    return _CameraStart(camera, phi_from, numbers, poses)
+    return replace(blank, phi=phi, lens=seen.nearest(spanning, phi, options.held))
 
 
-def _poses_of_few(sights: Sights, camera: Camera, posed: Indices, priors: Sequence[Prior]) -> dict[int, Array]:
-    """Number and cam_from_world (1, 3, 4) of sights of the world that have no homography, where they determine one."""
-    poses: dict[int, Array] = {}
-    for number, key in enumerate(sights.keys):
-        if key.placement is not None or number in posed:
-            continue
-        stated = [p for p in priors if p.name == key.station and p.quantity in ("height_m", "position_m")]
-        heights, sight = [(p.value[-1], p.sigma[-1]) for p in stated], sights[number]
-        rays = tuple(camera.lens.undistort(pixels, camera.phi) for pixels in (sight.pixels, sight.curve_pixels))
-        pose = pose_of_few(sight, (rays[0], rays[1]), camera.phi, heights[0] if heights else None)
-        if pose is not None:
-            poses[number] = pose[None]
-    return poses
+def _held_profile(blank: Camera, sights: Sights, options: Options) -> RadialProfile | None:
+    """That of a lens of which all is held; None where something is free, or depends on a phi that is not held."""
+    if not set(blank.lens.names) <= set(options.held) or blank.lens.set_at_start:
+        return None
+    if any(blank.lens.values) and "phi" not in options.fixed and blank.lens.kind != "radial":
+        return None
+    phi, unit = options.fixed.get("phi", unit_px(blank)), unit_px(blank)
+    seen = LensProfile.of(replace(blank, phi=phi), sights.reach_px)
+    squared = (seen.radii_px / unit) ** 2
+    w = seen.radii_px / (phi * np.tan(seen.angles))
+    powers = np.column_stack([squared, squared**2, squared**3])
+    return RadialProfile(tuple(np.linalg.lstsq(powers, w - 1.0, rcond=1e-12)[0].tolist()), unit)
 
 
 def edge_over(camera: Camera, reach_px: float) -> float:
@@ -278,11 +363,13 @@ def chained_poses(
     numbers: Indices,
     poses: Array,
     standing: Mapping[str, Station] | None = None,
+    open_numbers: Mapping[int, tuple[str, ...]] | None = None,
 ) -> tuple[dict[str, Station], Poses]:
     """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known.
 
     Args:
-        numbers: (K,) of these sights. standing: stations whose place is known.
+        numbers: (K,) of these sights. standing: stations whose place is known. open_numbers: what other sights leave
+            open, by their numbers.
 
     Raises:
         DegenerateError: naming a sight that nothing places.
@@ -307,7 +394,7 @@ def chained_poses(
             rows = list(fresh.values())
             world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
             placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
-    _require_all(observations, sights, stations, placements)
+    _require_all(observations, sights, stations, placements, open_numbers or {})
     cameras = observations.stations
     named = [name for name in placements if name is not None]
     return (
@@ -317,15 +404,21 @@ def chained_poses(
 
 
 def _require_all(
-    observations: Observations, sights: Sights, stations: Container[str], placements: Container[str | None]
+    observations: Observations,
+    sights: Sights,
+    stations: Container[str],
+    placements: Container[str | None],
+    open_numbers: Mapping[int, tuple[str, ...]],
 ) -> None:
     for number, key in enumerate(sights.keys):
         if key.station in stations and key.placement in placements:
             continue
         sight = sights[number]
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
+        names = ", ".join(open_numbers.get(number, ()))
+        what = f"its pose: {names} of the camera stay open" if names else "its pose"
         raise DegenerateError(
             f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(distinct(sight.track_index))} curves) cannot fix its pose: give at least four points, "
+            f"(on {len(distinct(sight.track_index))} curves) cannot fix {what}: give at least four points, "
             "not on one line, or straight lines in two directions, two of each, or remove the view"
         )

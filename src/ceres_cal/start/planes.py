@@ -124,16 +124,20 @@ class Homographies:
 _NONE = Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
 
 
-def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile, Homographies]:
-    """A camera's radial profile and the homography of each of its sights that determines one; sights about it."""
+def profile_and_homographies(
+    sights: Sights, unit: float, known: RadialProfile | None = None
+) -> tuple[RadialProfile, Homographies]:
+    """A camera's radial profile, where it is not known, and the homography of each of its sights that determines one;
+    sights about it.
+    """
     pure, board = _flat_sights_of_points(sights)
     rest = np.delete(np.arange(len(sights)), pure)
     planes = {int(i): plane_sight(sights[int(i)]) for i in rest}
     matrices: dict[int, Array] = {}
-    profile: RadialProfile | None = None
+    profile = known
     if len(pure):
         data = _plane_data(board, _spread_rows(board.point_bounds))
-        profile = _profile_of_boards(board, data, unit)
+        profile = profile or _profile_of_boards(board, data, unit)
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].on_arc) and sights[i].on_arc.all():
             ring, matrices[i] = _from_rings(sights[i], unit)
@@ -143,9 +147,13 @@ def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
     lined = [(planes[i].lines, planes[i].pixels) for i in mixed]
     # Boards in a corner of the image may say nothing of the rest of it.
-    if profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined):
+    if known is None and (
+        profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined)
+    ):
         profile = _profile_from_lines(lined, unit)
-    matrices |= {i: _homography_of(planes[i], profile) for i in mixed}
+    profile = profile or RadialProfile((0.0, 0.0), unit)
+    fitted = {i: fit_lines(planes[i].lines, profile.lift(planes[i].pixels), rounds=6)[0] for i in mixed}
+    matrices |= {i: matrix for i, matrix in fitted.items() if matrix is not None}
     parts = [_NONE]
     for i, matrix in matrices.items():
         height, size = np.array([planes[i].height_m]), np.array([planes[i].size_px])
@@ -222,17 +230,6 @@ def _plane_data(board: Sights, rows: Indices) -> PlaneData:
         np.ascontiguousarray(board.points.take(rows, axis=0)[:, :2]),
         board.pixels.take(rows, axis=0),
     )
-
-
-def _homography_of(plane: PlaneSight, profile: RadialProfile) -> Array:
-    """H of one sight: plane (x, y, 1) m to (p in px, w)."""
-    homography, _ = fit_lines(plane.lines, profile.lift(plane.pixels), rounds=6)
-    if homography is None:
-        raise DegenerateError(
-            f"{plane.sight.key}: its {len(plane.points)} points and {plane.segments} lines "
-            "cannot fix the plane's pose (all on one line, or parallel): add points or lines in other directions"
-        )
-    return homography
 
 
 def _profile_from_lines(planes: Sequence[tuple[Array, Array]], unit: float) -> RadialProfile:

@@ -83,11 +83,11 @@ def _board_poses(observations: Observations) -> dict[SightKey, Pose]:
     ]
     if not symmetric:
         return {}
-    _, _, numbers, poses = posed_sights(observations, sights, _START)
+    posed = posed_sights(observations, sights, _START)
     wanted = set(symmetric)
     return {
         sights.keys[number]: Pose(pose[:, :3], pose[:, 3])
-        for number, pose in zip(numbers.tolist(), poses, strict=True)
+        for number, pose in zip(posed.numbers.tolist(), posed.poses, strict=True)
         if number in wanted
     }
 

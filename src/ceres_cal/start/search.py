@@ -1,0 +1,202 @@
+"""One search for where a camera stands and what its phi is: by all that one sight shows, whatever that is.
+
+Cameras that may be are drawn: those that closed forms propose, and a grid of rotations and of phi, whose positions are
+linear in what is seen. All are scored by the same robust cost of the same distances in px, the best brought to their
+minima by damped Gauss-Newton steps, and what costs no more than the least one by chance is kept beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.start.sightlines import Candidates, Sightlines
+
+_PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
+_TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
+_AZIMUTHS, _ROLLS = (1, 6, 11, 15, 18, 18), 18
+_FIRST, _THEN, _KEPT = 64, 12, 4  # cameras that take the first steps, then the rest, and that are answered
+_FIRST_STEPS, _STEPS, _LAST_STEPS = 6, 12, 20
+_LEAST_PX = 1e-3  # of a scale: below it all data are exact
+_FAR_PX = 1e6
+_LOWEST = 0.01  # of the extent of what is seen: a camera that lies on a line sees it everywhere
+_WIDEST = 2.7  # of log phi from the middle: from a fisheye to a telescope
+_MOST_STEP = 0.3  # rad, and of log phi
+_BEHIND = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
+_DAMPING, _LEAST_DAMPING = 1e-2, 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Beforehand:
+    """What is known of a camera beforehand: means and standard deviations, infinite where nothing is, 0 where a number
+    is held.
+    """
+
+    position: Array
+    position_sd: Array
+    log_phi: tuple[float, float]
+    bend_sd: float
+
+    @property
+    def held(self) -> Mask:
+        """(8,) numbers that do not move."""
+        sd = np.array([np.inf, np.inf, np.inf, *self.position_sd, self.log_phi[1], self.bend_sd])
+        return np.asarray(sd == 0.0)
+
+    def residuals(self, poses: Candidates) -> tuple[Array, Array]:
+        """(K, 5) in standard deviations, and the diagonal (5,) of their derivatives."""
+        sd = np.array([*self.position_sd, self.log_phi[1], self.bend_sd])
+        share = np.where(sd > 0.0, 1.0 / np.maximum(sd, 1e-12), 0.0)
+        off = np.column_stack([poses.positions - self.position, poses.log_phi - self.log_phi[0], poses.bend])
+        return np.where(share > 0.0, off, 0.0) * share, share
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best cameras, the least cost first.
+
+    Attributes:
+        poses: K of them. costs: (K,) robust, in variances. scale_px: of the residuals at the best.
+    """
+
+    poses: Candidates
+    costs: Array
+    scale_px: float
+
+
+def information(lines: Sightlines, known: Beforehand, pose: Candidates, scale_px: float) -> Array:
+    """(8, 8) what is known of one camera's numbers by rows that fit it, and beforehand; 0 of those that are held."""
+    r, derivatives = lines.equations(pose)
+    weights = 1.0 / (scale_px**2 * (1.0 + (r[0] / (2.0 * scale_px)) ** 2) ** 2)
+    matrix = (derivatives[0] * weights[:, None]).T @ derivatives[0]
+    matrix[range(3, 8), range(3, 8)] += known.residuals(pose)[1] ** 2
+    free = ~known.held
+    return np.asarray(matrix * free[:, None] * free)
+
+
+def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int) -> Candidates:
+    """Each brought towards its minimum."""
+    damping = np.full(len(poses), _DAMPING)
+    free = np.flatnonzero(~known.held)
+    at = lines.equations(poses)
+    for _ in range(steps):
+        scale = scales(at[0], len(free))
+        step = _step(at, known, poses, scale, damping)
+        moved = poses.moved(step)
+        there = lines.equations(moved)
+        better = _cost(there[0], known, moved, scale) < _cost(at[0], known, poses, scale)
+        poses = moved.where(better, poses)
+        at = np.where(better[:, None], there[0], at[0]), np.where(better[:, None, None], there[1], at[1])
+        damping = np.clip(damping * np.where(better, 0.2, 6.0), _LEAST_DAMPING, 1e6)
+    return poses
+
+
+def _step(at: tuple[Array, Array], known: Beforehand, poses: Candidates, scale: Array, damping: Array) -> Array:
+    """(K, 8) a damped Gauss-Newton step of each, reweighted against what does not fit."""
+    r, derivatives = at
+    free = np.flatnonzero(~known.held)
+    weights = 1.0 / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
+    jacobian = derivatives[:, :, free]
+    weighted = jacobian * weights[..., None]
+    normal = np.swapaxes(weighted, 1, 2) @ jacobian
+    right = (np.swapaxes(weighted, 1, 2) @ r[..., None])[..., 0]
+    said, share = known.residuals(poses)
+    diagonal, sums = np.zeros(8), np.zeros((len(poses), 8))
+    diagonal[3:], sums[:, 3:] = share**2, said * share
+    each = range(len(free))
+    normal[:, each, each] += diagonal[free]
+    right += sums[:, free]
+    sizes = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
+    normal = normal / sizes[:, :, None] / sizes[:, None, :]
+    normal[:, each, each] += damping[:, None]
+    step = np.zeros((len(poses), 8))
+    step[:, free] = -np.linalg.solve(normal, (right / sizes)[..., None])[..., 0] / sizes
+    step[:, :3] = _bounded(step[:, :3], _MOST_STEP)
+    step[:, 6] = np.clip(step[:, 6], -_MOST_STEP, _MOST_STEP)
+    return step
+
+
+def _bounded(vectors: Array, most: float) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors * np.minimum(1.0, most / np.maximum(length, 1e-12)))
+
+
+def scales(r: Array, free: int) -> Array:
+    """(K, 1) px: the middle of the residuals that so many numbers cannot take up."""
+    count = r.shape[1]
+    middle = min((count + free) // 2, count - 1)
+    return np.asarray(np.maximum(np.partition(np.abs(r), middle, axis=1)[:, [middle]], _LEAST_PX))
+
+
+def _cost(r: Array, known: Beforehand, poses: Candidates, scale: Array | float) -> Array:
+    said, _ = known.residuals(poses)
+    return np.asarray(np.sum(4.0 * np.log1p((r / (2.0 * scale)) ** 2), axis=1) + np.sum(said**2, axis=1))
+
+
+def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> Array:
+    """(K,) minus twice the logarithm of the likelihood of Cauchy errors, each camera's at the scale of its own
+    residuals, at least so many px; with what is seen where it cannot be.
+    """
+    r, _ = lines.equations(poses)
+    r = np.nan_to_num(r, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX)
+    free = int(np.count_nonzero(~known.held))
+    scale = np.maximum(scales(r, free), least_px)
+    r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), _BEHIND * scale))
+    scale = np.maximum(scales(r, free), least_px)
+    floor, reach = float(lines.places[:, 2].min()), float(np.ptp(lines.places, axis=0).max())
+    inside = np.abs(poses.log_phi - known.log_phi[0]) < _WIDEST
+    inside &= poses.positions[:, 2] > floor + _LOWEST * reach
+    cost = _cost(r, known, poses, scale) + 4.0 * r.shape[1] * np.log(scale[:, 0])
+    return np.asarray(np.where(inside, cost, np.inf))
+
+
+def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates, rough_px: float) -> Found:
+    """The best cameras of those proposed and of a grid.
+
+    Args:
+        few: some of the rows, for the first rounds. rough_px: scale of the first.
+    """
+    some = _drawn(few, known)
+    some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:_FIRST])
+    some = refined(few, known, Candidates.joined(proposed, some), _FIRST_STEPS)
+    some = some.take(np.argsort(costs(few, known, some, rough_px))[:_THEN])
+    return best_of(lines, known, Candidates.joined(proposed, refined(lines, known, some, _STEPS)))
+
+
+def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> Found:
+    """The best of them, brought to their minima."""
+    some = refined(lines, known, some, _LAST_STEPS)
+    cost = costs(lines, known, some, _LEAST_PX)
+    order = np.argsort(cost)[:_KEPT]
+    best = some.take(order)
+    free = int(np.count_nonzero(~known.held))
+    scale = float(scales(lines.equations(best.take(np.array([0])))[0], free)[0, 0])
+    return Found(best, cost[order], scale)
+
+
+def _drawn(few: Sightlines, known: Beforehand) -> Candidates:
+    """A grid of rotations and phi, each with its position."""
+    middle, sd = known.log_phi
+    logs = middle + np.log(_PHI_GRID) - np.log(1.1) if sd > 0.2 else np.array([middle])
+    rotations = np.tile(_grid(), (len(logs), 1, 1))
+    log_phi = np.repeat(logs, len(_grid()))
+    poses = Candidates(rotations, few.positions(rotations, log_phi), log_phi, np.zeros(len(log_phi)))
+    floor = float(few.places[:, 2].min())
+    return poses.take(poses.positions[:, 2] > floor)
+
+
+@cache
+def _grid() -> Array:
+    """(K, 3, 3) frame_from_cam: axes evenly over the lower half sphere, each with some rolls."""
+    down = np.diag([1.0, -1.0, -1.0])
+    rolls = [down @ rotation_exp([0.0, 0.0, a]) for a in np.arange(_ROLLS) * (2.0 * np.pi / _ROLLS)]
+    axes = [
+        rotation_exp([tilt * np.cos(a), tilt * np.sin(a), 0.0])
+        for tilt, count in zip(_TILTS, _AZIMUTHS, strict=True)
+        for a in np.arange(count) * (2.0 * np.pi / count)
+    ]
+    return np.array([axis @ one for axis in axes for one in rolls])

@@ -1,0 +1,235 @@
+"""What a sight shows, as equations that are homogeneous in a ray: for many poses and focal lengths at once.
+
+A pixel at the offset p has the ray L = (p, phi w) before its camera, d = R L in the frame. From C it meets a place P
+where (P - C) . (a x d) = 0 for two directions a, a straight line through P along a where that is 0, and an arc around M
+where |x - M| is its radius: with h the height over its plane, x = C - (h / d_z) d. Each equation is n . d = 0, with a
+normal n that for arcs depends on d; over the length of its derivative by p it is a distance in px, to first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+
+_LEAST = 1e-12  # of a length, which is divided by
+_RIDGE = 1e-6  # of squares of order one
+_ROUNDS = 2  # of reweighting against wrong labels
+_LEAST_DOWN = 0.03  # sine of the angle under the horizon: nearer to it a ray has no place on the floor
+_BEYOND = 0.05  # share of a line's length by which a start may see it beyond its ends
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """K cameras that may be: frame_from_cam (K, 3, 3), position (K, 3) m, logarithm of phi in px (K,), and one more
+    coefficient of w, of r squared (K,).
+    """
+
+    rotations: Array
+    positions: Array
+    log_phi: Array
+    bend: Array
+
+    @classmethod
+    def none(cls) -> Candidates:
+        """Of which there are none."""
+        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def take(self, numbers: Indices | Mask) -> Candidates:
+        """Some of them."""
+        return Candidates(*(values[numbers] for values in vars(self).values()))
+
+    def moved(self, step: Array) -> Candidates:
+        """By (K, 8): a turn, a shift, and what is added to the rest."""
+        return Candidates(
+            _turns(step[:, :3]) @ self.rotations,
+            self.positions + step[:, 3:6],
+            self.log_phi + step[:, 6],
+            self.bend + step[:, 7],
+        )
+
+    def where(self, mask: Mask, others: Candidates) -> Candidates:
+        """These where the mask (K,) is set, others elsewhere."""
+        mine, theirs = vars(self).values(), vars(others).values()
+        return Candidates(
+            *(np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(mine, theirs, strict=True))
+        )
+
+    @classmethod
+    def joined(cls, *some: Candidates) -> Candidates:
+        """One after the other."""
+        return cls(*(np.concatenate(parts) for parts in zip(*(vars(one).values() for one in some), strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Sightlines:
+    """Of N observations: points first, twice each (their rows in x, then those in y), then lines, then arcs.
+
+    Attributes:
+        pixels: (N, 2) offsets p, px. w: (N,). slope: (N,) of w by r, over r.
+        unit_px: of the radius that the bend multiplies. places: (N, 3) P or M, m. along: (N, 3) a of lines; of arcs the
+            radius and two zeros.
+        counts: of points, lines and arcs. curve: (N,) which feature each row belongs to.
+    """
+
+    pixels: Array
+    w: Array
+    slope: Array
+    unit_px: float
+    places: Array
+    along: Array
+    counts: tuple[int, int, int]
+    curve: Indices
+
+    @property
+    def _points(self) -> slice:
+        return slice(0, 2 * self.counts[0])
+
+    @property
+    def _arcs(self) -> slice:
+        return slice(2 * self.counts[0] + self.counts[1], None)
+
+    @property
+    def _squared(self) -> Array:
+        return np.asarray(np.sum(self.pixels**2, axis=1) / self.unit_px**2)
+
+    def _rays(self, poses: Candidates) -> Array:
+        """(K, N, 3) L."""
+        rays = np.empty((len(poses), len(self.w), 3))
+        rays[:, :, :2] = self.pixels
+        rays[:, :, 2] = np.exp(poses.log_phi)[:, None] * (self.w + poses.bend[:, None] * self._squared)
+        return rays
+
+    def take(self, rows: Indices) -> Sightlines:
+        """Some rows, of points both, in their order."""
+        ends = np.cumsum([2 * self.counts[0], self.counts[1], self.counts[2]])
+        points, lines, arcs = (int(n) for n in np.diff(np.searchsorted(rows, [0, *ends])))
+        few = {name: getattr(self, name)[rows] for name in ("pixels", "w", "slope", "places", "along", "curve")}
+        return replace(self, **few, counts=(points // 2, lines, arcs))
+
+    def equations(self, poses: Candidates) -> tuple[Array, Array]:
+        """Distances (K, N) px and their derivatives (K, N, 8) by `Candidates.moved`."""
+        phi, squared = np.exp(poses.log_phi)[:, None], self._squared
+        rays = self._rays(poses)
+        d = rays @ np.swapaxes(poses.rotations, 1, 2)  # rows times it are R times columns
+        normals, by_position, by_turn = self._normals(poses, d)
+        before = normals @ poses.rotations  # in the camera's frame
+        lean = before[:, :, 2] * phi * (self.slope + 2.0 * poses.bend[:, None] / self.unit_px**2)
+        steep = np.hypot(before[:, :, 0] + lean * self.pixels[:, 0], before[:, :, 1] + lean * self.pixels[:, 1])
+        share = 1.0 / np.maximum(steep, _LEAST)
+        derivatives = np.empty((*share.shape, 8))
+        derivatives[:, :, :3], derivatives[:, :, 3:6] = by_turn, by_position
+        derivatives[:, :, 6] = before[:, :, 2] * rays[:, :, 2]
+        derivatives[:, :, 7] = before[:, :, 2] * phi * squared
+        return np.sum(normals * d, axis=2) * share, derivatives * share[:, :, None]
+
+    def _normals(self, poses: Candidates, d: Array) -> tuple[Array, Array, Array]:
+        """n (K, N, 3), and the derivatives (K, N, 3) of n . d by the position and by a turn."""
+        to, normals, by_position = self.places - poses.positions[:, None], np.empty_like(d), np.empty_like(d)
+        along = self._directions(poses.rotations)
+        straight, arcs = slice(0, self._arcs.start), self._arcs
+        normals[:, straight] = _cross(to[:, straight], along[:, straight])
+        by_position[:, straight] = -_cross(along[:, straight], d[:, straight])
+        by_turn = _cross(d, normals)
+        points = self._points  # whose directions turn with the camera
+        by_turn[:, points] = _cross(to[:, points], by_position[:, points])
+        e, radius = d[:, arcs], self.along[arcs, 0]
+        h, off = -to[:, arcs, 2], -to[:, arcs, :2]
+        away = off * e[:, :, 2:] - h[..., None] * e[:, :, :2]  # x - M, times d_z
+        length = np.maximum(np.linalg.norm(away, axis=2), _LEAST)
+        unit = away / length[..., None]
+        normals[:, arcs, :2] = -h[..., None] * unit
+        normals[:, arcs, 2] = np.sum(unit * off, axis=2) + np.sign(h) * radius
+        by_position[:, arcs, :2] = unit * e[:, :, 2:]
+        by_position[:, arcs, 2] = -np.sum(unit * e[:, :, :2], axis=2)
+        by_turn[:, arcs] = _cross(e, normals[:, arcs])
+        return normals, by_position, by_turn
+
+    def seen(self, poses: Candidates) -> Mask:
+        """(K, N) whether each row's place lies ahead and, on a line, between its ends."""
+        d = self._rays(poses) @ np.swapaxes(poses.rotations, 1, 2)
+        to = self.places - poses.positions[:, None]
+        good = np.sum(to * d, axis=2) > 0.0
+        lines, arcs = slice(self._points.stop, self._arcs.start), self._arcs
+        a, e, p = np.broadcast_to(self.along[lines], d[:, lines].shape), d[:, lines], to[:, lines]
+        # The place P + s a nearest to the ray t d: both ends of the common perpendicular.
+        aa, ee, ae = np.sum(a * a, axis=2), np.sum(e * e, axis=2), np.sum(a * e, axis=2)
+        ap, ep = np.sum(a * p, axis=2), np.sum(e * p, axis=2)
+        det = np.maximum(aa * ee - ae**2, _LEAST)
+        s, t = (ae * ep - ee * ap) / det, (aa * ep - ae * ap) / det
+        good[:, lines] = (t > 0.0) & (np.abs(s - 0.5) < 0.5 + _BEYOND)
+        good[:, arcs] = to[:, arcs, 2] * d[:, arcs, 2] > 0.0
+        return np.asarray(good)
+
+    def positions(self, rotations: Array, log_phi: Array) -> Array:
+        """(K, 3) m where cameras of these rotations stand: linear in what is seen, of an arc in the circle that its
+        rays make on a plane one metre below. Where all that leaves it open they stand over the middle of it.
+        """
+        rays = np.empty((len(rotations), len(self.w), 3))
+        rays[:, :, :2], rays[:, :, 2] = self.pixels, np.exp(log_phi)[:, None] * self.w
+        d = rays @ np.swapaxes(rotations, 1, 2)
+        d /= np.linalg.norm(d, axis=2, keepdims=True)
+        straight = slice(0, self._arcs.start)
+        rows = _cross(self._directions(rotations)[:, straight], d[:, straight])
+        places = np.broadcast_to(self.places[straight], rows.shape)
+        for number in distinct(self.curve[self._arcs]):
+            own = np.flatnonzero(self.curve == number)
+            where, weight = _over_circle(d[:, own], self.places[own[0]], self.along[own[0], 0])
+            rows = np.concatenate([rows, weight[:, None, None] * np.eye(3)], axis=1)
+            places = np.concatenate([places, np.repeat(where[:, None], 3, axis=1)], axis=1)
+        middle, weights = self.places.mean(axis=0), np.ones(rows.shape[:2])
+        for _ in range(_ROUNDS):
+            weighted = rows * weights[..., None]
+            matrix = np.swapaxes(weighted, 1, 2) @ rows + _RIDGE * np.eye(3)
+            right = np.einsum("kni,kn->ki", weighted, np.sum(rows * places, axis=2)) + _RIDGE * middle
+            positions = np.linalg.solve(matrix, right[..., None])[..., 0]
+            off = np.sum(rows * (places - positions[:, None]), axis=2)
+            usual = np.maximum(np.median(np.abs(off), axis=1, keepdims=True), _LEAST)
+            weights = 1.0 / (1.0 + (off / usual) ** 2)
+        return np.asarray(positions)
+
+    def _directions(self, rotations: Array) -> Array:
+        """(K, N, 3) a of each row, of unit length but of arcs; those of points are the camera's x and y."""
+        lines = slice(self._points.stop, self._arcs.start)
+        along = self.along.copy()
+        along[lines] /= np.linalg.norm(along[lines], axis=1)[:, None]
+        every = np.broadcast_to(along, (len(rotations), *along.shape)).copy()
+        half = self.counts[0]
+        every[:, :half], every[:, half : 2 * half] = rotations[:, None, :, 0], rotations[:, None, :, 1]
+        return every
+
+
+def _over_circle(d: Array, centre: Array, radius: float) -> tuple[Array, Array]:
+    """(K, 3) m where cameras stand whose rays d (K, n, 3) show a circle, and a weight (K,), 0 where they do not."""
+    down = np.maximum(-d[:, :, 2], _LEAST_DOWN)
+    u = d[:, :, :2] / down[..., None]
+    rows = np.concatenate([2.0 * u, np.ones((*u.shape[:2], 1))], axis=2)
+    matrix = np.swapaxes(rows, 1, 2) @ rows + _RIDGE * np.eye(3)
+    solved = np.linalg.solve(matrix, np.einsum("kni,kn->ki", rows, np.sum(u**2, axis=2))[..., None])[..., 0]
+    seen = np.sqrt(np.maximum(solved[:, 2] + np.sum(solved[:, :2] ** 2, axis=1), _RIDGE))  # its radius there
+    height = radius / seen
+    where = centre - np.column_stack([solved[:, :2] * height[:, None], -height])
+    return where, np.where((d[:, :, 2] < -_LEAST_DOWN).all(axis=1), np.sqrt(float(d.shape[1])), 0.0)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """As np.cross of the last axis, several times as fast."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+
+
+def _turns(vectors: Array) -> Array:
+    """(K, 3, 3) of rotation vectors (K, 3), rad."""
+    angle = np.linalg.norm(vectors, axis=1)
+    x, y, z = (vectors / np.maximum(angle, _LEAST)[:, None]).T
+    zero = np.zeros_like(x)
+    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.asarray(
+        np.eye(3) + np.sin(angle)[:, None, None] * skew + (1.0 - np.cos(angle))[:, None, None] * (skew @ skew)
+    )

@@ -1,0 +1,179 @@
+"""Where a camera stands by one sight of the world: what the homography proposes where it holds, else by a search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, distinct
+from ceres_cal.observations import Prior
+from ceres_cal.observations.sights import Sights
+from ceres_cal.start.closed_forms import RadialProfile
+from ceres_cal.start.search import Beforehand, Found, best_of, information, searched
+from ceres_cal.start.sightlines import Candidates, Sightlines
+
+_MOST_POINTS, _MOST_OF_A_CURVE = 40, 20  # beyond which a start learns nothing more
+_FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
+# A proposal holds where so many of its rows lie within some scales of it, and within a share of the half diagonal; and
+# where so many equations are left over: with fewer another place may explain them as well.
+_HOLDS, _SCALES, _ROUGH, _LEFT_OVER = 0.85, 8.0, 0.01, 8
+_ROUGH_PX = 2.0  # scale of a search's first rounds
+_BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: lenses without distortion are held
+_TOLD = 0.05  # standard deviation of log phi below which a sight tells it
+_OPEN = 1e-10  # least eigenvalue of the information in its own units below which numbers are open
+_ALIKE, _APART = 30.0, 0.05  # variances by which another place may cost more; rad, of the height and of phi
+_FINEST_PX = 1e-2  # of a scale: exact data are told no better
+_LEAST_SD = 1e-3  # of a stated number, as a share: a start is no better
+_NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a camera stands, by one sight.
+
+    Attributes:
+        pose: cam_from_world (3, 4). phi: px. bend: what is added to the profile's first coefficient.
+    """
+
+    pose: Array
+    phi: float
+    bend: float
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """The places that a sight may be seen from, the likeliest first.
+
+    Attributes:
+        open: numbers that the sight leaves open, by name. tells_phi: whether it tells phi.
+    """
+
+    places: tuple[Place, ...]
+    open: tuple[str, ...]
+    tells_phi: bool
+
+
+def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float], *, may_bend: bool) -> Beforehand:
+    """What is stated of a station's place, and this of phi."""
+    position, sd = np.zeros(3), np.full(3, np.inf)
+    for prior in priors:
+        if prior.owner == "station" and prior.name == station and prior.quantity in ("height_m", "position_m"):
+            numbers = slice(3 - len(prior.value), 3)
+            position[numbers] = prior.value
+            sd[numbers] = np.maximum(prior.sigma, _LEAST_SD * max(abs(prior.value[-1]), _LEAST_SD))
+    return Beforehand(position, sd, log_phi, _BEND_SD if may_bend else 0.0)
+
+
+def placed(sight: Sights, profile: RadialProfile, known: Beforehand, proposed: Array | None, log_phi: float) -> Placed:
+    """The places of a camera by one sight about it.
+
+    Args:
+        proposed: cam_from_world (3, 4) of a homography at this phi, where there is one.
+    """
+    lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
+    given = Candidates.none()
+    if proposed is not None and np.all(np.isfinite(proposed)):
+        rotation = proposed[:, :3].T
+        given = Candidates(rotation[None], (-rotation @ proposed[:, 3])[None], np.array([log_phi]), np.zeros(1))
+        found = best_of(lines, known, given)
+        if holds(lines, known, found, profile.unit_px):
+            return _answered(lines, known, found)
+    few = sightlines_of(sight, profile, _FEW_POINTS, _FEW_OF_A_CURVE)
+    found = searched(lines, few, known, given, _ROUGH_PX)
+    return _answered(lines, known, found)
+
+
+def _answered(lines: Sightlines, known: Beforehand, found: Found) -> Placed:
+    """With what the best place leaves open, and the others that fit alike."""
+    best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
+    matrix = information(lines, known, best, scale)
+    places = tuple(_place(found.poses, number) for number in _alike(found))
+    return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
+
+
+def holds(lines: Sightlines, known: Beforehand, found: Found, unit_px: float) -> bool:
+    """Whether nearly all of what is seen agrees with a place, and more than any place would take up."""
+    best = found.poses.take(np.array([0]))
+    distance = np.abs(lines.equations(best)[0][0])
+    limit = min(_SCALES * found.scale_px, _ROUGH * unit_px) + 1e-3
+    near = (distance < limit) & lines.seen(best)[0]
+    free = np.count_nonzero(~known.held)
+    return bool(np.mean(near) > _HOLDS and len(near) >= free + _LEFT_OVER)
+
+
+def open_numbers(matrix: Array) -> tuple[str, ...]:
+    """Names of the numbers that an information matrix (8, 8) leaves open; those that are held have no row."""
+    free = np.flatnonzero(np.diag(matrix) > 0.0)
+    missing = [_NAMES[n] for n in range(6) if n not in free]
+    sizes = np.sqrt(np.diag(matrix)[free])
+    values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
+    lost = vectors[:, values < _OPEN * max(values[-1], 1e-300)] / sizes[:, None] if len(free) else np.empty((0, 0))
+    moved = np.max(np.abs(lost), axis=1, initial=0.0)
+    names = [_NAMES[n] for n, m in zip(free, moved, strict=True) if m > 0.1 * np.max(moved, initial=0.0) > 0.0]
+    return tuple(dict.fromkeys([*missing, *names]))
+
+
+def _sd_of(matrix: Array, number: int) -> float:
+    """Standard deviation of one number, infinite where it is open; 0 where it is held."""
+    free = np.flatnonzero(np.diag(matrix) > 0.0)
+    if number not in free:
+        return 0.0
+    sizes = np.sqrt(np.diag(matrix)[free])
+    values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
+    row = int(np.searchsorted(free, number))
+    share = vectors[row] / sizes[row]
+    return float(np.sqrt(np.sum(share**2 / np.maximum(values, 1e-300))))
+
+
+def _place(poses: Candidates, number: int) -> Place:
+    rotation = poses.rotations[number].T
+    pose = np.column_stack([rotation, -rotation @ poses.positions[number]])
+    return Place(pose, float(np.exp(poses.log_phi[number])), float(poses.bend[number]))
+
+
+def _alike(found: Found) -> Sequence[int]:
+    """Numbers of those that fit about as well as the best, and stand elsewhere than each other."""
+    kept: list[int] = []
+    poses = found.poses
+    for number in np.flatnonzero(found.costs <= found.costs[0] + _ALIKE):
+        turned = [np.linalg.norm(poses.rotations[number] - poses.rotations[k]) / np.sqrt(2.0) for k in kept]
+        reach = [max(abs(float(poses.positions[k, 2])), 1e-9) for k in kept]
+        moved = [
+            np.linalg.norm(poses.positions[number] - poses.positions[k]) / r for k, r in zip(kept, reach, strict=True)
+        ]
+        if all(turn > _APART or move > _APART for turn, move in zip(turned, moved, strict=True)):
+            kept.append(int(number))
+    return kept
+
+
+def sightlines_of(sight: Sights, profile: RadialProfile, most_points: int, most_of_a_curve: int) -> Sightlines:
+    """Some of what a sight shows, evenly."""
+    points = _evenly(np.arange(len(sight.points)), most_points)
+    tracks = sight.track_index
+    rows = [_evenly(np.flatnonzero(tracks == track), most_of_a_curve) for track in distinct(tracks)]
+    some = np.concatenate([np.empty(0, np.int64), *rows])
+    arc = sight.on_arc[some]
+    some, arcs = np.concatenate([some[~arc], some[arc]]), int(np.count_nonzero(arc))
+    starts, along = sight.tracks[tracks[some], 0], sight.tracks[tracks[some], 1].copy()
+    if arcs:
+        along[-arcs:] = np.column_stack([np.linalg.norm(along[-arcs:], axis=1), np.zeros((arcs, 2))])
+    pixels = np.vstack([sight.pixels[points], sight.pixels[points], sight.curve_pixels[some]])
+    places = np.vstack([sight.points[points], sight.points[points], starts])
+    radius = np.linalg.norm(pixels, axis=1)
+    return Sightlines(
+        pixels,
+        profile.lift(pixels)[:, 2],
+        profile.slope(radius),
+        profile.unit_px,
+        places,
+        np.vstack([np.zeros((2 * len(points), 3)), along]),
+        (len(points), len(some) - arcs, arcs),
+        np.concatenate([np.full(2 * len(points), -1), tracks[some]]),
+    )
+
+
+def _evenly(rows: Indices, most: int) -> Indices:
+    count = min(len(rows), most)
+    return rows[distinct(np.linspace(0, max(len(rows) - 1, 0), count).round().astype(np.int64))]
