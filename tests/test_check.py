@@ -14,6 +14,7 @@ from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.cli.check import _station
 from ceres_cal.moves import check
 from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.observations import Observations
@@ -100,6 +101,17 @@ def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
     assert not check(calibration, lines(far, 5)).holds
     zoomed = replace(CAMERA, phi=1.05 * CAMERA.phi)
     assert not check(calibration, lines(HOME, 6, NOISE, zoomed)).holds
+
+
+def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibration) -> None:
+    without = replace(calibration, targets={})
+    for pose, words in (
+        (HOME, "holds: no movement beyond what is known (probability"),
+        (SMALL_TILT, "deg (probability"),
+    ):
+        found = check(without, lines(pose, 1))["overhead"]
+        assert found.change is not None and not found.change.maps and words in found.words
+        assert "nan" not in "\n".join(_station(found).lines)
 
 
 def test_each_station_by_itself() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -92,12 +93,17 @@ def _station(one: Agreement) -> Section:
         phi_change = change.phi_px[1] / change.phi_px[0] - 1.0
         sizes |= {"moved_mm": change.moved_mm, "turned_deg": change.turned_deg}
         sizes |= {"phi_change": phi_change, "shift_px": change.shift_px}
-        size = f"picture {change.shift_px:.3g} px rms, phi {100.0 * phi_change:+.3f} %"
+        picture = f"picture {change.shift_px:.3g} px rms, " if math.isfinite(change.shift_px) else ""
+        size = f"{picture}phi {100.0 * phi_change:+.3f} %"
         maps = [(over.height_m, over.mean_mm, over.worst_mm) for over in change.maps]
         lines += [
             f"{used} observations, {misfit.outliers} outliers, noise {noise:.2f} times as before",
             f"moved {change.moved_mm:.3g} mm, turned {change.turned_deg:.3g} deg, {size}",
-            *(f"map {at_height(h)}: {mean:.3g} mm on average, {worst:.3g} mm at most" for h, mean, worst in maps),
+            *(
+                f"map {at_height(h)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
+                for h, mean, worst in maps
+                if mean == mean
+            ),
         ]
     shifts = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, mean, worst in maps]
     return Section("station", lines, {"stations": {one.name: {**data, **sizes, "shift_mm": shifts}}})

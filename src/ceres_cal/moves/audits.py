@@ -127,9 +127,9 @@ def _audited(name: str, given: Camera, observations: Observations) -> Agreement:
     def known(grid: FieldGrid) -> Array:
         return field_map(ours.estimate, ours.uncertainty.posterior, name, grid).sd_mm
 
-    change = change_of(
-        ours.estimate, name, as_it_is, field_grids(ours.targets), known if ours.posterior is not None else None
-    )
+    # A camera that is the world stands nowhere over a field, even where its targets have one.
+    grids = field_grids(ours.targets) if tied else []
+    change = change_of(ours.estimate, name, as_it_is, grids, known if ours.posterior is not None else None)
     return Agreement(
         name=name,
         holds=holds,

@@ -243,17 +243,14 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
 
 
 def _words(holds: bool, probability: float, misfit: Misfit, change: Change) -> str:
-    worst_mm = change.maps[0].worst_mm
+    worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
     if holds:
-        words = (
-            f"holds: no movement beyond what is known ({worst_mm:.1f} mm on the floor at most, probability "
-            f"{probability:.2g})"
-        )
+        at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
+        words = f"holds: no movement beyond what is known ({at_most}probability {probability:.2g})"
     else:
-        words = (
-            f"no longer holds: moved by about {change.moved_mm:.1f} mm and {change.turned_deg:.3f} deg, which shifts "
-            f"the map by up to {worst_mm:.1f} mm on the floor (probability {probability:.1g})"
-        )
+        shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
+        moved = f"moved by about {change.moved_mm:.1f} mm and {change.turned_deg:.3f} deg{shifts}"
+        words = f"no longer holds: {moved} (probability {probability:.1g})"
     count = misfit.points + misfit.curves + misfit.outliers
     if misfit.outliers > _MANY_OUTLIERS * count:
         words += f"; but {misfit.outliers} of {count} observations fit nowhere: check labels"
