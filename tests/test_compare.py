@@ -35,7 +35,7 @@ def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
     maps = [pair.change.maps[0] for pair in pairs if pair.change is not None]
     ratio = [np.nanmean(one.errors_mm**2) / np.nanmean(one.expected_mm**2) for one in maps]
     assert 0.4 < np.mean(ratio) < 2.0  # 0.9
-    probabilities = np.sort([pair.probability for pair in pairs if pair.probability is not None])
+    probabilities = np.sort([pair.probability for pair in pairs])
     assert len(probabilities) == 12
     assert np.max(np.abs(probabilities - (np.arange(12) + 0.5) / 12)) < 0.45  # 0.2
 

@@ -291,7 +291,7 @@ def _photographed_alarms(
             path = _field_photograph(folder, pose, 100_000 * kind + 100 * number + i)
             found, _ = check_photographs(calibration, [path], false_alarms=ALARMS)
             alarms += not found.holds
-            noise.append(found.stations["overhead"].noise)
+            noise.append(found["overhead"].misfit.noise[1])
     return alarms / (len(known) * each), float(np.median(noise))
 
 

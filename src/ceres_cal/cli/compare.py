@@ -125,7 +125,7 @@ def _tested(one: Agreement) -> dict[str, Any]:
 
 def _explained(one: Agreement) -> str:
     return {
-        True: f"explained by their uncertainties (probability {one.probability or 0.0:.2g})",
-        False: f"more than their uncertainties explain (probability {one.probability or 0.0:.1g})",
+        True: f"explained by their uncertainties (probability {one.probability:.2g})",
+        False: f"more than their uncertainties explain (probability {one.probability:.1g})",
         None: "nothing can be said of uncertainty: it is not told of both",
     }[one.holds]

@@ -148,7 +148,7 @@ class Agreement:
 
     name: str
     holds: bool | None = None
-    probability: float | None = None
+    probability: float = np.nan
     statistic: float = np.nan
     degrees: int = 0
     words: str = ""
