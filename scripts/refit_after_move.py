@@ -37,8 +37,8 @@ from ceres_cal.base.files import make_folder, read_bytes, write_bytes
 from ceres_cal.cli.files import IMAGE_ENDINGS
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.photographs import check_photographs
-from ceres_cal.moves import FALSE_ALARMS, Check, movements
-from ceres_cal.moves.carried import WHAT
+from ceres_cal.moves import FALSE_ALARMS, Agreements, movements
+from ceres_cal.moves.refit_plan import WHAT
 from ceres_cal.scene.heights import ROBOT_TOP_M
 
 SUSPICIOUS = ("suspected", "refused")  # of a file that was checked
@@ -90,7 +90,7 @@ def read(source: Path) -> cc.Observations | None:
 
 def checked(
     old: cc.Calibration, source: Path, content: cc.Observations | None, given: argparse.Namespace
-) -> tuple[Check, cc.Observations | None]:
+) -> tuple[Agreements, cc.Observations | None]:
     """The answer to a file, and its observations; None where a photograph shows no field."""
     if content is not None:
         return cc.check(old, content, level(given)), content
@@ -103,9 +103,9 @@ def level(given: argparse.Namespace) -> float:
     return math.sqrt(float(given.false_alarms) / int(given.checks))
 
 
-def told(found: Check) -> dict[str, str]:
+def told(found: Agreements) -> dict[str, str]:
     """The answer of each station, in words."""
-    return {name: station.words for name, station in found.stations.items()}
+    return {name: station.words for name, station in found.items()}
 
 
 def keep(place: Path) -> Path:

@@ -35,20 +35,21 @@ def test_planted_faults_are_named(fault: str, tmp_path: Path) -> None:
 
 def test_a_sound_one_is_trusted_to_so_many_millimetres() -> None:
     one = audit(sound(), seen(4))["overhead"]
-    assert one.trusted and one.cause is None and one.posed
-    assert one.off_mm[0.0][0] < 3.0 * np.hypot(one.known_mm[0.0], one.known_mm[0.0])  # both have that error
+    assert one.holds and one.cause is None and not one.pose_free and one.change is not None
+    (floor, _) = one.change.maps
+    assert floor.rms_mm < 3.0 * np.hypot(floor.known_mm, floor.known_mm)  # both have that error
     assert "explains the observations as well as a calibration of its own would, within" in one.words
 
 
 def test_without_a_pose_the_best_one_is_taken() -> None:
     bare = ImportedCameras({"other name": sound().station().at(Pose.identity())}).calibration("a test")
     one = audit(bare, seen(4))["overhead"]
-    assert one.trusted and not one.posed and "it says none" in one.words
+    assert one.holds and one.pose_free and "it says none" in one.words
     swapped = planted.FAULTS["half a pixel"](sound().station().at(Pose.identity()))
     # half a pixel is a turn by 0.03 degrees, which the pose takes up
-    assert audit(ImportedCameras({"x": swapped}).calibration("a test"), seen(4))["overhead"].trusted
+    assert audit(ImportedCameras({"x": swapped}).calibration("a test"), seen(4))["overhead"].holds
     long = replace(sound().station(), phi=1.05 * sound().station().phi).at(Pose.identity())
-    assert not audit(ImportedCameras({"x": long}).calibration("a test"), seen(4))["overhead"].trusted
+    assert not audit(ImportedCameras({"x": long}).calibration("a test"), seen(4))["overhead"].holds
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,4 +93,4 @@ def test_opencvs_own_calibration_of_real_photographs(real_data: Path) -> None:
         made = cv2.calibrateCamera(places, [corners[n] for n in names[::2]], (640, 480), nothing, nothing, flags=flags)
         given = Camera.from_opencv((640, 480), made[1], made[2])
         answer = audit(ImportedCameras({"camera": given}).calibration("OpenCV"), seen)["camera"]
-        assert answer.cause == cause and not answer.posed and answer.off_mm == {}
+        assert answer.cause == cause and answer.pose_free and answer.change is not None and not answer.change.maps

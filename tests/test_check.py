@@ -14,6 +14,7 @@ from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.cli.check import _station
 from ceres_cal.moves import check
 from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.observations import Observations
@@ -66,12 +67,13 @@ def test_more_checks_share_the_false_alarms(calibration: Calibration) -> None:
 
 @pytest.mark.parametrize("pose", [SMALL_TILT, SMALL_SHIFT])
 def test_sizes_are_those_of_the_movement(calibration: Calibration, pose: Pose) -> None:
-    found = check(calibration, lines(pose, 1)).stations["overhead"]
+    found = check(calibration, lines(pose, 1))["overhead"]
     assert not found.holds and "no longer holds" in found.words
     x, y = (part.ravel() for part in np.meshgrid(np.linspace(-4.0, -1.0, 9), np.linspace(-2.0, 2.0, 9)))
     floor = np.column_stack([x, y, 0.0 * x])
     off = 1e3 * np.linalg.norm(CAMERA.at(pose).locate(CAMERA.at(HOME).project(floor)) - floor[:, :2], axis=1)
-    assert found.shift_mm[0.0][0] == pytest.approx(float(np.mean(off)), rel=0.4)  # 3.2 of 3.7 mm, 2.7 of 3.0 mm
+    assert found.change is not None
+    assert found.change.maps[0].mean_mm == pytest.approx(float(np.mean(off)), rel=0.4)  # 3.2 of 3.7 mm, 2.7 of 3.0 mm
 
 
 def test_outliers_and_more_noise_are_no_movement(calibration: Calibration) -> None:
@@ -82,23 +84,34 @@ def test_outliers_and_more_noise_are_no_movement(calibration: Calibration) -> No
     observations = replace(
         observations, curves=replace(observations.curves, sigma_px=0.5 * observations.curves.sigma_px)
     )
-    found = check(calibration, observations).stations["overhead"]
-    assert found.holds and found.noise == pytest.approx(2.0, rel=0.2)  # 1.9
+    found = check(calibration, observations)["overhead"]
+    assert found.holds and found.misfit.noise[0] == pytest.approx(2.0, rel=0.2)  # 1.9
 
 
 def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
     observations = lines(HOME, 4)
     shuffled = np.random.default_rng(0).permutation(observations.curves.feature)
     found = check(calibration, replace(observations, curves=replace(observations.curves, feature=shuffled)))
-    assert not found.holds and "not understood" in found.stations["overhead"].words
+    assert not found.holds and "not understood" in found["overhead"].words
     mirrored = relabelled(observations, MIRRORED)  # two thirds of it look the same: the camera is where it was
     assert mirrored is not None
     found = check(calibration, mirrored)
-    assert found.holds and "check labels" in found.stations["overhead"].words
+    assert found.holds and "check labels" in found["overhead"].words
     far = Pose.looking(HOME.position + np.array([0.5, 0.2, 0.3]), rotation_exp((0.2, 0.1, np.pi)) @ HOME.rotation)
     assert not check(calibration, lines(far, 5)).holds
     zoomed = replace(CAMERA, phi=1.05 * CAMERA.phi)
     assert not check(calibration, lines(HOME, 6, NOISE, zoomed)).holds
+
+
+def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibration) -> None:
+    without = replace(calibration, targets={})
+    for pose, words in (
+        (HOME, "holds: no movement beyond what is known (probability"),
+        (SMALL_TILT, "deg (probability"),
+    ):
+        found = check(without, lines(pose, 1))["overhead"]
+        assert found.change is not None and not found.change.maps and words in found.words
+        assert "nan" not in "\n".join(_station(found).lines)
 
 
 def test_each_station_by_itself() -> None:
@@ -110,7 +123,7 @@ def test_each_station_by_itself() -> None:
     moved = Station("right", Pose.looking(pose.position, rotation_exp((0.003, 0.0, 0.0)) @ pose.rotation))
     there = field_scene(FIELD, cameras, {**stations, "right": moved}, spacing_m=0.3)
     found = check(both, simulate(there, NOISE, 1).observations)
-    assert found.stations["left"].holds and not found.stations["right"].holds and not found.holds
+    assert found["left"].holds and not found["right"].holds and not found.holds
 
 
 def test_wrong_use(calibration: Calibration) -> None:

@@ -20,10 +20,10 @@ def calibration() -> Calibration:
 
 
 def test_equals_differ_nowhere(calibration: Calibration) -> None:
-    (found,) = compare(calibration, calibration, 0.15)
-    assert found.moved_mm == 0.0 and found.turned_deg < 1e-6
-    assert found.worst_mm < 1e-6
-    assert found.explained and found.probability == pytest.approx(1.0)
+    found = compare(calibration, calibration, 0.15)["overhead"]
+    assert found.change is not None and found.change.moved_mm == 0.0 and found.change.turned_deg < 1e-6
+    assert found.change.maps[0].worst_mm < 1e-6
+    assert found.holds and found.probability == pytest.approx(1.0)
 
 
 def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
@@ -31,19 +31,22 @@ def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
     likely.
     """
     every = [calibrated_at_home(seed) for seed in range(1, 25)]
-    pairs = [compare(a, b)[0] for a, b in zip(every[::2], every[1::2], strict=True)]
-    ratio = [np.nanmean(pair.errors_mm**2) / np.nanmean(pair.expected_mm**2) for pair in pairs]
+    pairs = [compare(a, b)["overhead"] for a, b in zip(every[::2], every[1::2], strict=True)]
+    maps = [pair.change.maps[0] for pair in pairs if pair.change is not None]
+    ratio = [np.nanmean(one.errors_mm**2) / np.nanmean(one.expected_mm**2) for one in maps]
     assert 0.4 < np.mean(ratio) < 2.0  # 0.9
-    probabilities = np.sort([pair.probability for pair in pairs if pair.probability is not None])
+    probabilities = np.sort([pair.probability for pair in pairs])
     assert len(probabilities) == 12
     assert np.max(np.abs(probabilities - (np.arange(12) + 0.5) / 12)) < 0.45  # 0.2
 
 
 def test_a_move_is_found(calibration: Calibration) -> None:
     moved = refit(calibration, seen(MOVED, DAY, 1).observations)
-    (found,) = compare(calibration, moved)
-    assert found.moved_mm == pytest.approx(1e3 * np.linalg.norm(MOVED.position - HOME.position), abs=5.0)  # 1.2 mm off
-    assert found.explained is False
+    answer = compare(calibration, moved)["overhead"]
+    assert answer.change is not None and answer.holds is False
+    (found,) = answer.change.maps
+    moved_mm = 1e3 * np.linalg.norm(MOVED.position - HOME.position)
+    assert answer.change.moved_mm == pytest.approx(moved_mm, abs=5.0)  # 1.2 mm off
     row, column = 12, 8  # halfway up, in what both see
     place = np.array([[found.x_m[column], found.y_m[row], 0.0]])
     pixel = calibration.station().project(place)
@@ -53,8 +56,8 @@ def test_a_move_is_found(calibration: Calibration) -> None:
 
 
 def test_without_uncertainty_nothing_is_explained(calibration: Calibration) -> None:
-    (found,) = compare(calibration, replace(calibration, posterior=None))
-    assert found.explained is None and np.isnan(found.expected_mm).all()
+    found = compare(calibration, replace(calibration, posterior=None))["overhead"]
+    assert found.holds is None and found.change is not None and np.isnan(found.change.maps[0].expected_mm).all()
 
 
 def test_no_station_in_common(calibration: Calibration) -> None:
@@ -68,10 +71,13 @@ def test_no_station_in_common(calibration: Calibration) -> None:
 def test_the_picture_is_svg(calibration: Calibration) -> None:
     moved = replace(calibration.estimate.cameras["overhead"], phi=1.01 * CAMERA.phi)
     zoomed = replace(calibration, estimate=replace(calibration.estimate, cameras={"overhead": moved}))
-    (found,) = compare(calibration, zoomed)
+    found = compare(calibration, zoomed)["overhead"]
+    assert found.change is not None
     root = ElementTree.fromstring(comparison_svg(found, calibration))
     assert root.tag.endswith("svg")
     paths = [path for path in root.iter("{http://www.w3.org/2000/svg}path") if "stroke" in path.get("style", "")]
     assert len(paths) > 2 * len(calibration.targets["field"].curves)  # each on a lighter ground
     texts = " ".join("".join(text.itertext()) for text in root.iter("{http://www.w3.org/2000/svg}text"))
-    assert "overhead, on the floor: difference, mm" in texts and f"{found.mean_mm:.2f} on average" in texts
+    assert (
+        "overhead, on the floor: difference, mm" in texts and f"{found.change.maps[0].mean_mm:.2f} on average" in texts
+    )

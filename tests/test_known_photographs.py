@@ -69,18 +69,18 @@ def test_boards_and_fields_are_weighed_together(calibration: Calibration) -> Non
 
 def test_an_unmoved_camera_holds(calibration: Calibration) -> None:
     found, seen = check_photographs(calibration, [NEW])
-    station = found.stations["camera"]
-    assert found.holds and station.noise == pytest.approx(1.0, abs=0.2)  # 0.97
-    assert station.moved_mm < 1.0 and station.turned_deg < 0.02
+    station = found["camera"]
+    assert found.holds and station.change is not None and station.misfit.noise[0] == pytest.approx(1.0, abs=0.2)  # 0.97
+    assert station.change.moved_mm < 1.0 and station.change.turned_deg < 0.02
     assert seen.shown == {"field": 1} and seen.missed == () and seen.station == "camera"
 
 
 def test_a_knock_is_found_and_mended(calibration: Calibration) -> None:
     found, seen = check_photographs(calibration, [KNOCKED])
-    station, truth = found.stations["camera"], knocked_truth()
-    assert not found.holds and station.probability < 1e-9
-    assert station.moved_mm == pytest.approx(18.79, abs=1.0)
-    assert station.turned_deg == pytest.approx(1.077, abs=0.01)
+    station, truth = found["camera"], knocked_truth()
+    assert not found.holds and station.probability == pytest.approx(0.0, abs=1e-9) and station.change is not None
+    assert station.change.moved_mm == pytest.approx(18.79, abs=1.0)
+    assert station.change.turned_deg == pytest.approx(1.077, abs=0.01)
     mended = refit(calibration, seen.require())
     assert floor_error_mm(truth, calibration.station()) > 20.0
     assert floor_error_mm(truth, mended.station()) < 0.5  # 0.07 mm

@@ -59,9 +59,9 @@ def test_stereo_left_is_solved_as_built(case: Callable[[str], Path]) -> None:
 def test_stereo_left_b_is_scored_by_a_warped_board(case: Callable[[str], Path]) -> None:
     options = Options(tolerances={"board": Tolerance(warp_m=0.002)})
     calibration = calibrate(Observations.load(case("stereo_left_a.json")), options)
-    scored = score(calibration, Observations.load(case("stereo_left_b.json")))
-    assert scored.fit.points_rms_px < 0.14  # 0.125 measured; 0.113 of the other half
-    assert scored.noise_ratios[0] == pytest.approx(1.0, abs=0.2)  # 1.10 measured
+    (scored,) = score(calibration, Observations.load(case("stereo_left_b.json"))).values()
+    assert scored.misfit.points_rms_px < 0.14  # 0.125 measured; 0.113 of the other half
+    assert scored.misfit.noise[0] == pytest.approx(1.0, abs=0.2)  # 1.10 measured
 
 
 def refused(capfd: pytest.CaptureFixture[str], *arguments: str) -> str:

@@ -20,7 +20,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import export
-from ceres_cal.moves.refitting import refit
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Options, Station, make_layout

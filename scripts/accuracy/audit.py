@@ -19,7 +19,7 @@ from ceres_cal import CalibrationError, Camera, Options, audit, calibrate
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats import export, import_calibration
 from ceres_cal.formats.import_format import ImportedCameras
-from ceres_cal.moves.auditing import resized
+from ceres_cal.moves.audits import resized
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate

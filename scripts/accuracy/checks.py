@@ -19,7 +19,7 @@ from accuracy.moves import ALARMS, DAY, HOME, NOISE, calibrated, clean, seen, th
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import StationCheck, check
+from ceres_cal.moves import Agreement, check
 from ceres_cal.observations import Observations
 from ceres_cal.problem.quantities import difference
 from ceres_cal.simulate import Disturbance
@@ -61,12 +61,12 @@ KINDS = (
 calibration_of = cache(calibrated)
 
 
-def checked(kind: Kind, number: int, seed: int, pose: Pose = HOME) -> StationCheck:
+def checked(kind: Kind, number: int, seed: int, pose: Pose = HOME) -> Agreement:
     """One check of one of the calibrations."""
-    return check(calibration_of(number), kind.seen(pose, 10_000 + seed), ALARMS).stations["overhead"]
+    return check(calibration_of(number), kind.seen(pose, 10_000 + seed), ALARMS)["overhead"]
 
 
-def _checked_by_turns(kind: Kind, number: int, first: int = 0, pose: Pose = HOME) -> StationCheck:
+def _checked_by_turns(kind: Kind, number: int, first: int = 0, pose: Pose = HOME) -> Agreement:
     return checked(kind, number % CALIBRATIONS, first + number, pose)
 
 

@@ -32,7 +32,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs import FieldOptions, check_photographs, detect_field
 from ceres_cal.moves import refit
-from ceres_cal.moves.carried import make_plan, refit_problem
+from ceres_cal.moves.refit_plan import make_plan, refit_problem
 from ceres_cal.observations import Observations, combine, taken
 from ceres_cal.posterior.maps import locate_slopes, visible_pixels
 from ceres_cal.problem.information import Key
@@ -291,7 +291,7 @@ def _photographed_alarms(
             path = _field_photograph(folder, pose, 100_000 * kind + 100 * number + i)
             found, _ = check_photographs(calibration, [path], false_alarms=ALARMS)
             alarms += not found.holds
-            noise.append(found.stations["overhead"].noise)
+            noise.append(found["overhead"].misfit.noise[1])
     return alarms / (len(known) * each), float(np.median(noise))
 
 

@@ -16,7 +16,7 @@ from runner import Row, script
 
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.moves.scoring import score
+from ceres_cal.moves.scores import score
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import checkerboard
 from photos.real_data import ov_plane, real_folder
@@ -47,7 +47,8 @@ def very_wide(runs: int) -> Iterator[Row]:
     for lens, most_px in (("kannala-brandt", 0.4825), ("spline", 0.435)):
         calibration = calibrate(train, Options(lens=lens, free_aspect=True, loss="trivial", reject_sigma=1e9))
         yield Row("ov plane", f"{lens}, training views: rms, px", calibration.fit.points_rms_px, most=most_px)
-        test_px = score(calibration, test).fit.points_rms_px
+        (answer,) = score(calibration, test).values()
+        test_px = answer.misfit.points_rms_px
         yield Row("ov plane", f"{lens}, test views: rms, px", test_px, most=most_px - 0.007)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.command import command
 from ceres_cal.cli.export import format_options, import_forms
@@ -14,7 +14,7 @@ from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
-    from ceres_cal.moves import StationAudit
+    from ceres_cal.moves import Agreement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +43,17 @@ def _run(args: AuditArguments) -> Document:
     else:
         given = import_calibration(args.file, args.form, **format_options(args.options, list(import_forms().values())))
     stations = audit(given, read_observations(args.observations))
-    trusted = all(one.trusted for one in stations.values())
     return Document(
         (
-            Section("audit", ["yes" if trusted else "no"], {"trusted": trusted, "warnings": list(given.warnings)}),
-            *(_station(name, one) for name, one in stations.items()),
+            Section(
+                "audit",
+                ["yes" if stations.holds else "no"],
+                {"trusted": stations.holds, "warnings": list(given.warnings)},
+            ),
+            *map(_station, stations.values()),
             *(Section("warning", wrapped(text)) for text in given.warnings),
         ),
-        0 if trusted else 1,
+        stations.exit_code,
     )
 
 
@@ -60,13 +63,19 @@ def _is_ours(path: Path) -> bool:
     return b"ceres-cal/calibration" in read_bytes(path)[:4096]
 
 
-def _station(name: str, one: StationAudit) -> Section:
-    camera = one.ours.station()
-    known = ", ".join(f"{sd:.2g} mm at {1e3 * h:.0f} mm" for h, sd in one.known_mm.items())
+def _station(one: Agreement) -> Section:
+    from ceres_cal.moves.audits import excess_px
+
+    assert one.solution is not None and one.change is not None
+    camera, maps = one.solution.station(), one.change.maps
+    off_px, noise_px = excess_px(one)
+    known_mm = {} if one.solution.posterior is None else {over.height_m: over.known_mm for over in maps}
+    known = ", ".join(f"{sd:.2g} mm at {1e3 * h:.0f} mm" for h, sd in known_mm.items())
     ours = f"ours: {camera!r}" + (f", known to {known}" if known else "")
-    off = f"its picture is off by {one.off_px:.3f} px rms beyond the noise of {one.noise_px:.3f} px"
-    data = {key: getattr(one, key) for key in ("trusted", "cause", "words", "off_px", "noise_px", "posed")}
-    data["off_mm"] = [{"height_m": h, "rms_mm": rms, "worst_mm": worst} for h, (rms, worst) in one.off_mm.items()]
-    data["known_mm"] = [{"height_m": h, "sd_mm": sd} for h, sd in one.known_mm.items()]
-    data["ours"] = {"phi_px": camera.phi, "lens": camera.lens.kind, "rms_px": one.ours.rms_px}
-    return Section("station", wrapped(f"{name} {one.words}", off, ours), {"stations": {name: data}})
+    off = f"its picture is off by {off_px:.3f} px rms beyond the noise of {noise_px:.3f} px"
+    data: dict[str, Any] = {"trusted": one.holds, "cause": one.cause, "words": one.words}
+    data |= {"off_px": off_px, "noise_px": noise_px, "posed": not one.pose_free}
+    data["off_mm"] = [{"height_m": over.height_m, "rms_mm": over.rms_mm, "worst_mm": over.most_mm} for over in maps]
+    data["known_mm"] = [{"height_m": h, "sd_mm": sd} for h, sd in known_mm.items()]
+    data["ours"] = {"phi_px": camera.phi, "lens": camera.lens.kind, "rms_px": one.solution.rms_px}
+    return Section("station", wrapped(f"{one.name} {one.words}", off, ours), {"stations": {one.name: data}})

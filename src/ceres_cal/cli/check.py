@@ -15,11 +15,11 @@ from ceres_cal.cli.options import option
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
-from ceres_cal.scene.heights import at_height
+from ceres_cal.scene.heights import HEIGHTS_M, at_height
 
 if TYPE_CHECKING:
     from ceres_cal.detect.photographs import KnownDetections
-    from ceres_cal.moves import Check, StationCheck
+    from ceres_cal.moves import Agreement, Agreements
 
 
 def _share(text: str) -> float:
@@ -60,13 +60,13 @@ def _run(args: CheckArguments) -> Document:
             read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
         )
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
-    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms{often})"
+    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * args.false_alarms:g} % false alarms{often})"
     stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
-    stations = map(_station, answer.stations.values())
-    return Document((Section("check", [holds], stated), shown(detections), *stations), 0 if answer.holds else 1)
+    stations = map(_station, answer.values())
+    return Document((Section("check", [holds], stated), shown(detections), *stations), answer.exit_code)
 
 
-def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, KnownDetections]:
+def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Agreements, KnownDetections]:
     from ceres_cal.detect.photographs import check_photographs
 
     calibration, not_painted = read_calibration(args.calibration), parse_names(args.not_painted)
@@ -82,17 +82,28 @@ def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, Know
         )
 
 
-def _station(one: StationCheck) -> Section:
-    lines = [f"{one.station} {one.words}"]
-    if math.isfinite(one.statistic) or one.degrees:
-        size = f"picture {one.shift_px:.3g} px rms, phi {100.0 * one.phi_change:+.3f} %"
+def _station(one: Agreement) -> Section:
+    lines, change, misfit = [f"{one.name} {one.words}"], one.change, one.misfit
+    used, noise = misfit.points + misfit.curves, misfit.noise[0]
+    data = {name: getattr(one, name) for name in ("holds", "probability", "statistic", "degrees", "words")}
+    data |= {"station": one.name, "used": used, "outliers": misfit.outliers, "noise": noise}
+    sizes: dict[str, float | None] = dict.fromkeys(("moved_mm", "turned_deg", "phi_change", "shift_px"))
+    maps: list[tuple[float, float | None, float | None]] = [(height_m, None, None) for height_m in HEIGHTS_M]
+    if change is not None:
+        phi_change = change.phi_px[1] / change.phi_px[0] - 1.0
+        sizes |= {"moved_mm": change.moved_mm, "turned_deg": change.turned_deg}
+        sizes |= {"phi_change": phi_change, "shift_px": change.shift_px}
+        picture = f"picture {change.shift_px:.3g} px rms, " if math.isfinite(change.shift_px) else ""
+        size = f"{picture}phi {100.0 * phi_change:+.3f} %"
+        maps = [(over.height_m, over.mean_mm, over.worst_mm) for over in change.maps]
         lines += [
-            f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
-            f"moved {one.moved_mm:.3g} mm, turned {one.turned_deg:.3g} deg, {size}",
+            f"{used} observations, {misfit.outliers} outliers, noise {noise:.2f} times as before",
+            f"moved {change.moved_mm:.3g} mm, turned {change.turned_deg:.3g} deg, {size}",
+            *(
+                f"map {at_height(h)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
+                for h, mean, worst in maps
+                if mean == mean
+            ),
         ]
-        lines += [
-            f"map {at_height(height_m)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
-            for height_m, (mean, worst) in one.shift_mm.items()
-        ]
-    maps = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, (mean, worst) in one.shift_mm.items()]
-    return Section("station", lines, {"stations": {one.station: {**vars(one), "shift_mm": maps}}})
+    shifts = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, mean, worst in maps]
+    return Section("station", lines, {"stations": {one.name: {**data, **sizes, "shift_mm": shifts}}})

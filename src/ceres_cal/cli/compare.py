@@ -19,7 +19,7 @@ from ceres_cal.report.document import Document, Section
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
     from ceres_cal.calibration import Calibration
-    from ceres_cal.moves import CameraComparison, StationComparison
+    from ceres_cal.moves import Agreement
 
 _TABLE_SIZE = 9, 7
 
@@ -59,7 +59,7 @@ def _over_image(args: CompareArguments, first: Calibration, second: Calibration)
     from ceres_cal.moves import compare_cameras
 
     comparisons = compare_cameras(first, second, without_turn=args.without_turn)
-    return Document(tuple(section for one in comparisons for section in _camera(one)))
+    return Document(tuple(section for one in comparisons.values() for section in _camera(one)))
 
 
 def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
@@ -69,40 +69,47 @@ def _over_field(args: CompareArguments, first: Calibration, second: Calibration)
     comparisons = compare(first, second, metres(args.height_mm), args.station)
     if args.picture is not None:
         if len(comparisons) > 1:
-            names = " or ".join(one.station for one in comparisons)
+            names = " or ".join(comparisons)
             raise InputError(f"--picture shows one station: name it with --station {names}")
         from ceres_cal.report.maps import comparison_svg
 
-        svg = comparison_svg(comparisons[0], first)
+        svg = comparison_svg(next(iter(comparisons.values())), first)
         with finishing():
             write_bytes(args.picture, svg.encode())
-    return Document(tuple(section for one in comparisons for section in _station(one)))
+    return Document(tuple(section for one in comparisons.values() for section in _station(one)))
 
 
-def _station(one: StationComparison) -> Iterator[Section]:
-    phi = f"phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px"
-    size = f"{one.mean_mm:.2f} mm on average, {one.worst_mm:.2f} mm at most"
-    data = _data(one, mean_mm=one.mean_mm, worst_mm=one.worst_mm)
-    yield Section("station", [one.station], {"stations": {one.station: data}})
-    yield Section("camera", [f"moved {one.moved_mm:.2f} mm, turned {one.turned_deg:.4f} deg, {phi}"])
-    yield Section("map", [f"{size}, {1e3 * one.height_m:.0f} mm above the floor", _explained(one)])
-    yield _table("mm at y \\ x", one.errors_mm[::-1], one.x_m, one.y_m[::-1], "{:.2f} m")
+def _station(one: Agreement) -> Iterator[Section]:
+    assert one.change is not None
+    change, (over,) = one.change, one.change.maps
+    before, after = change.phi_px
+    size = f"{over.mean_mm:.2f} mm on average, {over.worst_mm:.2f} mm at most"
+    data = {name: getattr(over, name) for name in ("height_m", "x_m", "y_m", "difference_mm", "expected_mm")}
+    data |= {name: getattr(change, name) for name in ("moved_mm", "turned_deg", "phi_px")}
+    data |= {"mean_mm": over.mean_mm, "worst_mm": over.worst_mm, **_tested(one)}
+    moved = f"moved {change.moved_mm:.2f} mm, turned {change.turned_deg:.4f} deg"
+    yield Section("station", [one.name], {"stations": {one.name: data}})
+    yield Section("camera", [f"{moved}, phi {before:.3f} -> {after:.3f} px"])
+    yield Section("map", [f"{size}, {1e3 * over.height_m:.0f} mm above the floor", _explained(one)])
+    yield _table("mm at y \\ x", over.errors_mm[::-1], over.x_m, over.y_m[::-1], "{:.2f} m")
 
 
-def _camera(one: CameraComparison) -> Iterator[Section]:
+def _camera(one: Agreement) -> Iterator[Section]:
     import numpy as np
 
-    pixels, angles = one.errors_px[np.isfinite(one.errors_px)], one.angles_deg[np.isfinite(one.angles_deg)]
-    turned = f", {one.turn_deg:.4f} deg of turn taken out" if one.turn_deg else ""
-    title = f"{one.camera}, phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px{turned}"
-    yield Section("camera", [title], {"cameras": {one.camera: _data(one)}})
+    assert one.image is not None
+    over = one.image
+    pixels, angles = over.errors_px[np.isfinite(over.errors_px)], over.angles_deg[np.isfinite(over.angles_deg)]
+    turned = f", {over.turn_deg:.4f} deg of turn taken out" if over.turn_deg else ""
+    title = f"{one.name}, phi {over.phi_px[0]:.3f} -> {over.phi_px[1]:.3f} px{turned}"
+    yield Section("camera", [title], {"cameras": {one.name: {**vars(over), **_tested(one)}}})
     lines = [
         f"{np.mean(pixels):.3f} px on average, {np.max(pixels):.3f} px at most",
         f"{np.mean(angles):.4f} deg on average, {np.max(angles):.4f} deg at most, between directions",
         _explained(one),
     ]
     yield Section("image", lines)
-    yield _table("px at y \\ x", one.errors_px, one.x_px, one.y_px, "{:.0f} px")
+    yield _table("px at y \\ x", over.errors_px, over.x_px, over.y_px, "{:.0f} px")
 
 
 def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
@@ -112,15 +119,13 @@ def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
     return Section("", table.lines(), pieces=(table,))
 
 
-def _data(one: StationComparison | CameraComparison, **more: float) -> dict[str, Any]:
-    """Everything; places of a map that are not shown are null."""
-    own = {name: value for name, value in vars(one).items() if name not in ("station", "camera")}
-    return {**own, **more, "explained_by_uncertainty": one.explained}
+def _tested(one: Agreement) -> dict[str, Any]:
+    return {"probability": one.probability, "explained_by_uncertainty": one.holds}
 
 
-def _explained(one: StationComparison | CameraComparison) -> str:
+def _explained(one: Agreement) -> str:
     return {
-        True: f"explained by their uncertainties (probability {one.probability or 0.0:.2g})",
-        False: f"more than their uncertainties explain (probability {one.probability or 0.0:.1g})",
+        True: f"explained by their uncertainties (probability {one.probability:.2g})",
+        False: f"more than their uncertainties explain (probability {one.probability:.1g})",
         None: "nothing can be said of uncertainty: it is not told of both",
-    }[one.explained]
+    }[one.holds]

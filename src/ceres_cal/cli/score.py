@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.arguments import Loss, calibration_argument
 from ceres_cal.cli.command import command
@@ -13,7 +13,8 @@ from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.moves import Score, ScorePart
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.moves import Agreement, Agreements
 
 _MOST_VIEWS = 3  # shown
 
@@ -51,36 +52,46 @@ def _run(args: ScoreArguments) -> Document:
     asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
     options = replace(calibration.options, **asked)
     observations = read_observations(args.observations)
-    return _document(score(calibration, observations, options=options, hold_stations=args.hold_stations))
+    return _document(score(calibration, observations, options=options, hold_stations=args.hold_stations), calibration)
 
 
-def _document(answer: Score) -> Document:
-    ratios = dict(zip(("points", "curves"), answer.noise_ratios, strict=True))
+def _document(answer: Agreements, before: Calibration) -> Document:
+    cameras = list(answer.values())
+    views = sorted((view for one in cameras for view in one.views), key=lambda view: -view.misfit.all_rms_px)
+    posed = cameras[0].solution
+    assert posed is not None
+    ratios = dict(zip(("points", "curves"), cameras[0].misfit.noise, strict=True))
     known = [f"noise of {kind} {ratio:.2f} times the calibration's" for kind, ratio in ratios.items() if ratio == ratio]
     numbers = {
-        "fit": answer.fit,
-        "rms_px": answer.fit.rms_px,
-        "calibration_rms_px": answer.before.rms_px,
+        "fit": posed.fit,
+        "rms_px": posed.fit.rms_px,
+        "calibration_rms_px": before.fit.rms_px,
         "noise_ratios": ratios,
     }
-    worst = [f"{part.name}: {_left(part)}" for part in answer.views[:_MOST_VIEWS]]
+    worst = [f"{one.name}: {_left(one)}" for one in views[:_MOST_VIEWS]]
+    parts = {"cameras": list(map(_data, cameras)), "views": list(map(_data, views))}
     return Document(
         (
             Section("score", ["intrinsics held, poses alone solved for", *known], numbers),
-            *(Section("camera", [f"{part.name}: {_left(part)}"]) for part in answer.cameras),
-            Section("worst", worst, {"cameras": answer.cameras, "views": answer.views}),
+            *(Section("camera", [f"{one.name}: {_left(one)}"]) for one in cameras),
+            Section("worst", worst, parts),
         )
     )
 
 
-def _left(part: ScorePart) -> str:
+def _data(one: Agreement) -> dict[str, Any]:
+    return {"name": one.name, **{name: value for name, value in vars(one.misfit).items() if name != "noise"}}
+
+
+def _left(one: Agreement) -> str:
+    left = one.misfit
     kinds = [
         f"rms {rms:.4f} px over {count} {kind}"
         for kind, count, rms in (
-            ("points", part.points, part.points_rms_px),
-            ("curve observations", part.curves, part.curves_rms_px),
+            ("points", left.points, left.points_rms_px),
+            ("curve observations", left.curves, left.curves_rms_px),
         )
         if count
     ]
-    out = f"; {part.outliers} taken out, {part.all_rms_px:.4f} px with them" if part.outliers else ""
+    out = f"; {left.outliers} taken out, {left.all_rms_px:.4f} px with them" if left.outliers else ""
     return ", ".join(kinds or ["nothing took part"]) + out

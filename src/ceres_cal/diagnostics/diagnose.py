@@ -82,7 +82,7 @@ def diagnose(
     Raises:
         InputError: the observations are not those of the calibration, and `new_data` does not say so; or they name
             cameras or stations that it does not have.
-        SolutionError: it can show none of them.
+        SolutionError: another camera or target than those calibrated, or it can show none of them.
     """
     observations = calibration.drawn_alike(observations)
     _require_known(calibration, observations, new_data)
@@ -110,16 +110,11 @@ def _require_known(calibration: Calibration, observations: Observations, new_dat
             "these are not the observations that the calibration was made from (their digest differs): give those, or "
             "say that they are new data (--new-data)"
         )
-    for station, camera in observations.stations.items():
-        known = calibration.estimate.stations.get(station)
-        if known is None or known.camera != camera:
-            raise InputError(
-                f"station {station!r} of camera {camera!r} is not in the calibration: it has "
-                f"{', '.join(calibration.estimate.stations)}"
-            )
-    for name, target in observations.targets.items():
-        if name in calibration.targets and calibration.targets[name] != target:
-            raise InputError(f"target {name!r} is another one than the calibration's: give one of them another name")
+    if new_data:
+        from ceres_cal.moves.agreement import matched, require_stations  # which `calibrate` does not need
+
+        matched(calibration, observations)
+        require_stations(calibration, observations)
 
 
 def _case(calibration: Calibration, observations: Observations, new_data: bool) -> Case:

@@ -1,22 +1,18 @@
-"""Calibrations and new observations: refit, check, score and compare."""
+"""Calibrations and new observations: refit, check, score, audit and compare."""
 
-from ceres_cal.moves.auditing import StationAudit, audit
-from ceres_cal.moves.carried import RefitOptions
-from ceres_cal.moves.checking import FALSE_ALARMS, Check, StationCheck, check
-from ceres_cal.moves.comparison import CameraComparison, StationComparison, compare, compare_cameras
-from ceres_cal.moves.refitting import movements, refit
-from ceres_cal.moves.scoring import Score, ScorePart, score
+from ceres_cal.moves.agreement import FALSE_ALARMS, Agreement, Agreements
+from ceres_cal.moves.audits import audit
+from ceres_cal.moves.checks import check
+from ceres_cal.moves.comparisons import compare, compare_cameras
+from ceres_cal.moves.refit_plan import RefitOptions
+from ceres_cal.moves.refits import movements, refit
+from ceres_cal.moves.scores import score
 
 __all__ = [
     "FALSE_ALARMS",
-    "CameraComparison",
-    "Check",
+    "Agreement",
+    "Agreements",
     "RefitOptions",
-    "Score",
-    "ScorePart",
-    "StationAudit",
-    "StationCheck",
-    "StationComparison",
     "audit",
     "check",
     "compare",

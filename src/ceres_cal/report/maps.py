@@ -11,7 +11,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import StationComparison
 from ceres_cal.posterior.image import image_grid
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.report import canvas
@@ -24,6 +23,8 @@ from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from ceres_cal.moves import Agreement
 
 _SERIES = (
     (1.0, 2.0, 5.0),
@@ -277,18 +278,18 @@ def lens_image_figure(material: Material, name: str) -> Figure:
 # ---- where two calibrations differ ----------------------------------------------------------------------------------
 
 
-def comparison_svg(comparison: StationComparison, before: Calibration) -> str:
+def comparison_svg(comparison: Agreement, before: Calibration) -> str:
     """The map of one station's differences as a file of its own, over the field as the first calibration sees it."""
-    camera = before.stations[comparison.station]
+    assert comparison.change is not None
+    camera, (over,) = before.stations[comparison.name], comparison.change.maps
     fields = [target for target in before.targets.values() if not target.movable]
-    where = at_height(comparison.height_m)
     map_drawing = MapDrawing(
-        comparison.x_m,
-        comparison.y_m,
-        comparison.errors_mm,
-        f"{comparison.station}, {where}: difference, mm ({comparison.mean_mm:.2f} on average)",
+        over.x_m,
+        over.y_m,
+        over.errors_mm,
+        f"{comparison.name}, {at_height(over.height_m)}: difference, mm ({over.mean_mm:.2f} on average)",
         [line[:, :2] for line in paint_of(fields)],
-        image_border(camera, comparison.height_m),
+        image_border(camera, over.height_m),
         camera.position,
     )
     return canvas.to_svg(map_drawing.drawing, canvas.WIDE_IN, "comparison", whole_file=True)

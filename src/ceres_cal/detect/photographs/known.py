@@ -12,7 +12,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs.field import FieldOptions, detect_field
 from ceres_cal.detect.photographs.follow import FAR_PX
-from ceres_cal.moves import FALSE_ALARMS, Check, StationCheck, check
+from ceres_cal.moves import FALSE_ALARMS, Agreements, check
+from ceres_cal.moves.checks import not_found
 from ceres_cal.observations import Observations, combine
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -135,7 +136,7 @@ def check_photographs(
     checks: int = 1,
     not_painted: Collection[str] = (),
     progress: ImageProgress | None = None,
-) -> tuple[Check, KnownDetections]:
+) -> tuple[Agreements, KnownDetections]:
     """`check` with photographs of one station; boards, which lie anywhere, are not looked for.
 
     Where no photograph shows the field near where the calibration has it, the station does not hold, and its words say
@@ -148,9 +149,7 @@ def check_photographs(
         f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
         "farther, or it sees no field (dark, covered, other lines): look at the picture"
     )
-    return Check(
-        false_alarms, checks, {detections.station: StationCheck.unknown(detections.station, words)}
-    ), detections
+    return Agreements({detections.station: not_found(detections.station, words)}, false_alarms, checks), detections
 
 
 def is_painted(target: Target) -> bool:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,9 +11,9 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibration import Calibration, Fit
+from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import Again, solved_from
-from ceres_cal.moves.carried import require_same_things
+from ceres_cal.moves.agreement import Agreement, Agreements, Misfit, matched, require_stations
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -25,50 +25,6 @@ from ceres_cal.problem.structure import EXACT, Structure, make_structure
 from ceres_cal.start.initialise import Start, chained_poses
 
 
-@dataclass(frozen=True)
-class ScorePart:
-    """What one camera, or one view, leaves.
-
-    Attributes:
-        name: of the camera, or of frame, station and target.
-        points, curves: observations that took part. outliers: those that did not.
-        points_rms_px, curves_rms_px: root mean square lengths of their residuals; 0 of nothing.
-        all_rms_px: the same of points and curves with all outliers in it; infinite where one cannot be shown at all.
-    """
-
-    name: str
-    points: int
-    curves: int
-    outliers: int
-    points_rms_px: float
-    curves_rms_px: float
-    all_rms_px: float
-
-
-@dataclass(frozen=True, eq=False)
-class Score:
-    """New observations under a calibration's intrinsics.
-
-    Attributes:
-        fit: residuals and noise. before: those that the calibration was made with.
-        cameras, views: parts by camera and, the worst first, by view.
-        estimate: the poses that suit the observations best.
-    """
-
-    fit: Fit
-    before: Fit
-    cameras: tuple[ScorePart, ...]
-    views: tuple[ScorePart, ...]
-    estimate: Estimate
-
-    @property
-    def noise_ratios(self) -> tuple[float, float]:
-        """Noise of points and of curves over that of the calibration, px over px; NaN where either has none."""
-        pairs = zip(self.fit.noise_px, self.before.noise_px, strict=True)
-        ratios = [new / old if new > 0.0 and old > 0.0 else float("nan") for new, old in pairs]
-        return ratios[0], ratios[1]
-
-
 @numerical("the score")
 def score(
     calibration: Calibration,
@@ -76,10 +32,12 @@ def score(
     *,
     options: Options | None = None,
     hold_stations: bool = False,
-) -> Score:
+) -> Agreements:
     """How well new observations of fields or boards agree with a calibration: poses alone are solved for.
 
-    Targets are taken as the calibration says that they were built. A calibration of another program will do.
+    Targets are taken as the calibration says that they were built. A calibration of another program will do. The
+    answers are those of its cameras, with what each view leaves, the worst first, and the poses that suit the
+    observations best (`solution`). Whether the calibration holds is not decided: the noise says how well.
 
     Args:
         options: loss and rejection; those of the calibration by default.
@@ -91,14 +49,12 @@ def score(
         DegenerateError: naming the sight whose pose the observations do not determine.
         SolutionError: another camera or target than those calibrated, or intrinsics that do not explain them at all.
     """
-    observations = calibration.drawn_alike(observations)
-    require_same_things(calibration, observations)
-    observed = replace(observations, targets={**calibration.targets, **observations.targets})
+    observed = matched(calibration, observations)
     given = replace(options or calibration.options, lens=calibration.options.lens, tolerances={}, dimensions=())
     sights = _as_built(observed, calibration)
-    known = (
-        {name: calibration.estimate.stations[name] for name in _held(calibration, observed)} if hold_stations else {}
-    )
+    if hold_stations:
+        require_stations(calibration, observed)
+    known = {name: calibration.estimate.stations[name] for name in observed.stations} if hold_stations else {}
     layout = make_layout(observed, given)
     layout = replace(
         layout,
@@ -111,21 +67,17 @@ def score(
     priors = gather_priors(observed, given, EXACT)
     posed = solved_from(start, observed, Problem(sights, layout, priors, options=given), Again(layout, None, False))
     left = residuals(observed, sights, posed.estimate)
-    return Score(
-        posed.fit,
-        calibration.fit,
-        tuple(_by_camera(observed, left, posed)),
-        tuple(sorted(_by_view(observed, left, posed), key=lambda part: -part.all_rms_px)),
-        posed.estimate,
-    )
-
-
-def _held(calibration: Calibration, observations: Observations) -> list[str]:
-    for name in observations.stations:
-        if name not in calibration.estimate.stations:
-            names = ", ".join(map(repr, calibration.estimate.stations))
-            raise InputError(f"station {name!r} is not in the calibration, which has {names}: it cannot be held there")
-    return list(observations.stations)
+    noise = _noise_ratios(posed, calibration)
+    views = [(view.camera, _view(number, observed, left, posed, noise)) for number, view in enumerate(observed.views)]
+    views.sort(key=lambda one: -one[1].misfit.all_rms_px)
+    answers = {}
+    for name in posed.cameras:
+        own = np.array([view.camera == name for view in observed.views])
+        if own.any():
+            misfit = _misfit(own, observed, left, posed, noise)
+            its = tuple(view for camera, view in views if camera == name)
+            answers[name] = Agreement(name=name, misfit=misfit, views=its, pose_free=True, solution=posed)
+    return Agreements(answers)
 
 
 def _as_built(observations: Observations, calibration: Calibration) -> Sights:
@@ -161,20 +113,25 @@ def _start(
 # ---- what is left ---------------------------------------------------------------------------------------------------
 
 
-def _by_camera(observations: Observations, left: Residuals, posed: Calibration) -> Iterator[ScorePart]:
-    cameras = [view.camera for view in observations.views]
-    for name in posed.cameras:
-        if name in cameras:
-            yield _part(name, np.array([camera == name for camera in cameras]), observations, left, posed)
+def _noise_ratios(posed: Calibration, before: Calibration) -> tuple[float, float]:
+    """Noise of points and of curves over that of the calibration, px over px; NaN where either has none."""
+    pairs = zip(posed.fit.noise_px, before.fit.noise_px, strict=True)
+    points, curves = (new / old if new > 0.0 and old > 0.0 else float("nan") for new, old in pairs)
+    return points, curves
 
 
-def _by_view(observations: Observations, left: Residuals, posed: Calibration) -> Iterator[ScorePart]:
-    for number, view in enumerate(observations.views):
-        name = f"frame {view.frame!r} of station {view.station!r}, {view.target}"
-        yield _part(name, np.arange(len(observations.views)) == number, observations, left, posed)
+def _view(
+    number: int, observations: Observations, left: Residuals, posed: Calibration, noise: tuple[float, float]
+) -> Agreement:
+    view = observations.views[number]
+    name = f"frame {view.frame!r} of station {view.station!r}, {view.target}"
+    here = np.arange(len(observations.views)) == number
+    return Agreement(name=name, misfit=_misfit(here, observations, left, posed, noise), pose_free=True)
 
 
-def _part(name: str, views: Mask, observations: Observations, left: Residuals, posed: Calibration) -> ScorePart:
+def _misfit(
+    views: Mask, observations: Observations, left: Residuals, posed: Calibration, noise: tuple[float, float]
+) -> Misfit:
     own = views[observations.points.view], views[observations.curves.view]
     kept = posed.inlier_masks(observations)
     inside = [lengths[mine & used] for lengths, mine, used in zip(left.lengths, own, kept, strict=True)]
@@ -182,9 +139,8 @@ def _part(name: str, views: Mask, observations: Observations, left: Residuals, p
         np.concatenate([lengths[mine] for lengths, mine in zip(left.lengths, own, strict=True)]), nan=np.inf
     )
     points, curves = inside
-    return ScorePart(
-        name, len(points), len(curves), len(every) - len(points) - len(curves), *map(_rms, (*inside, every))
-    )
+    outliers = len(every) - len(points) - len(curves)
+    return Misfit(len(points), len(curves), outliers, _rms(points), _rms(curves), _rms(every), noise)
 
 
 def _rms(values: Array) -> float:

@@ -21,15 +21,16 @@ from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.moves.agreement import Agreement, Agreements, Change, Misfit, change_of, field_grids
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.posterior.maps import FieldGrid, field_map
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.heights import HEIGHTS_M, at_height
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import at_height
 
 # How often a sound calibration is said to be at fault.
 _FALSE_ALARMS = 0.005
@@ -38,36 +39,14 @@ _LENSES = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (
 _SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 
 
-@dataclass(frozen=True, eq=False)
-class StationAudit:
-    """What observations say of one station of another program's calibration.
-
-    Attributes:
-        trusted: whether it explains them as well as another calibration of as many would.
-        cause: None, or "another image size", "half a pixel", "swapped focal lengths", "moved", "too few coefficients",
-            "other intrinsics". words: the answer, in a line.
-        off_px: root mean square by which its picture is off beyond the noise. noise_px: that of the observations.
-        off_mm: height_m -> root mean square and largest distance from where ours locates, over what it sees of the
-            field; empty without a field. known_mm: how well ours knows that, root mean square.
-        posed: whether it said where it stands; else the pose that is best for it was taken.
-        ours: the calibration of the same observations.
-    """
-
-    station: str
-    trusted: bool
-    cause: str | None
-    words: str
-    off_px: float
-    noise_px: float
-    off_mm: dict[float, tuple[float, float]]
-    known_mm: dict[float, float]
-    posed: bool
-    ours: Calibration
-
-
 @numerical("the audit")
-def audit(foreign: Calibration, observations: Observations) -> dict[str, StationAudit]:
+def audit(foreign: Calibration, observations: Observations) -> Agreements:
     """Hold a calibration, ours or another program's, against observations of its stations.
+
+    The answer of a station has the least change that explains the observations as its `cause` ("another image size",
+    "half a pixel", "swapped focal lengths", "moved", "too few coefficients" or "other intrinsics"), our own calibration
+    of the same observations as its `solution`, and the change from that to the given camera, with how well ours knows
+    places as what is expected. `pose_free`: it did not say where it stands, and the pose that is best for it was taken.
 
     Args:
         foreign: see `formats.import_calibration`. A single station need not be named as in the observations.
@@ -81,7 +60,8 @@ def audit(foreign: Calibration, observations: Observations) -> dict[str, Station
     if not names:
         there, here = (", ".join(map(repr, one)) for one in (foreign.stations, observations.stations))
         raise InputError(f"the calibration has stations {there}, the observations {here}: name them alike")
-    return {name: _audited(name, foreign.station(own), observations.of_station(name)) for name, own in names.items()}
+    answers = {name: _audited(name, foreign.station(own), observations.of_station(name)) for name, own in names.items()}
+    return Agreements(answers, _FALSE_ALARMS)
 
 
 # ---- one station ----------------------------------------------------------------------------------------------------
@@ -130,32 +110,47 @@ class _AuditCase:
         return total
 
 
-def _audited(name: str, given: Camera, observations: Observations) -> StationAudit:
+def _audited(name: str, given: Camera, observations: Observations) -> Agreement:
     case = _case(observations, given)
-    here = case.ours.station(name)
+    ours, here = case.ours, case.ours.station(name)
     tied = bool(case.problem.layout.stations)  # else only boards were seen, and the camera is the world
     posed = tied and not np.array_equal(given.cam_from_world.matrix, np.eye(3, 4))
     camera = given if posed else given.at(here.cam_from_world)
     best = case.least(here, pose=False)[0]
-    free = case.problem.layout.free[next(iter(case.ours.cameras))]
+    free = case.problem.layout.free[next(iter(ours.cameras))]
     degrees = len(free) + (6 if posed else 0)
     cost, as_it_is = case.least(camera, pose=not posed)
-    cause, words = (None, "") if _sound(cost - best, degrees) else _cause(case, camera, best, degrees, posed)
-    size = case.ours.fit.points + case.ours.fit.curves
-    noise = float(np.hypot(*case.ours.fit.noise_px))
-    off_mm = _off_mm(as_it_is, here, case.ours)
-    return StationAudit(
-        name,
-        cause is None,
-        cause,
-        _words(cause, words, off_mm, posed),
-        noise * float(np.sqrt(max(cost - best, 0.0) / size)),
-        noise,
-        off_mm,
-        _known_mm(case.ours),
-        posed,
-        case.ours,
+    probability = _probability(cost - best, degrees)
+    holds = probability >= _FALSE_ALARMS
+    cause, what_to_do = (None, "") if holds else _cause(case, camera, best, degrees, posed)
+
+    def known(grid: FieldGrid) -> Array:
+        return field_map(ours.estimate, ours.uncertainty.posterior, name, grid).sd_mm
+
+    # A camera that is the world stands nowhere over a field, even where its targets have one.
+    grids = field_grids(ours.targets) if tied else []
+    change = change_of(ours.estimate, name, as_it_is, grids, known if ours.posterior is not None else None)
+    return Agreement(
+        name=name,
+        holds=holds,
+        probability=probability,
+        statistic=0.5 * max(cost - best, 0.0),
+        degrees=degrees,
+        words=_words(cause, what_to_do, change, posed),
+        cause=cause,
+        change=change,
+        misfit=Misfit(ours.fit.points, ours.fit.curves, len(ours.outliers)),
+        pose_free=not posed,
+        solution=ours,
     )
+
+
+def excess_px(one: Agreement) -> tuple[float, float]:
+    """Root mean square by which the picture of an audited camera is off beyond the noise, and the noise, px."""
+    assert one.solution is not None
+    fit = one.solution.fit
+    noise = float(np.hypot(*fit.noise_px))
+    return noise * float(np.sqrt(2.0 * one.statistic / (fit.points + fit.curves))), noise
 
 
 def _case(observations: Observations, given: Camera) -> _AuditCase:
@@ -184,9 +179,13 @@ def _case(observations: Observations, given: Camera) -> _AuditCase:
     return _AuditCase(observations, ours, used.used(points, curves))
 
 
+def _probability(rise: float, degrees: int) -> float:
+    """Of a cost so far above the least, or farther, where both calibrations were made from as many observations."""
+    return upper_tail(0.5 * rise, degrees)
+
+
 def _sound(rise: float, degrees: int) -> bool:
-    """Whether a cost so far above the least is what two calibrations of as many observations show."""
-    return upper_tail(0.5 * rise, degrees) >= _FALSE_ALARMS
+    return _probability(rise, degrees) >= _FALSE_ALARMS
 
 
 # ---- what is wrong with it ------------------------------------------------------------------------------------------
@@ -243,38 +242,13 @@ def resized(camera: Camera, scale: float, image_size: tuple[int, int]) -> Camera
     return replace(camera, image_size=image_size, phi=scale * camera.phi, principal_point=(cx, cy), lens=lens)
 
 
-# ---- how far it is off ----------------------------------------------------------------------------------------------
+# ---- in words -------------------------------------------------------------------------------------------------------
 
 
-def _off_mm(camera: Camera, ours: Camera, calibration: Calibration) -> dict[float, tuple[float, float]]:
-    off_mm = {}
-    for height_m in HEIGHTS_M if _has_field(calibration) else ():
-        x, y = (part.ravel() for part in np.meshgrid(*field_grid(calibration.targets)))
-        pixels = ours.project(np.column_stack([x, y, np.full(len(x), height_m)]))
-        pixels = pixels[in_image(pixels, ours.image_size)]
-        off = 1e3 * np.linalg.norm(camera.locate(pixels, height_m) - ours.locate(pixels, height_m), axis=1)
-        off = np.where(np.isfinite(off), off, np.inf)
-        off_mm[height_m] = _root_mean_square(off), float(np.max(off, initial=0.0))
-    return off_mm
-
-
-def _known_mm(calibration: Calibration) -> dict[float, float]:
-    if not _has_field(calibration) or calibration.posterior is None:
-        return {}
-    maps = {height_m: calibration.uncertainty.map_sd_mm(height_m=height_m).sd_mm for height_m in HEIGHTS_M}
-    return {height_m: _root_mean_square(sd[np.isfinite(sd)]) for height_m, sd in maps.items()}
-
-
-def _has_field(calibration: Calibration) -> bool:
-    return any(not target.movable for target in calibration.targets.values())
-
-
-def _root_mean_square(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
-
-
-def _words(cause: str | None, what_to_do: str, off_mm: dict[float, tuple[float, float]], posed: bool) -> str:
-    sizes = [f"{rms:.2g} mm rms and {worst:.2g} mm at most {at_height(h)}" for h, (rms, worst) in off_mm.items()]
+def _words(cause: str | None, what_to_do: str, change: Change, posed: bool) -> str:
+    sizes = [
+        f"{one.rms_mm:.2g} mm rms and {one.most_mm:.2g} mm at most {at_height(one.height_m)}" for one in change.maps
+    ]
     placed = "" if posed else " (from the pose that is best for it: it says none)"
     if cause is None:
         off = f", within {', '.join(sizes)} of ours" if sizes else ""

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
+from ceres_cal.moves.agreement import matched, require_posterior
 from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -109,8 +110,8 @@ def make_plan(
     if what not in WHAT:
         raise InputError(f"what={what!r} is unknown: choose one of {', '.join(WHAT)}")
     require_posterior(calibration)
+    observed = matched(calibration, observations)
     observations = calibration.drawn_alike(observations)
-    require_same_things(calibration, observations)
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
     for name in chosen - stations.keys():
@@ -121,8 +122,7 @@ def make_plan(
     elsewhere = {stations[name] for name in stations}  # a camera that was observed is where it was observed
     stays = frozenset(n for n, s in old.items() if n not in chosen and (n in stations or s.camera not in elsewhere))
     asked = asked or RefitOptions()
-    given = _turned(observations) if asked.labels == "turned" else observations
-    observed = replace(given, targets={**calibration.targets, **observations.targets})
+    observed = _turned(observed) if asked.labels == "turned" else observed
     same = calibration.digest == observations.digest  # then the question is the same, too
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
@@ -158,39 +158,6 @@ def _turned(observations: Observations) -> Observations:
     if turned is None:
         raise InputError("labels turned: some observed feature has no counterpart half a turn away: label anew")
     return turned
-
-
-def require_posterior(calibration: Calibration) -> None:
-    """Raise InputError where nothing is known of how well a calibration is known."""
-    if calibration.posterior is None:
-        raise InputError("the calibration does not say how well it is known: calibrate again")
-
-
-def require_same_things(calibration: Calibration, observations: Observations) -> None:
-    """Raise an error where cameras, image sizes or targets are not those that were calibrated, or images too small for
-    the observations.
-    """
-    for name, size in observations.cameras.items():
-        if name not in calibration.cameras:
-            known = ", ".join(map(repr, calibration.cameras))
-            raise InputError(f"camera {name!r} is not in the calibration, which has {known}: name the camera as there")
-        known_size = calibration.cameras[name].image_size
-        if known_size != tuple(size):
-            raise SolutionError(
-                f"wrong camera: {name!r} was calibrated with images of {known_size[0]} x {known_size[1]} px, the "
-                f"observations are of {size[0]} x {size[1]} px: calibrate it anew"
-            )
-    for name, target in observations.targets.items():
-        if name in calibration.targets and calibration.targets[name] != target:
-            raise SolutionError(
-                f"wrong field: target {name!r} has other dimensions in the observations than in the calibration: "
-                "correct them, or give it another name"
-            )
-    for name, camera in observations.stations.items():
-        station = calibration.estimate.stations.get(name)
-        if station is not None and station.camera != camera:
-            raise InputError(f"station {name!r} is one of camera {station.camera!r}, not of {camera!r}: name another")
-    observations.require_inside()
 
 
 def carried_prior(calibration: Calibration, observations: Observations, stays: frozenset[str]) -> GaussianPrior:

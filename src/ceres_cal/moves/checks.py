@@ -19,13 +19,22 @@ from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.effects.dependence import measure_scatter
-from ceres_cal.moves.carried import require_posterior, require_same_things
+from ceres_cal.moves.agreement import (
+    FALSE_ALARMS,
+    Agreement,
+    Agreements,
+    Change,
+    Misfit,
+    change_of,
+    field_grids,
+    matched,
+    require_posterior,
+    require_stations,
+)
 from ceres_cal.moves.contrast import Contrast, NormalDistribution, contrast
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
-from ceres_cal.posterior.maps import FieldGrid, visible_pixels
-from ceres_cal.posterior.uncertainty import field_grid
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
@@ -35,10 +44,7 @@ from ceres_cal.problem.quantities import layout_of
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import make_structure
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 
-FALSE_ALARMS = 0.01
 # Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
 # -> 0.075 of 80 cases); at double nothing changes.
 _INLIER_SIGMA = 3.5
@@ -51,68 +57,10 @@ _WILL_DO = 10.8
 _USUAL_EQUATIONS = 4.0
 
 
-@dataclass(frozen=True)
-class StationCheck:
-    """Whether one station still is as it was calibrated.
-
-    Attributes:
-        holds: whether the probability is not below the false-alarm rate of one station, and the observations are
-            understood. probability: of such observations, or stranger ones, from an unmoved camera whose calibration
-            is as far off as one in 20 is.
-        statistic: squared distance, in standard deviations. degrees: numbers, or directions of them, that were tested.
-        used, outliers: observations. noise: times that of the calibration.
-        moved_mm, turned_deg: best estimate of the movement. phi_change: relative; both with phi under what is known
-            of it, unless that does not explain the observations.
-        shift_px: root mean square shift of the picture over the field. shift_mm: height_m -> mean and largest shift of
-            the map over what the station sees of the field.
-        words: the answer, in a line.
-    """
-
-    station: str
-    holds: bool
-    probability: float
-    statistic: float
-    degrees: int
-    used: int
-    outliers: int
-    noise: float
-    moved_mm: float
-    turned_deg: float
-    phi_change: float
-    shift_px: float
-    shift_mm: dict[float, tuple[float, float]]
-    words: str
-
-    @classmethod
-    def unknown(cls, station: str, words: str, used: int = 0, outliers: int = 0) -> StationCheck:
-        """A station that does not hold, of whose movement nothing is known."""
-        shifts, far = dict.fromkeys(HEIGHTS_M, (np.inf, np.inf)), (np.inf,) * 5
-        return cls(station, False, 0.0, np.inf, 0, used, outliers, *far, shifts, words)
-
-
-@dataclass(frozen=True)
-class Check:
-    """The answer for all stations together.
-
-    Attributes:
-        false_alarms: probability that an unmoved set of cameras is said to have moved at least once in so many
-            checks. stations: by name.
-    """
-
-    false_alarms: float
-    checks: int
-    stations: dict[str, StationCheck]
-
-    @property
-    def holds(self) -> bool:
-        """Whether every station still is as it was."""
-        return all(station.holds for station in self.stations.values())
-
-
 @numerical("the check")
 def check(
     calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1
-) -> Check:
+) -> Agreements:
     """Test whether a calibration still holds for new observations of its stations.
 
     Seven numbers of each station that was observed are tested at once: its pose and its camera's phi. Noise and
@@ -133,21 +81,16 @@ def check(
     if checks < 1:
         raise InputError(f"checks must be 1 or more, not {checks}")
     require_posterior(calibration)
-    observations = calibration.drawn_alike(observations)
-    require_same_things(calibration, observations)
-    for name in observations.stations:
-        if name not in calibration.estimate.stations:
-            names = ", ".join(map(repr, calibration.estimate.stations))
-            raise InputError(f"station {name!r} is not in the calibration, which has {names}: name it as there")
-    observed = replace(observations, targets={**calibration.targets, **observations.targets})
+    observed = matched(calibration, observations)
+    require_stations(calibration, observed)
     sights = gather_sights(observed)
     world = sights.of_world
-    for name in observations.stations:
+    for name in observed.stations:
         if name not in world:
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
     level = false_alarms / (len(world) * checks)
     stations = {name: _checked(calibration, observed, sight, level) for name, sight in world.items()}
-    return Check(false_alarms, checks, stations)
+    return Agreements(stations, false_alarms, checks)
 
 
 # ---- one station ----------------------------------------------------------------------------------------------------
@@ -218,35 +161,34 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     return _CheckCase(calibration, observed, sight, estimate, calibration.prior_of(kept), tested)
 
 
-@dataclass(frozen=True)
-class _CheckOutcome:
-    """The outcome of a station's test: the first attributes of its `StationCheck`."""
-
-    holds: bool
-    probability: float
-    statistic: float
-    degrees: int
-    used: int
-    outliers: int
-    noise: float
-
-
-def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> StationCheck:
+def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> Agreement:
     case = _case(calibration, observed, sight)
     search = PoseSearch(observed, sight, case.estimate, calibration.fit.scales)
     near = pose_candidates(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
     used = sight.used(*_inliers(search, near[0])) if near else sight[:0]
     inside, count = (len(s.point_rows) + len(s.curve_rows) for s in (used, sight))
+    misfit = Misfit(len(used.point_rows), len(used.curve_rows), count - inside)
     # With phi under what is known of it: next to it a height says little, and far along that valley nothing is linear.
     posed = case.least(used, case.station_keys, near[0].pose) if inside >= _LEAST_SHARE * count else None
     if posed is None:
-        return _not_understood(case, inside, count)
+        return _not_understood(case, misfit)
     noise, apart = _apart(case, used, *posed)
     holds = apart.probability >= level
-    test = _CheckOutcome(holds, apart.probability, apart.statistic, apart.degrees, inside, count - inside, noise)
     zoomed = None if holds else case.least(used, case.tested, near[0].pose)
     will_do = zoomed is None or posed[0] - zoomed[0] < _WILL_DO * noise**2
-    return _answer(case, test, posed[1] if will_do or zoomed is None else zoomed[1])
+    anew = posed[1] if will_do or zoomed is None else zoomed[1]
+    grids = field_grids(calibration.targets)
+    change = change_of(case.estimate, case.name, anew.camera_at(case.name), grids)
+    return Agreement(
+        name=case.name,
+        holds=holds,
+        probability=apart.probability,
+        statistic=apart.statistic,
+        degrees=apart.degrees,
+        words=_words(holds, apart.probability, misfit, change),
+        change=change,
+        misfit=replace(misfit, noise=(noise, noise)),
+    )
 
 
 def _apart(case: _CheckCase, used: Sights, least: float, estimate: Estimate) -> tuple[float, Contrast]:
@@ -285,59 +227,31 @@ def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
 # ---- in words -------------------------------------------------------------------------------------------------------
 
 
-def _not_understood(case: _CheckCase, inside: int, count: int) -> StationCheck:
+def _not_understood(case: _CheckCase, misfit: Misfit) -> Agreement:
+    inside = misfit.points + misfit.curves
     words = (
-        f"moved far, or not understood: only {inside} of {count} observations fit the known lens from anywhere near: "
-        "refit, or check labels and camera"
+        f"moved far, or not understood: only {inside} of {inside + misfit.outliers} observations fit the known lens "
+        "from anywhere near: refit, or check labels and camera"
     )
-    return StationCheck.unknown(case.name, words, inside, count - inside)
+    return not_found(case.name, words, misfit)
 
 
-def _answer(case: _CheckCase, test: _CheckOutcome, anew: Estimate) -> StationCheck:
-    old, new = case.estimate.camera_at(case.name), anew.camera_at(case.name)
-    shift_m, turn = movement(new.cam_from_world, old.cam_from_world)
-    maps = {height_m: _map_shift_mm(old, new, _visible_places(case, height_m)) for height_m in HEIGHTS_M}
-    floor = _visible_places(case, 0.0)
-    shift_px = np.linalg.norm(old.project(floor) - new.project(floor), axis=1)
-    shift_px = shift_px[np.isfinite(shift_px)]
-    return StationCheck(
-        case.name,
-        **vars(test),
-        moved_mm=1e3 * shift_m,
-        turned_deg=float(np.degrees(turn)),
-        phi_change=new.phi / old.phi - 1.0,
-        shift_px=float(np.sqrt(np.mean(shift_px**2))) if len(shift_px) else np.nan,
-        shift_mm=maps,
-        words=_words(test, f"{1e3 * shift_m:.1f} mm and {np.degrees(turn):.3f} deg", maps[0.0][1]),
-    )
+def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreement:
+    """A station that does not hold, of whose movement nothing is known."""
+    answer = Agreement(name=station, holds=False, probability=0.0, statistic=np.inf, words=words)
+    return answer if misfit is None else replace(answer, misfit=misfit)
 
 
-def _words(test: _CheckOutcome, movement: str, worst_mm: float) -> str:
-    if test.holds:
-        probability = f"probability {test.probability:.2g}"
-        words = f"holds: no movement beyond what is known ({worst_mm:.1f} mm on the floor at most, {probability})"
+def _words(holds: bool, probability: float, misfit: Misfit, change: Change) -> str:
+    worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
+    if holds:
+        at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
+        words = f"holds: no movement beyond what is known ({at_most}probability {probability:.2g})"
     else:
-        shift = f"shifts the map by up to {worst_mm:.1f} mm on the floor (probability {test.probability:.1g})"
-        words = f"no longer holds: moved by about {movement}, which {shift}"
-    count = test.used + test.outliers
-    if test.outliers > _MANY_OUTLIERS * count:
-        words += f"; but {test.outliers} of {count} observations fit nowhere: check labels"
+        shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
+        moved = f"moved by about {change.moved_mm:.1f} mm and {change.turned_deg:.3f} deg{shifts}"
+        words = f"no longer holds: {moved} (probability {probability:.1g})"
+    count = misfit.points + misfit.curves + misfit.outliers
+    if misfit.outliers > _MANY_OUTLIERS * count:
+        words += f"; but {misfit.outliers} of {count} observations fit nowhere: check labels"
     return words
-
-
-def _visible_places(case: _CheckCase, height_m: float) -> Array:
-    """Places (N, 3) of the map's grid that the station sees."""
-    places = FieldGrid(height_m, *field_grid(case.calibration.targets)).places
-    visible = np.isfinite(visible_pixels(case.estimate, case.name, places, height_m)[:, 0])
-    return np.column_stack([places[visible], np.full(np.count_nonzero(visible), height_m)])
-
-
-def _map_shift_mm(old: Camera, new: Camera, places: Array) -> tuple[float, float]:
-    """Mean and largest distance (mm) between where the old and the new camera locate the pixels of places (N, 3) of
-    one height.
-    """
-    if not len(places):
-        return np.nan, np.nan
-    off = 1e3 * np.linalg.norm(new.locate(old.project(places), places[0, 2]) - places[:, :2], axis=1)
-    off = off[np.isfinite(off)]
-    return (float(np.mean(off)), float(np.max(off))) if len(off) else (np.nan, np.nan)

@@ -16,8 +16,7 @@ from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.calibration.calibrating import Again, Watched, solved_from
-from ceres_cal.moves.carried import RefitOptions, RefitPlan, make_plan, refit_problem
-from ceres_cal.moves.explain import (
+from ceres_cal.moves.explanations import (
     judged,
     old_poses,
     require_labels,
@@ -26,6 +25,7 @@ from ceres_cal.moves.explain import (
     zoomed_search,
 )
 from ceres_cal.moves.poses import PoseSearch, equations, movement, pose_candidates
+from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, make_plan, refit_problem
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.bundle import Progress

@@ -1,0 +1,288 @@
+"""Does a calibration hold? The answer that `check`, `score`, `audit` and `compare` give, and what they share.
+
+Each of them holds a calibration against something else, observations or another calibration, and says of every
+station, camera or view: what differs, whether chance explains it, and what does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.calibration import Calibration
+from ceres_cal.moves.poses import movement
+from ceres_cal.observations import Observations
+from ceres_cal.posterior.maps import ErrorMap, FieldGrid, visible_pixels
+from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.scene.targets import Target
+
+# How often a calibration that holds is said not to, where nobody states another rate. At half of it nothing changes, at
+# double one of six pairs of calibrations of one camera differs.
+FALSE_ALARMS = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class FieldDifference(ErrorMap):
+    """Where two cameras locate the same pixels, over the field.
+
+    Attributes:
+        difference_mm: (Y, X, 2) where the second locates what the first sees there, less the place itself; NaN where
+            the first does not show it. lost: (Y, X) where the second has no answer although the first shows the place.
+        expected_mm: (Y, X) standard deviation of its length where nothing but noise lies between them; NaN where that
+            cannot be said.
+    """
+
+    difference_mm: Array
+    expected_mm: Array
+    lost: Mask
+
+    @property
+    def errors_mm(self) -> Array:
+        """(Y, X) length of the difference; NaN where the first does not show the place."""
+        return np.asarray(np.linalg.norm(self.difference_mm, axis=2))
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the difference; infinite where the second has no answer somewhere."""
+        return np.inf if self.lost.any() else _root_mean_square(self.errors_mm)
+
+    @property
+    def most_mm(self) -> float:
+        """Largest difference; infinite where the second has no answer somewhere."""
+        return np.inf if self.lost.any() else self.worst_mm
+
+    @property
+    def known_mm(self) -> float:
+        """Root mean square of what is expected."""
+        return _root_mean_square(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm))
+
+
+def _root_mean_square(values: Array) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A station from one camera to another.
+
+    Attributes:
+        moved_mm, turned_deg: of its pose. phi_px: of both.
+        shift_px: root mean square shift of the picture over the first map. maps: one a height.
+    """
+
+    moved_mm: float
+    turned_deg: float
+    phi_px: tuple[float, float]
+    shift_px: float
+    maps: tuple[FieldDifference, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageDifference:
+    """Where two cameras see the same directions, over the image.
+
+    Attributes:
+        phi_px: of both. x_px (X,), y_px (Y,): a grid over the image.
+        difference_px: (Y, X, 2) where the second sees the direction that the first sees at a pixel, less the pixel; NaN
+            where either has no answer. angles_deg: (Y, X) between the directions that both see there.
+        turn_deg: of the second's directions to those of the first, which was taken out; 0 where that was not asked for.
+    """
+
+    phi_px: tuple[float, float]
+    x_px: Array
+    y_px: Array
+    difference_px: Array
+    angles_deg: Array
+    turn_deg: float
+
+    @property
+    def errors_px(self) -> Array:
+        """(Y, X) length of the difference; NaN where either has no answer."""
+        return np.asarray(np.linalg.norm(self.difference_px, axis=2))
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What observations leave.
+
+    Attributes:
+        points, curves: observations that took part. outliers: those that did not.
+        points_rms_px, curves_rms_px: root mean square lengths of their residuals; 0 of nothing.
+        all_rms_px: the same of points and curves with all outliers in it; infinite where one cannot be shown at all.
+        noise: of points and of curves, times that of the calibration; NaN where either has none.
+    """
+
+    points: int = 0
+    curves: int = 0
+    outliers: int = 0
+    points_rms_px: float = np.nan
+    curves_rms_px: float = np.nan
+    all_rms_px: float = np.nan
+    noise: tuple[float, float] = (np.nan, np.nan)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Agreement:
+    """What is said of one station, camera or view; what was not asked is left at its default.
+
+    Attributes:
+        name: of the station, of the camera, or of the view's frame, station and target.
+        holds: whether the calibration holds there; None where that was not asked, or cannot be said.
+        probability: of as large a difference, or a larger one, where nothing is wrong. statistic: the difference as a
+            squared distance in standard deviations. degrees: how many numbers, or directions of them, it has.
+        words: the answer, in a line. cause: what explains a difference, where a cause was found.
+        change: from the calibration's camera to the one that explains the observations, or to that of the other
+            calibration. image: the same over the image.
+        misfit: what the observations leave. views: the same for each view, of a camera.
+        pose_free: whether the pose that suits the observations best was taken, so that it was not asked about.
+        solution: the calibration by which the observations are explained.
+    """
+
+    name: str
+    holds: bool | None = None
+    probability: float = np.nan
+    statistic: float = np.nan
+    degrees: int = 0
+    words: str = ""
+    cause: str | None = None
+    change: Change | None = None
+    image: ImageDifference | None = None
+    misfit: Misfit = field(default_factory=Misfit)
+    views: tuple[Agreement, ...] = ()
+    pose_free: bool = False
+    solution: Calibration | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Agreements(Mapping[str, Agreement]):
+    """The answers by name, of stations or of cameras.
+
+    Attributes:
+        false_alarms: how often any of so many `checks` of a calibration that holds would say that it does not; None
+            where that is not known.
+    """
+
+    answers: Mapping[str, Agreement]
+    false_alarms: float | None = None
+    checks: int = 1
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether all of them hold; None where one cannot be said, and none is known not to."""
+        every = [one.holds for one in self.answers.values()]
+        return None if None in every and False not in every else all(every)
+
+    @property
+    def exit_code(self) -> int:
+        """1 where one does not hold."""
+        return int(self.holds is False)
+
+    def __getitem__(self, name: str) -> Agreement:
+        return self.answers[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.answers)
+
+    def __len__(self) -> int:
+        return len(self.answers)
+
+
+# ---- what is compared -----------------------------------------------------------------------------------------------
+
+
+def require_posterior(calibration: Calibration) -> None:
+    """Raise InputError where nothing is known of how well a calibration is known."""
+    if calibration.posterior is None:
+        raise InputError("the calibration does not say how well it is known: calibrate again")
+
+
+def matched(calibration: Calibration, observations: Observations) -> Observations:
+    """The observations with the targets of both, as the calibration draws them.
+
+    Raises:
+        InputError: a camera that the calibration does not have, a station of another camera, or observations outside
+            of their image.
+        SolutionError: images of another size, or a target of other dimensions.
+    """
+    observations = calibration.drawn_alike(observations)
+    for name, size in observations.cameras.items():
+        if name not in calibration.cameras:
+            known = ", ".join(map(repr, calibration.cameras))
+            raise InputError(f"camera {name!r} is not in the calibration, which has {known}: name the camera as there")
+        known_size = calibration.cameras[name].image_size
+        if known_size != tuple(size):
+            raise SolutionError(
+                f"wrong camera: {name!r} was calibrated with images of {known_size[0]} x {known_size[1]} px, the "
+                f"observations are of {size[0]} x {size[1]} px: calibrate it anew"
+            )
+    for name, target in observations.targets.items():
+        if name in calibration.targets and calibration.targets[name] != target:
+            raise SolutionError(
+                f"wrong field: target {name!r} has other dimensions in the observations than in the calibration: "
+                "correct them, or give it another name"
+            )
+    for name, camera in observations.stations.items():
+        station = calibration.estimate.stations.get(name)
+        if station is not None and station.camera != camera:
+            raise InputError(f"station {name!r} is one of camera {station.camera!r}, not of {camera!r}: name another")
+    observations.require_inside()
+    return replace(observations, targets={**calibration.targets, **observations.targets})
+
+
+def require_stations(calibration: Calibration, observations: Observations) -> None:
+    """Raise InputError where a station was observed that the calibration does not have."""
+    for name in observations.stations:
+        if name not in calibration.estimate.stations:
+            names = ", ".join(map(repr, calibration.estimate.stations))
+            raise InputError(f"station {name!r} is not in the calibration, which has {names}: name it as there")
+
+
+# ---- what differs ---------------------------------------------------------------------------------------------------
+
+
+def field_grids(targets: Mapping[str, Target], heights_m: Sequence[float] = HEIGHTS_M) -> list[FieldGrid]:
+    """The grid of the map over the field, at some heights; none without a field."""
+    if all(target.movable for target in targets.values()):
+        return []
+    return [FieldGrid(height_m, *field_grid(targets)) for height_m in heights_m]
+
+
+def change_of(
+    before: Estimate,
+    station: str,
+    after: Camera,
+    grids: Sequence[FieldGrid],
+    known: Callable[[FieldGrid], Array] | None = None,
+) -> Change:
+    """How a station differs from what an estimate says of it.
+
+    Args:
+        known: (Y, X) mm, the standard deviation to be expected over a grid.
+    """
+    camera = before.camera_at(station)
+    shift_m, turn = movement(after.cam_from_world, camera.cam_from_world)
+    pixels = [visible_pixels(before, station, grid.places, grid.height_m) for grid in grids]
+    maps = tuple(
+        _difference(grid, seen, after, known(grid) if known else np.full(grid.shape, np.nan))
+        for grid, seen in zip(grids, pixels, strict=True)
+    )
+    shifts = np.empty(0)
+    for grid, seen in zip(grids[:1], pixels[:1], strict=True):
+        places = np.column_stack([grid.places, np.full(len(seen), grid.height_m)])
+        shifts = np.linalg.norm(seen - after.project(places), axis=1)
+    turned_deg, phi_px = float(np.degrees(turn)), (camera.phi, after.phi)
+    return Change(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
+
+
+def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Array) -> FieldDifference:
+    off = 1e3 * (after.locate(pixels, grid.height_m) - grid.places)
+    lost = (np.isfinite(pixels[:, 0]) & ~np.isfinite(off[:, 0])).reshape(grid.shape)
+    return FieldDifference(grid.height_m, grid.x_m, grid.y_m, off.reshape(*grid.shape, 2), expected_mm, lost)

@@ -1,0 +1,170 @@
+"""Where two calibrations differ, on the field and over the image, how far the cameras stand apart, and whether their
+uncertainties explain it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, median
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.numerical import numerical
+from ceres_cal.base.tails import upper_tail
+from ceres_cal.base.transforms import nearest_rotation, rotation_log
+from ceres_cal.calibration import Calibration
+from ceres_cal.moves.agreement import FALSE_ALARMS, Agreement, Agreements, ImageDifference, change_of
+from ceres_cal.moves.contrast import NormalDistribution, contrast
+from ceres_cal.posterior.maps import FieldGrid, field_map
+from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.quantities import difference
+from ceres_cal.problem.structure import EXACT
+
+_COLUMNS = 41  # of the grid over an image
+_ROUNDS = 20  # of reweighting
+
+
+@numerical("the comparison")
+def compare(a: Calibration, b: Calibration, height_m: float = 0.0, station: str | None = None) -> Agreements:
+    """Compare two calibrations, station by station.
+
+    The two count as independent of each other. Where b is a refit of a they share what was known before, and the
+    difference that is to be expected is smaller than stated.
+
+    Raises:
+        InputError: no station that both have, or not the one named; no field to draw a map of.
+    """
+    common = [name for name in a.estimate.stations if name in b.estimate.stations]
+    if station is not None and station not in common:
+        raise InputError(f"station {station!r} is not in both calibrations: both have {_listed(common)}")
+    if not common:
+        raise InputError(
+            f"no station is in both calibrations: one has {_listed(list(a.estimate.stations))}, the other "
+            f"{_listed(list(b.estimate.stations))}"
+        )
+    names = [station] if station is not None else common
+    return Agreements({name: _compared(a, b, name, height_m) for name in names}, FALSE_ALARMS)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names)) or "none"
+
+
+def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> Agreement:
+    grid = FieldGrid(height_m, *field_grid(a.targets))
+    known = [c for c in (a, b) if c.posterior is not None and c.posterior.knows_station(station)]
+
+    def expected_mm(grid: FieldGrid) -> Array:
+        maps = [field_map(c.estimate, c.uncertainty.posterior, station, grid).sd_mm for c in known]
+        return np.asarray(np.hypot(*maps))
+
+    change = change_of(a.estimate, station, b.station(station), [grid], expected_mm if len(known) == 2 else None)
+    if len(known) < 2:
+        return Agreement(name=station, change=change, solution=b)
+    keys, others = (c.uncertainty.posterior.keys_of(c.estimate, station) for c in known)
+    tested = _tested(a, b, keys, difference(_only(b, station), _only(a, station), keys), set(others))
+    return Agreement(name=station, change=change, solution=b, **tested)
+
+
+def _tested(a: Calibration, b: Calibration, keys: Sequence[Key], off: Array, others: Collection[Key]) -> dict[str, Any]:
+    """Holds, probability, statistic and degrees of an answer: whether a and b, so far `off` from each other in the same
+    numbers, contradict each other; nothing where they have other free numbers, or share none.
+    """
+    if set(keys) != set(others) or not keys:
+        return {}
+    first, second = (c.uncertainty.posterior for c in (a, b))
+    apart = contrast(
+        NormalDistribution(first.information.marginal(keys), np.zeros(len(keys)), first.degrees_of_freedom),
+        NormalDistribution(second.information.marginal(keys), -off, second.degrees_of_freedom),
+        keys,
+    )
+    if not apart.degrees:
+        return {}
+    probability = upper_tail(apart.statistic, apart.degrees)
+    holds = probability >= FALSE_ALARMS
+    return {"holds": holds, "probability": probability, "statistic": apart.statistic, "degrees": apart.degrees}
+
+
+def _only(calibration: Calibration, station: str) -> Estimate:
+    """One station and its camera."""
+    old = calibration.estimate
+    camera = old.stations[station].camera
+    return Estimate({camera: old.cameras[camera]}, {station: old.stations[station]}, {}, old.structure)
+
+
+# ---- over the image -------------------------------------------------------------------------------------------------
+
+
+def compare_cameras(
+    a: Calibration, b: Calibration, camera: str | None = None, *, without_turn: bool = False
+) -> Agreements:
+    """Compare the intrinsics of two calibrations, camera by camera; neither needs a field.
+
+    Args:
+        camera: this one alone, by its name in both; else all that both have, or the only one of each.
+        without_turn: take out the rotation that most directions agree on: another principal point looks much like a
+            camera that is turned.
+
+    Raises:
+        InputError: no camera that both have, or not the one named; images of other sizes.
+    """
+    pairs = [(name, name) for name in a.cameras if name in b.cameras]
+    if not pairs and len(a.cameras) == len(b.cameras) == 1:
+        pairs = [(next(iter(a.cameras)), next(iter(b.cameras)))]
+    pairs = [pair for pair in pairs if camera in (None, pair[0])]
+    if not pairs:
+        asked = "no camera" if camera is None else f"camera {camera!r}"
+        raise InputError(f"{asked} is in both calibrations: {_listed([*a.cameras])}, and {_listed([*b.cameras])}")
+    return Agreements({name: _camera_compared(a, b, name, other, without_turn) for name, other in pairs}, FALSE_ALARMS)
+
+
+def _camera_compared(a: Calibration, b: Calibration, name: str, other: str, without_turn: bool) -> Agreement:
+    first, second = a.cameras[name], b.cameras[other]
+    if first.image_size != second.image_size:
+        sizes = " and ".join(f"{w} x {h} px" for w, h in (first.image_size, second.image_size))
+        raise InputError(f"camera {name!r}: its images are of {sizes}: calibrations of one size can be compared")
+    width, height = first.image_size
+    x, y = (np.linspace(0.0, n - 1.0, max(2, round(_COLUMNS * n / width))) for n in (width, height))
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    seen, also = first.rays(pixels), second.rays(pixels)
+    both = np.isfinite(seen[:, 0]) & np.isfinite(also[:, 0])
+    turn = _common_turn(seen[both], also[both]) if without_turn else np.eye(3)
+    turned = seen @ turn.T
+    angles = 2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(turned - also, axis=1), 0.0, 1.0))
+    grid = len(y), len(x)
+    image = ImageDifference(
+        (first.phi, second.phi),
+        x,
+        y,
+        (second.project(turned) - pixels).reshape(*grid, 2),
+        np.degrees(angles).reshape(grid),
+        float(np.degrees(np.linalg.norm(rotation_log(turn)))),
+    )
+    tested = _intrinsics_tested(a, b, name) if name == other else {}
+    return Agreement(name=name, image=image, solution=b, **tested)
+
+
+def _common_turn(seen: Array, also: Array) -> Array:
+    """(3, 3) the rotation that most of the directions (N, 3) agree on: Cauchy's weights at the median, since lenses
+    differ most in corners that nobody observed.
+    """
+    turn = np.eye(3)
+    for _ in range(_ROUNDS):
+        away = np.linalg.norm(seen @ turn.T - also, axis=1)
+        weights = 1.0 / (1.0 + (away / max(median(away), 1e-15)) ** 2)
+        turn = nearest_rotation((also * weights[:, None]).T @ seen)
+    return turn
+
+
+def _intrinsics_tested(a: Calibration, b: Calibration, camera: str) -> dict[str, Any]:
+    if a.posterior is None or b.posterior is None:
+        return {}
+    keys, others = ([key for key in c.uncertainty.posterior.keys if key[:2] == ("camera", camera)] for c in (a, b))
+    if set(keys) != set(others):
+        return {}
+    first, second = (Estimate({camera: c.cameras[camera]}, {}, {}, EXACT) for c in (a, b))
+    return _tested(a, b, keys, difference(second, first, keys), others)
