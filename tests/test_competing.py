@@ -20,6 +20,7 @@ from ceres_cal.cli import main
 from ceres_cal.effects.evidence import RandomEffects
 from ceres_cal.effects.offsets import Offsets, fault_of
 from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference
@@ -30,7 +31,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Segment
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import custom, ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, field_scene, overhead_pose, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 LINES = ("TopTouchLine", "BottomTouchLine", "HalfwayLine", "CenterLine", "LeftPenaltyStretch")
@@ -308,3 +309,20 @@ def test_many_features_are_competed_with_in_bounded_time() -> None:
     assert time.process_time() - start < 6.0  # measured 1.3
     assert wholes(calibration) == {"the whole of point 'p7_3' in all 3 frames"}
     assert np.max(np.abs(error_sd(calibration, scene))) < 4.0  # measured 1.3
+
+
+def test_features_of_different_targets_are_different_wholes() -> None:
+    """Each target counts its features from 0: the tops of three poles and a corner were one whole, and were taken out
+    together, with all that told phi.
+    """
+    scene = half_field(2)
+    poles = {f"pole_{x}": custom({"top": (x, 0.3, 1.0)}) for x in (-3.0, -2.0, -1.0)}
+    views = tuple(ViewPlan((f"{name}_1", f"{name}_2"), "overhead", name) for name in poles)
+    every = replace(scene, targets={**scene.targets, **poles}, views=(*scene.views, *views))
+    observations = simulate(every, NOISE, seed=0).observations
+    target = np.array([view.target for view in observations.views])
+    owner = target[np.concatenate([observations.points.view, observations.curves.view])]
+    kinds = [one for one in looked_at.wholes_of(observations, gather_sights(observations)) if one.of_features]
+    assert len(kinds) == 2
+    for wholes in kinds:
+        assert all(len(set(owner[wholes.of == number])) == 1 for number in set(wholes.of.tolist()) - {-1})

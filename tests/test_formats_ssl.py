@@ -393,6 +393,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ("a.yml", b"field: {field_length: 9000, what: 3}\n", 'not what SSL_GeometryData holds.*"what"'),
         ("a.xml", b"<VarXML><Var", "not valid XML"),
         ("a.xml", b"<html></html>", "not a settings file of ssl-vision: it begins with <html>"),
+        ("a.xml", b'<Var name="x">1</Var>', "not a settings file of ssl-vision: it begins with <Var>"),
         ("a.xml", b"<VarXML></VarXML>", "keeps its cameras in robocup-ssl.xml"),
         ("a.txt", b"hello", "of no format that is known"),
     ],

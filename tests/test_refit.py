@@ -364,11 +364,9 @@ def test_strays_are_neither_another_zoom_nor_mirrored_labels(
     every = seen(MOVED, NOISE, seed, spacing_m=0.15).observations
     names = [every.targets["field"].point_names[feature] for feature in every.points.feature]
     few = thinned(every, rng.permutation(names)[:points].tolist(), rows, seed)
-    pixels = [columns.pixels.copy() for columns in (few.points, few.curves)]
-    for own, strays in zip(pixels, (range(3), np.flatnonzero(rng.random(rows) < 0.2)), strict=True):
+    pixels, curve_pixels = few.points.pixels.copy(), few.curves.pixels.copy()
+    for own, strays in ((pixels, range(3)), (curve_pixels, np.flatnonzero(rng.random(rows) < 0.2))):
         own[strays] = rng.uniform((0.0, 0.0), (1279.0, 959.0), (len(strays), 2))
-    points_now, curves_now = (
-        replace(columns, pixels=own) for columns, own in zip((few.points, few.curves), pixels, strict=True)
-    )
-    result = refit(calibration, replace(few, points=points_now, curves=curves_now))
+    curves_now = replace(few.curves, pixels=curve_pixels)
+    result = refit(calibration, replace(few, points=replace(few.points, pixels=pixels), curves=curves_now))
     assert np.max(sigmas_off(result, truth_of(result, MOVED))) < MOST_SIGMA

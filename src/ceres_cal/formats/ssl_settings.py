@@ -77,7 +77,7 @@ def _values(content: bytes) -> list[_Var]:
         name, _, first = open_tags.pop()
         last = max(parser.CurrentByteIndex, first)
         inside = content[first:last]
-        if tag == "Var" and b"<" not in inside:
+        if tag == "Var" and open_tags and b"<" not in inside:
             path = (*(one[0] for one in open_tags[1:]), name)
             owner = open_tags[-1][1]
             found.append(_Var(path, owner, inside.decode("utf-8", errors="replace").strip(), first, last))

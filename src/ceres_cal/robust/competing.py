@@ -29,6 +29,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.conflicts import without_suspicious
 from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust.usable import require_fits
 from ceres_cal.robust.wholes import (
     FEWEST,
     ObservationGroups,
@@ -296,6 +297,9 @@ class _Competition:
         gone = wholes.among(np.array(numbers))
         try:
             end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
+            every = self._some.problem
+            there = residuals(self._some.observations, every.sights, end.solution.estimate)
+            require_fits(replace(end, residuals=there), every)
         except CalibrationError:  # quiet: what determines nothing without the suspects is no explanation
             return None
         if wholes.of_features:

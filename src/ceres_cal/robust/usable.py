@@ -10,6 +10,7 @@ pictures, too, turned about the principal point; residuals tell nothing of any o
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,9 +22,11 @@ from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals
-from ceres_cal.robust.competing import Explanation
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
+
+if TYPE_CHECKING:
+    from ceres_cal.robust.competing import Explanation
 
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.

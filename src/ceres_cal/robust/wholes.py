@@ -158,10 +158,15 @@ def _wholes(observations: Observations, owner: Indices, frames: Indices) -> Obse
     )
     is_curve = np.arange(len(view)) >= len(observations.points)
     takes_part = (owner[view] >= 0) & (is_curve | (frames[view] > 1))
+    targets = {name: number for number, name in enumerate(observations.targets)}  # each counts its features from 0
+    target = np.array([targets[one.target] for one in observations.views])
     names = int(feature.max(initial=0)) + 1
-    number = (owner[view] * 2 + is_curve) * names + feature
+    number = ((owner[view] * 2 + is_curve) * len(targets) + target[view]) * names + feature
     return ObservationGroups(
-        observations, np.where(takes_part, number, -1).astype(np.int32), (int(owner.max()) + 1) * 2 * names, frames
+        observations,
+        np.where(takes_part, number, -1).astype(np.int32),
+        (int(owner.max()) + 1) * 2 * len(targets) * names,
+        frames,
     )
 
 
