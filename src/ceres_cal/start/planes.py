@@ -99,10 +99,10 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
 
 
 def _usual_height(sight: Sights, level: Mask) -> float:
-    """z at which most of the points and level curves lie, 0 where there are none."""
-    on_level = np.flatnonzero(level[sight.track_index])
-    starts = sight.tracks[sight.track_index[on_level[:: max(1, len(on_level) // _MOST)]], 0]
-    heights, votes = np.unique(np.concatenate([sight.points[:, 2], starts[:, 2]]).round(9), return_counts=True)
+    """z at which most of the places and level curves lie, each counted once: 0 where there are none."""
+    places = np.unique(sight.points.round(9), axis=0)[:, 2]
+    tracks = np.unique(sight.track_index[level[sight.track_index]])
+    heights, votes = np.unique(np.append(places, sight.tracks[tracks, 0, 2].round(9)), return_counts=True)
     return float(heights[np.argmax(votes)]) if len(heights) else 0.0
 
 
