@@ -19,7 +19,6 @@ _FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
 # A proposal holds where so many of its rows lie within some scales of it, and within a share of the half diagonal; and
 # where so many equations are left over: with fewer another place may explain them as well.
 _HOLDS, _SCALES, _ROUGH, _LEFT_OVER = 0.85, 8.0, 0.01, 8
-_ROUGH_PX = 2.0  # scale of a search's first rounds
 _BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: lenses without distortion are held
 _TOLD = 0.05  # standard deviation of log phi below which a sight tells it
 _OPEN = 1e-10  # least eigenvalue of the information in its own units below which numbers are open
@@ -81,7 +80,7 @@ def placed(sight: Sights, profile: RadialProfile, known: Beforehand, proposed: A
         if holds(lines, known, found, profile.unit_px):
             return _answered(lines, known, found)
     few = sightlines_of(sight, profile, _FEW_POINTS, _FEW_OF_A_CURVE)
-    found = searched(lines, few, known, given, _ROUGH_PX)
+    found = searched(lines, few, known, given)
     return _answered(lines, known, found)
 
 
