@@ -102,7 +102,9 @@ def _drawn(seed: int) -> Outcome | None:
     camera = Camera(_SIZE, rng.uniform(500.0, 1400.0), (639.5, 511.5), Brown((0.0,) * 5))
     tilt, to = rng.uniform(0.0, 45.0), rng.uniform(0.0, 2.0 * np.pi)
     place = rng.uniform(-4.0, 4.0), rng.uniform(-3.0, 3.0), rng.uniform(3.0, 7.0)
-    pose = overhead_pose(place[0], place[1], place[2], tilt * np.cos(to), tilt * np.sin(to), yaw_deg=rng.uniform(-180.0, 180.0))
+    pose = overhead_pose(
+        place[0], place[1], place[2], tilt * np.cos(to), tilt * np.sin(to), yaw_deg=rng.uniform(-180.0, 180.0)
+    )
     scene = field_scene(_FIELD, {"c": camera}, {"c": Station("c", pose)}, spacing_m=0.02)
     every = _thinned(simulate(scene, Disturbance(), 1).observations)
     seen = [(0, f) for f in np.unique(every.points.feature)] + [(1, f) for f in np.unique(every.curves.feature)]

@@ -192,9 +192,9 @@ def _drawn(few: Sightlines, known: Beforehand) -> Candidates:
     logs = middle + np.log(_PHI_GRID) - np.log(1.1) if sd > 0.2 else np.array([middle])
     rotations = np.tile(_grid(), (len(logs), 1, 1))
     log_phi = np.repeat(logs, len(_grid()))
-    poses = Candidates(rotations, few.positions(rotations, log_phi), log_phi, np.zeros(len(log_phi)))
-    floor = float(few.places[:, 2].min())
-    return poses.take(poses.positions[:, 2] > floor)
+    positions, floor = few.positions(rotations, log_phi), float(few.places[:, 2].min())
+    positions[:, 2] = floor + np.abs(positions[:, 2] - floor)  # a camera under it is the mirror image of one above
+    return Candidates(rotations, positions, log_phi, np.zeros(len(log_phi)))
 
 
 @cache

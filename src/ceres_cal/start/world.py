@@ -16,13 +16,15 @@ from ceres_cal.start.sightlines import Candidates, Sightlines
 
 _MOST_POINTS, _MOST_OF_A_CURVE = 40, 20  # beyond which a start learns nothing more
 _FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
-# A proposal holds where so many of its rows lie within some scales of it, and within a share of the half diagonal; and
-# where so many equations are left over: with fewer another place may explain them as well.
-_HOLDS, _SCALES, _ROUGH, _LEFT_OVER = 0.85, 8.0, 0.01, 8
-_BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: lenses without distortion are held
-_TOLD = 0.05  # standard deviation of log phi below which a sight tells it
-_OPEN = 1e-10  # least eigenvalue of the information in its own units below which numbers are open
-_ALIKE, _APART = 30.0, 0.05  # variances by which another place may cost more; rad, of the height and of phi
+_HOLDS = 0.85  # share of a proposal's rows that lie near: more than a mislabelled line of a dozen leaves
+_SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
+_ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
+_LEFT_OVER = 8  # equations beyond the unknowns: with fewer another place may explain them as well
+_BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
+_TOLD = 0.05  # standard deviation of log phi below which a sight tells it: above, the start is called a guess
+_OPEN = 1e-10  # least eigenvalue of the information in its own units: rounding is less, the weakest scenes have 1e-7
+_ALIKE = 30.0  # variances by which another place may cost more at a start: the solve, which is exact, decides
+_APART = 0.05  # rad, and of the height: places that are nearer are one minimum
 _FINEST_PX = 1e-2  # of a scale: exact data are told no better
 _LEAST_SD = 1e-3  # of a stated number, as a share: a start is no better
 _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")

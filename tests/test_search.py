@@ -1,4 +1,4 @@
-"""A known camera over few features: two lines and an arc, an arc and a crossing; what is seen alike from two places."""
+"""The search for where a camera stands: few features before a known camera, what is seen alike, what stays open."""
 
 import re
 from collections.abc import Collection
