@@ -28,7 +28,8 @@ _LOWEST = 0.01  # of the extent of what is seen: a camera that lies on a line se
 _WIDEST = 2.7  # of log phi from the middle: from a fisheye to a telescope
 _MOST_STEP = 0.3  # rad, and of log phi
 _BEHIND = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
-_DAMPING, _LEAST_DAMPING = 1e-2, 1e-9
+_DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
+_NOTHING = 1e-3  # variances: who gains less is there
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +91,14 @@ def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int)
         step = _step(at, known, poses, scale, damping)
         moved = poses.moved(step)
         there = lines.equations(moved)
-        better = _cost(there[0], known, moved, scale) < _cost(at[0], known, poses, scale)
+        gained = _cost(at[0], known, poses, scale) - _cost(there[0], known, moved, scale)
+        better = gained > 0.0
         better &= _possible(lines, known, moved)
         poses = moved.where(better, poses)
         at = np.where(better[:, None], there[0], at[0]), np.where(better[:, None, None], there[1], at[1])
         damping = np.clip(damping * np.where(better, 0.2, 6.0), _LEAST_DAMPING, 1e6)
+        if np.all(np.where(better, gained < _NOTHING, damping > _GIVEN_UP)):
+            break
     return poses
 
 

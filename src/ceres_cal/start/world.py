@@ -14,7 +14,7 @@ from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import Beforehand, Found, best_of, information, searched
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
-_MOST_POINTS, _MOST_OF_A_CURVE = 40, 20  # beyond which a start learns nothing more
+_MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
 _FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
 _HOLDS = 0.85  # share of a proposal's rows that lie near: more than a mislabelled line of a dozen leaves
 _SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
