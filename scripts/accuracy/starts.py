@@ -4,7 +4,8 @@
 line and the circle (and the centre line), a quarter's over lines of its corner, 30 points on each, with and without a
 height. "drawn": 2 to 8 features of a field before a camera whose phi is known or not. Counted are refusals of scenes
 that a rank by finite differences of the exact scene calls solvable, and calibrations of which a number that is called
-"known" is over 5 standard deviations off. Exits with 1 where there are any.
+"known" is over 5 standard deviations off. "labels": two lines of a field under each other's names. Exits with 1 where
+there are any.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.moves.labels import mended, renamings
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
 from ceres_cal.problem.parameters import Options
@@ -61,6 +63,34 @@ def drawn(runs: int) -> Iterator[Row]:
     found = list(over(_drawn, range(runs)))
     yield Row("drawn", "scenes that are solvable", sum(one is not None for one in found))
     yield from _rows("drawn", [one for one in found if one is not None])
+
+
+def labels(runs: int) -> Iterator[Row]:
+    found = list(over(_exchanged, range(runs)))
+    yield Row("labels", f"exchanged in pairs, named and mended, of {runs}", sum(found), least=runs)
+
+
+def _exchanged(seed: int) -> bool:
+    """Whether two exchanged curves of a field are found to be, and nothing else is."""
+    rng = np.random.default_rng([seed, 24])
+    camera = Camera(_SIZE, rng.uniform(500.0, 700.0), (639.5, 511.5), Radial((rng.uniform(-6e-5, 0.0), 5e-7)))
+    x, y, height = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(5.0, 6.5)
+    pose = overhead_pose(x, y, height, rng.uniform(-15.0, 15.0), rng.uniform(-15.0, 15.0))
+    field = ssl_field("AB"[seed % 2])
+    scene = field_scene(field, {"c": camera}, {"c": Station("c", pose)})
+    right = _thinned(simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), seed).observations)
+    straight = [f for f in np.unique(right.curves.feature) if not field.is_arc[f]]
+    first, second = rng.permutation(straight)[:2]
+    feature = right.curves.feature.copy()
+    feature[right.curves.feature == first], feature[right.curves.feature == second] = second, first
+    wrong = replace(right, curves=replace(right.curves, feature=feature))
+    try:
+        calibration = calibrate(wrong, Options(lens="radial"))
+    except CalibrationError:
+        return False
+    return bool(
+        np.array_equal(mended(wrong, tuple(renamings(wrong, calibration))).curves.feature, right.curves.feature)
+    )
 
 
 def _rows(case: str, found: Sequence[Outcome]) -> Iterator[Row]:
@@ -181,4 +211,6 @@ def _project(camera: Camera, pose: Pose, places: Array) -> Array:
     return camera.at(pose).project(places)
 
 
-main = script({"middle": middle, "quarter": quarter, "drawn": drawn}, __doc__, (144, "scenes of each case"))
+main = script(
+    {"middle": middle, "quarter": quarter, "drawn": drawn, "labels": labels}, __doc__, (144, "scenes of each case")
+)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,12 +35,12 @@ class Place:
     """Where a camera stands, by one sight.
 
     Attributes:
-        pose: cam_from_world (3, 4). phi: px. bend: what is added to the profile's first coefficient.
+        pose: cam_from_world (3, 4). phi: px. profile: of the lens that shows it from there.
     """
 
     pose: Array
     phi: float
-    bend: float
+    profile: RadialProfile
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Placed:
     tells_phi: bool
 
 
-def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float], *, may_bend: bool) -> Beforehand:
+def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float]) -> Beforehand:
     """What is stated of a station's place, and this of phi."""
     position, sd = np.zeros(3), np.full(3, np.inf)
     for prior in priors:
@@ -64,14 +64,17 @@ def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, floa
             numbers = slice(3 - len(prior.value), 3)
             position[numbers] = prior.value
             sd[numbers] = np.maximum(prior.sigma, _LEAST_SD * max(abs(prior.value[-1]), _LEAST_SD))
-    return Beforehand(position, sd, log_phi, _BEND_SD if may_bend else 0.0)
+    return Beforehand(position, sd, log_phi, 0.0)
 
 
-def placed(sight: Sights, profile: RadialProfile, known: Beforehand, proposed: Array | None, log_phi: float) -> Placed:
+def placed(
+    sight: Sights, profile: RadialProfile, known: Beforehand, proposed: Array | None, log_phi: float, *, may_bend: bool
+) -> Placed:
     """The places of a camera by one sight about it.
 
     Args:
-        proposed: cam_from_world (3, 4) of a homography at this phi, where there is one.
+        proposed: cam_from_world (3, 4) of a homography at this log phi, where there is one.
+        may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
     """
     lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
     given = Candidates.none()
@@ -80,17 +83,26 @@ def placed(sight: Sights, profile: RadialProfile, known: Beforehand, proposed: A
         given = Candidates(rotation[None], (-rotation @ proposed[:, 3])[None], np.array([log_phi]), np.zeros(1))
         found = best_of(lines, known, given)
         if holds(lines, known, found, profile.unit_px):
-            return _answered(lines, known, found)
+            return _answered(lines, profile, known, found)
+    known = replace(known, bend_sd=_BEND_SD if may_bend else 0.0)
+    none = RadialProfile((0.0, 0.0), profile.unit_px)
+    tried = [_searched(sight, one, known, given) for one in ((profile, none) if may_bend else (profile,))]
+    return _answered(*min(tried, key=lambda one: float(one[-1].costs[0])))
+
+
+def _searched(
+    sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates
+) -> tuple[Sightlines, RadialProfile, Beforehand, Found]:
+    lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
     few = sightlines_of(sight, profile, _FEW_POINTS, _FEW_OF_A_CURVE)
-    found = searched(lines, few, known, given)
-    return _answered(lines, known, found)
+    return lines, profile, known, searched(lines, few, known, given)
 
 
-def _answered(lines: Sightlines, known: Beforehand, found: Found) -> Placed:
+def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, found: Found) -> Placed:
     """With what the best place leaves open, and the others that fit alike."""
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
     matrix = information(lines, known, best, scale)
-    places = tuple(_place(found.poses, number) for number in _alike(found))
+    places = tuple(_place(found.poses, number, profile) for number in _alike(found))
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
@@ -128,10 +140,10 @@ def _sd_of(matrix: Array, number: int) -> float:
     return float(np.sqrt(np.sum(share**2 / np.maximum(values, 1e-300))))
 
 
-def _place(poses: Candidates, number: int) -> Place:
+def _place(poses: Candidates, number: int, profile: RadialProfile) -> Place:
     rotation = poses.rotations[number].T
     pose = np.column_stack([rotation, -rotation @ poses.positions[number]])
-    return Place(pose, float(np.exp(poses.log_phi[number])), float(poses.bend[number]))
+    return Place(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
 
 
 def _alike(found: Found) -> Sequence[int]:
