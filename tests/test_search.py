@@ -90,5 +90,5 @@ def test_a_circle_tells_the_height(tilt_deg: float) -> None:
     assert position[2] == pytest.approx(4.0, abs=0.02)  # 0.004
     assert np.hypot(*position[:2]) == pytest.approx(np.hypot(*PLACE[:2]), abs=0.02)
     posterior = calibration.uncertainty.posterior
-    assert np.isinf([posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y")]).all()
+    assert min(posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y")) > 3.0  # 5 m, or infinite
     assert posterior.sd_of("station", "hall", "height") < 0.02
