@@ -86,6 +86,12 @@ class Sightlines:
     counts: tuple[int, int, int]
     curve: Indices
 
+    @property
+    def independent(self) -> int:
+        """What the rows can say at most: two numbers of each point and line, five of each arc."""
+        straight = distinct(self.curve[self._points.stop : self._arcs.start])
+        return 2 * self.counts[0] + 2 * len(straight) + 5 * len(distinct(self.curve[self._arcs]))
+
     @classmethod
     def of_points(cls, pixels: Array, places: Array, unit_px: float) -> Sightlines:
         """Of places (N, 3) m alone, seen at undistorted offsets (N, 2) px."""

@@ -112,8 +112,7 @@ def holds(lines: Sightlines, known: Beforehand, found: Found, unit_px: float) ->
     distance = np.abs(lines.equations(best)[0][0])
     limit = min(_SCALES * found.scale_px, _ROUGH * unit_px) + 1e-3
     near = (distance < limit) & lines.seen(best)[0]
-    free = np.count_nonzero(~known.held)
-    return bool(np.mean(near) > _HOLDS and len(near) >= free + _LEFT_OVER)
+    return bool(np.mean(near) > _HOLDS and lines.independent >= np.count_nonzero(~known.held) + _LEFT_OVER)
 
 
 def open_numbers(matrix: Array) -> tuple[str, ...]:
