@@ -19,7 +19,7 @@ from ceres_cal.start.sightlines import Candidates, Sightlines
 _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
 _TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
 _AZIMUTHS, _ROLLS = (1, 6, 11, 15, 18, 18), 18
-_FIRST, _THEN, _KEPT = 64, 12, 4  # cameras that take the first steps, then the rest, and that are answered
+_FIRST, _THEN = 64, 20  # cameras that take the first steps, then the rest
 _FIRST_STEPS, _STEPS, _LAST_STEPS = 6, 12, 20
 _LEAST_PX = 1e-3  # of a scale: below it all data are exact
 _FAR_PX = 1e6
@@ -183,7 +183,7 @@ def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> Found:
     """The best of them, brought to their minima."""
     some = refined(lines, known, some, _LAST_STEPS)
     cost = costs(lines, known, some, known.least_px)
-    order = np.argsort(cost)[:_KEPT]
+    order = np.argsort(cost)
     best = some.take(order)
     free = int(np.count_nonzero(~known.held))
     scale = float(scales(lines.equations(best.take(np.array([0])))[0], free)[0, 0])
