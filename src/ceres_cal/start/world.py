@@ -25,6 +25,7 @@ _TOLD = 0.05  # standard deviation of log phi below which a sight tells it: abov
 _OPEN = 1e-10  # least eigenvalue of the information in its own units: rounding is less, the weakest scenes have 1e-7
 _ALIKE = 30.0  # variances by which another place may cost more at a start: the solve, which is exact, decides
 _APART = 0.05  # rad, and of the height: places that are nearer are one minimum
+_MOST_PLACES = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
 _FINEST_PX = 1e-2  # of a scale: exact data are told no better
 _LEAST_SD = 1e-3  # of a stated number, as a share: a start is no better
 _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")
@@ -102,7 +103,7 @@ def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, foun
     """With what the best place leaves open, and the others that fit alike."""
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
     matrix = information(lines, known, best, scale)
-    places = tuple(_place(found.poses, number, profile) for number in _alike(found))
+    places = tuple(_place(found.poses, number, profile) for number in _alike(found)[:_MOST_PLACES])
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
