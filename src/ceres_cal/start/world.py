@@ -16,7 +16,7 @@ from ceres_cal.start.sightlines import Candidates, Sightlines
 
 _MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
 _FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
-_HOLDS = 0.85  # share of a proposal's rows that lie near: more than a mislabelled line of a dozen leaves
+_HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
 _SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
 _ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
 _LEFT_OVER = 8  # equations beyond the unknowns: with fewer another place may explain them as well
@@ -84,6 +84,8 @@ def placed(
         given = Candidates(rotation[None], (-rotation @ proposed[:, 3])[None], np.array([log_phi]), np.zeros(1))
         found = best_of(lines, known, given)
         if holds(lines, known, found, profile.unit_px):
+            if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
+                found = replace(found, poses=given, costs=found.costs[:1])
             return _answered(lines, profile, known, found)
     known = replace(known, bend_sd=_BEND_SD if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
