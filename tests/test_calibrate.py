@@ -598,20 +598,16 @@ def fourth_board_with(*rows: int) -> Observations:
     [
         (lambda: corners_at(lambda p: np.arange(len(p)) < 3), r"'0001'.*3 points.*give at least four points"),
         (lambda: corners_at(lambda p: np.arange(len(p)) < 5), "10 measured numbers.*cannot determine 11 unknowns: add"),
-        (lambda: corners_at(lambda p: p[:, 1] == 0.0), "station 'overhead'.*8 points.*one line.*add points or lines"),
+        (lambda: corners_at(lambda p: p[:, 1] == 0.0), "8 points.*cannot fix its pose: .*y.* stay open"),
         (lambda: lines_named("HalfwayLine"), "station 'overhead'.*29 curve observations.*cannot fix its pose"),
         (
             lambda: lines_named("TopTouchLine", "CenterLine", "BottomTouchLine"),
             "station 'overhead'.*cannot fix its pose",
         ),
-        (
-            lambda: lines_named("HalfwayLine", "TopTouchLine", "CenterLine", "BottomTouchLine"),
-            "station 'overhead'.*4 lines cannot fix the plane's pose",
-        ),
         (lambda: fourth_board_with(0, 8), r"frame 'board_04'.*2 points.*give at least four points.*or remove the view"),
-        (lambda: fourth_board_with(*range(9)), "placement 'board_04'.*9 points.*one line.*add points"),
+        (lambda: fourth_board_with(*range(9)), "placement 'board_04'.*9 points.*not on one line"),
     ],
-    ids=["three points", "five points", "one line of points", "one line", "parallel", "parallel but one", "two", "row"],
+    ids=["three points", "five points", "one line of points", "one line", "parallel", "two", "row"],
 )
 def test_observations_that_cannot_tell(observations: Callable[[], Observations], message: str) -> None:
     with pytest.raises(DegenerateError, match=message) as caught:

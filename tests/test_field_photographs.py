@@ -258,7 +258,7 @@ def test_clicks_that_cannot_be(tmp_path: Path, shot: script.Shot) -> None:
         detect_field([path], FIELD, Clicks(mirrored))
     row = ("LeftPenaltyMark", "CenterMark", "RightPenaltyMark", "LeftGoalCenterCrossing")
     in_a_row = {name: (100.0 * i, 50.0 * i) for i, name in enumerate(row)}
-    with pytest.raises(InputError, match="the points to start from tell no pose"):
+    with pytest.raises(InputError, match="points to start from lie on one line"):
         detect_field([path], FIELD, Clicks(in_a_row))
     with pytest.raises(InputError, match=r"corners\.json: 4 points are needed"):
         clicks_from_json({"format": FORMAT, "version": 1, "points": {"a": [1, 2]}}, "corners.json")

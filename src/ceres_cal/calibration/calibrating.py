@@ -327,6 +327,7 @@ def _assess(
 
 def _start_of(others: Problem, some: Subproblem, start: Start, again: Again | None) -> Estimate:
     """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
-    if again is not None or set(others.sights.keys) != set(some.problem.sights.keys):
-        return start.estimate
+    alike = set(others.sights.keys) == set(some.problem.sights.keys)
+    if again is not None or not alike or all(key.placement is None for key in others.sights.keys):
+        return start.estimate  # that of the world was found with what does not belong among the rest
     return initialise(some.observations, others.sights, others.options).estimate

@@ -159,7 +159,9 @@ class Comparison:
         there, form, start = self.there, self.chosen.form, self.start
         placements = Poses.of(start.estimate.placements)
         placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
-        near = replace(start, estimate=replace(there, placements=placements), is_near=not form.blank.roughness)
+        others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # with a plainer lens so far
+        near = replace(start, estimate=replace(there, placements=placements), others=others)
+        near = replace(near, is_near=not form.blank.roughness)
         return Chosen(form.of(self.seen.options), near, _choice(self), self)
 
     def instead(self, points: Mask, curves: Mask) -> Chosen | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -120,6 +120,10 @@ class CalibrateArguments(ReportArguments):
     )
     prior: tuple[str, ...] = prior_option(group=_CAMERA)
     estimate: tuple[str, ...] = estimate_option(group=_CAMERA)
+    mend_labels: bool = switch(
+        "give features that were seen under the name of another their own, and calibrate again; else they are named",
+        group=_SOLVE,
+    )
     loss: Loss = option(default="huber", group=_SOLVE)
     loss_scale: float = option("where the loss starts to bend", "SIGMA", 2.5, group=_SOLVE)
     reject_sigma: float = option("observations farther off are taken out and listed", "SIGMA", 5.0, group=_SOLVE)
@@ -155,10 +159,17 @@ def _run(args: CalibrateArguments) -> Document:
     options = _options(args, observations, fixed=fixed, powers=powers)
     with progress_bar(args) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
+        from ceres_cal.moves.labels import mended, renamings
         from ceres_cal.report.quality import quality_of
 
         workers = {} if client is None else {"client": client}
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
+        wrong = tuple(renamings(observations, calibration)) if calibration.rounds else ()
+        if wrong and args.mend_labels:
+            observations = mended(observations, wrong)
+            calibration = calibrate(observations, options, _solve_progress(bar), **workers)
+    told = (f"{one.words}: {'renamed' if args.mend_labels else 'is it (--mend-labels)?'}" for one in wrong)
+    calibration = replace(calibration, warnings=(*calibration.warnings, *told))
     from ceres_cal.report.summary import calibration_sections
 
     page, unmade = report_page(args, calibration, observations, photographs)

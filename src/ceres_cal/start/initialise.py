@@ -155,19 +155,19 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     told = phi_from == "fixed" or (phi_from != "guess" and len(homographies.sights) > 1)
     found: dict[int, Placed] = {}
     for number in of_world:
-        log_phi, may_bend = _known_phi(phi, told, unit, priors), given is None and not told and number not in poses
-        known = beforehand(priors, sights.keys[number].station, log_phi, may_bend=may_bend)
-        one = placed(sights[number], profile, known, poses.get(number), float(np.log(phi)))
+        known = beforehand(priors, sights.keys[number].station, _known_phi(phi, told, unit, priors))
+        may_bend = given is None and not told
+        one = placed(sights[number], profile, known, poses.get(number), float(np.log(phi)), may_bend=may_bend)
         found[number], best = one, one.places[0]
         if not told:
-            phi, profile = best.phi, profile.bent(best.bend)
+            phi, profile = best.phi, best.profile
             known_phi = any(p.quantity in ("phi", "height_m", "position_m") for p in priors)
             phi_from = "guess" if not one.tells_phi else "prior" if known_phi else "views"
             poses = dict(zip(homographies.sights.tolist(), _poses_at(homographies, phi), strict=True))
             told = one.tells_phi
     poses |= {n: one.places[0].pose for n, one in found.items() if n in poses or not one.open}
     others = tuple(
-        (n, place.pose, _with_lens(blank, sights, profile.bent(place.bend - one.places[0].bend), place.phi, options))
+        (n, place.pose, _with_lens(blank, sights, place.profile, place.phi, options))
         for n, one in found.items()
         for place in one.places[1:]
         if n in poses

@@ -19,27 +19,30 @@ from ceres_cal.start.sightlines import Candidates, Sightlines
 _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
 _TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
 _AZIMUTHS, _ROLLS = (1, 6, 11, 15, 18, 18), 18
-_FIRST, _THEN, _KEPT = 64, 12, 4  # cameras that take the first steps, then the rest, and that are answered
+_FIRST, _THEN = 64, 20  # cameras that take the first steps, then the rest
 _FIRST_STEPS, _STEPS, _LAST_STEPS = 6, 12, 20
 _LEAST_PX = 1e-3  # of a scale: below it all data are exact
 _FAR_PX = 1e6
+_ROUGH_PX = 2.0  # scale of a search's first rounds
 _LOWEST = 0.01  # of the extent of what is seen: a camera that lies on a line sees it everywhere
 _WIDEST = 2.7  # of log phi from the middle: from a fisheye to a telescope
 _MOST_STEP = 0.3  # rad, and of log phi
 _BEHIND = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
-_DAMPING, _LEAST_DAMPING = 1e-2, 1e-9
+_DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
+_NOTHING = 1e-3  # variances: who gains less is there
 
 
 @dataclass(frozen=True, eq=False)
 class Beforehand:
     """What is known of a camera beforehand: means and standard deviations, infinite where nothing is, 0 where a number
-    is held.
+    is held; and the least scale that residuals can have.
     """
 
     position: Array
     position_sd: Array
     log_phi: tuple[float, float]
     bend_sd: float
+    least_px: float = _LEAST_PX
 
     @property
     def held(self) -> Mask:
@@ -84,14 +87,18 @@ def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int)
     free = np.flatnonzero(~known.held)
     at = lines.equations(poses)
     for _ in range(steps):
-        scale = scales(at[0], len(free))
+        scale = np.maximum(scales(at[0], len(free)), known.least_px)
         step = _step(at, known, poses, scale, damping)
         moved = poses.moved(step)
         there = lines.equations(moved)
-        better = _cost(there[0], known, moved, scale) < _cost(at[0], known, poses, scale)
+        gained = _cost(at[0], known, poses, scale) - _cost(there[0], known, moved, scale)
+        better = gained > 0.0
+        better &= _possible(lines, known, moved)
         poses = moved.where(better, poses)
         at = np.where(better[:, None], there[0], at[0]), np.where(better[:, None, None], there[1], at[1])
         damping = np.clip(damping * np.where(better, 0.2, 6.0), _LEAST_DAMPING, 1e6)
+        if np.all(np.where(better, gained < _NOTHING, damping > _GIVEN_UP)):
+            break
     return poses
 
 
@@ -137,6 +144,13 @@ def _cost(r: Array, known: Beforehand, poses: Candidates, scale: Array | float) 
     return np.asarray(np.sum(4.0 * np.log1p((r / (2.0 * scale)) ** 2), axis=1) + np.sum(said**2, axis=1))
 
 
+def _possible(lines: Sightlines, known: Beforehand, poses: Candidates) -> Mask:
+    """(K,) whether a camera stands over what it sees, with a phi that lenses have."""
+    floor, reach = float(lines.places[:, 2].min()), float(np.ptp(lines.places, axis=0).max())
+    is_lens = np.abs(poses.log_phi - known.log_phi[0]) < _WIDEST
+    return np.asarray(is_lens & (poses.positions[:, 2] > floor + _LOWEST * reach))
+
+
 def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> Array:
     """(K,) minus twice the logarithm of the likelihood of Cauchy errors, each camera's at the scale of its own
     residuals, at least so many px; with what is seen where it cannot be.
@@ -147,19 +161,17 @@ def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: flo
     scale = np.maximum(scales(r, free), least_px)
     r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), _BEHIND * scale))
     scale = np.maximum(scales(r, free), least_px)
-    floor, reach = float(lines.places[:, 2].min()), float(np.ptp(lines.places, axis=0).max())
-    inside = np.abs(poses.log_phi - known.log_phi[0]) < _WIDEST
-    inside &= poses.positions[:, 2] > floor + _LOWEST * reach
     cost = _cost(r, known, poses, scale) + 4.0 * r.shape[1] * np.log(scale[:, 0])
-    return np.asarray(np.where(inside, cost, np.inf))
+    return np.asarray(np.where(_possible(lines, known, poses), cost, np.inf))
 
 
-def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates, rough_px: float) -> Found:
+def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates | None = None) -> Found:
     """The best cameras of those proposed and of a grid.
 
     Args:
-        few: some of the rows, for the first rounds. rough_px: scale of the first.
+        few: some of the rows, for the first rounds.
     """
+    proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, known.least_px)
     some = _drawn(few, known)
     some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:_FIRST])
     some = refined(few, known, Candidates.joined(proposed, some), _FIRST_STEPS)
@@ -170,8 +182,8 @@ def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Ca
 def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> Found:
     """The best of them, brought to their minima."""
     some = refined(lines, known, some, _LAST_STEPS)
-    cost = costs(lines, known, some, _LEAST_PX)
-    order = np.argsort(cost)[:_KEPT]
+    cost = costs(lines, known, some, known.least_px)
+    order = np.argsort(cost)
     best = some.take(order)
     free = int(np.count_nonzero(~known.held))
     scale = float(scales(lines.equations(best.take(np.array([0])))[0], free)[0, 0])
@@ -184,9 +196,9 @@ def _drawn(few: Sightlines, known: Beforehand) -> Candidates:
     logs = middle + np.log(_PHI_GRID) - np.log(1.1) if sd > 0.2 else np.array([middle])
     rotations = np.tile(_grid(), (len(logs), 1, 1))
     log_phi = np.repeat(logs, len(_grid()))
-    poses = Candidates(rotations, few.positions(rotations, log_phi), log_phi, np.zeros(len(log_phi)))
-    floor = float(few.places[:, 2].min())
-    return poses.take(poses.positions[:, 2] > floor)
+    positions, floor = few.positions(rotations, log_phi), float(few.places[:, 2].min())
+    positions[:, 2] = floor + np.abs(positions[:, 2] - floor)  # a camera under it is the mirror image of one above
+    return Candidates(rotations, positions, log_phi, np.zeros(len(log_phi)))
 
 
 @cache

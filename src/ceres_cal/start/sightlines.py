@@ -87,6 +87,20 @@ class Sightlines:
     curve: Indices
 
     @property
+    def independent(self) -> int:
+        """What the rows can say at most: two numbers of each point and line, five of each arc."""
+        straight = distinct(self.curve[self._points.stop : self._arcs.start])
+        return 2 * self.counts[0] + 2 * len(straight) + 5 * len(distinct(self.curve[self._arcs]))
+
+    @classmethod
+    def of_points(cls, pixels: Array, places: Array, unit_px: float) -> Sightlines:
+        """Of places (N, 3) m alone, seen at undistorted offsets (N, 2) px."""
+        twice, count = np.vstack([pixels, pixels]), len(pixels)
+        ones, zeros, along = np.ones(2 * count), np.zeros(2 * count), np.zeros((2 * count, 3))
+        none = np.full(2 * count, -1)
+        return cls(twice, ones, zeros, unit_px, np.vstack([places, places]), along, (count, 0, 0), none)
+
+    @property
     def _points(self) -> slice:
         return slice(0, 2 * self.counts[0])
 

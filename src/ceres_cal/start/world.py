@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,16 +14,18 @@ from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import Beforehand, Found, best_of, information, searched
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
-_MOST_POINTS, _MOST_OF_A_CURVE = 40, 20  # beyond which a start learns nothing more
+_MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
 _FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
-# A proposal holds where so many of its rows lie within some scales of it, and within a share of the half diagonal; and
-# where so many equations are left over: with fewer another place may explain them as well.
-_HOLDS, _SCALES, _ROUGH, _LEFT_OVER = 0.85, 8.0, 0.01, 8
-_ROUGH_PX = 2.0  # scale of a search's first rounds
-_BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: lenses without distortion are held
-_TOLD = 0.05  # standard deviation of log phi below which a sight tells it
-_OPEN = 1e-10  # least eigenvalue of the information in its own units below which numbers are open
-_ALIKE, _APART = 30.0, 0.05  # variances by which another place may cost more; rad, of the height and of phi
+_HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
+_SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
+_ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
+_LEFT_OVER = 8  # equations beyond the unknowns: with fewer another place may explain them as well
+_BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
+_TOLD = 0.05  # standard deviation of log phi below which a sight tells it: above, the start is called a guess
+_OPEN = 1e-10  # least eigenvalue of the information in its own units: rounding is less, the weakest scenes have 1e-7
+_ALIKE = 30.0  # variances by which another place may cost more at a start: the solve, which is exact, decides
+_APART = 0.05  # rad, and of the height: places that are nearer are one minimum
+_MOST_PLACES = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
 _FINEST_PX = 1e-2  # of a scale: exact data are told no better
 _LEAST_SD = 1e-3  # of a stated number, as a share: a start is no better
 _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")
@@ -34,12 +36,12 @@ class Place:
     """Where a camera stands, by one sight.
 
     Attributes:
-        pose: cam_from_world (3, 4). phi: px. bend: what is added to the profile's first coefficient.
+        pose: cam_from_world (3, 4). phi: px. profile: of the lens that shows it from there.
     """
 
     pose: Array
     phi: float
-    bend: float
+    profile: RadialProfile
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,7 @@ class Placed:
     tells_phi: bool
 
 
-def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float], *, may_bend: bool) -> Beforehand:
+def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float]) -> Beforehand:
     """What is stated of a station's place, and this of phi."""
     position, sd = np.zeros(3), np.full(3, np.inf)
     for prior in priors:
@@ -63,14 +65,17 @@ def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, floa
             numbers = slice(3 - len(prior.value), 3)
             position[numbers] = prior.value
             sd[numbers] = np.maximum(prior.sigma, _LEAST_SD * max(abs(prior.value[-1]), _LEAST_SD))
-    return Beforehand(position, sd, log_phi, _BEND_SD if may_bend else 0.0)
+    return Beforehand(position, sd, log_phi, 0.0)
 
 
-def placed(sight: Sights, profile: RadialProfile, known: Beforehand, proposed: Array | None, log_phi: float) -> Placed:
+def placed(
+    sight: Sights, profile: RadialProfile, known: Beforehand, proposed: Array | None, log_phi: float, *, may_bend: bool
+) -> Placed:
     """The places of a camera by one sight about it.
 
     Args:
-        proposed: cam_from_world (3, 4) of a homography at this phi, where there is one.
+        proposed: cam_from_world (3, 4) of a homography at this log phi, where there is one.
+        may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
     """
     lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
     given = Candidates.none()
@@ -79,17 +84,28 @@ def placed(sight: Sights, profile: RadialProfile, known: Beforehand, proposed: A
         given = Candidates(rotation[None], (-rotation @ proposed[:, 3])[None], np.array([log_phi]), np.zeros(1))
         found = best_of(lines, known, given)
         if holds(lines, known, found, profile.unit_px):
-            return _answered(lines, known, found)
+            if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
+                found = replace(found, poses=given, costs=found.costs[:1])
+            return _answered(lines, profile, known, found)
+    known = replace(known, bend_sd=_BEND_SD if may_bend else 0.0)
+    none = RadialProfile((0.0, 0.0), profile.unit_px)
+    tried = [_searched(sight, one, known, given) for one in ((profile, none) if may_bend else (profile,))]
+    return _answered(*min(tried, key=lambda one: float(one[-1].costs[0])))
+
+
+def _searched(
+    sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates
+) -> tuple[Sightlines, RadialProfile, Beforehand, Found]:
+    lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
     few = sightlines_of(sight, profile, _FEW_POINTS, _FEW_OF_A_CURVE)
-    found = searched(lines, few, known, given, _ROUGH_PX)
-    return _answered(lines, known, found)
+    return lines, profile, known, searched(lines, few, known, given)
 
 
-def _answered(lines: Sightlines, known: Beforehand, found: Found) -> Placed:
+def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, found: Found) -> Placed:
     """With what the best place leaves open, and the others that fit alike."""
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
     matrix = information(lines, known, best, scale)
-    places = tuple(_place(found.poses, number) for number in _alike(found))
+    places = tuple(_place(found.poses, number, profile) for number in _alike(found)[:_MOST_PLACES])
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
@@ -99,8 +115,7 @@ def holds(lines: Sightlines, known: Beforehand, found: Found, unit_px: float) ->
     distance = np.abs(lines.equations(best)[0][0])
     limit = min(_SCALES * found.scale_px, _ROUGH * unit_px) + 1e-3
     near = (distance < limit) & lines.seen(best)[0]
-    free = np.count_nonzero(~known.held)
-    return bool(np.mean(near) > _HOLDS and len(near) >= free + _LEFT_OVER)
+    return bool(np.mean(near) > _HOLDS and lines.independent >= np.count_nonzero(~known.held) + _LEFT_OVER)
 
 
 def open_numbers(matrix: Array) -> tuple[str, ...]:
@@ -127,10 +142,10 @@ def _sd_of(matrix: Array, number: int) -> float:
     return float(np.sqrt(np.sum(share**2 / np.maximum(values, 1e-300))))
 
 
-def _place(poses: Candidates, number: int) -> Place:
+def _place(poses: Candidates, number: int, profile: RadialProfile) -> Place:
     rotation = poses.rotations[number].T
     pose = np.column_stack([rotation, -rotation @ poses.positions[number]])
-    return Place(pose, float(np.exp(poses.log_phi[number])), float(poses.bend[number]))
+    return Place(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
 
 
 def _alike(found: Found) -> Sequence[int]:

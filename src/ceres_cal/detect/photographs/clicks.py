@@ -11,27 +11,27 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import DegenerateError, InputError, naming
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import check_header, convert, read_json
+from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.photographs.refit import CAMERA, FreeIntrinsics, PointHints
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target
-from ceres_cal.start.closed_forms import homography_from_points, orthogonality_error, pose_from_homography
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
+from ceres_cal.start.search import Beforehand, searched
+from ceres_cal.start.sightlines import Sightlines
 
 FORMAT, VERSION = "ceres-cal/corners", 1
 # How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
 SIGMA_PX = 15.0
 FEWEST = 4
 _STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
-_PHI = np.geomspace(0.5, 3.0, 40)  # in half image diagonals
+_WRONG = 6.0  # standard deviations of a click: as far off, and it is another place's
 _FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
 # A standard deviation of fy / fx where a picture was stretched one way.
 _STRETCH = 0.03
-# How square clicks are good to make the axes. Nothing changes from half to double.
-_SQUARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -78,31 +78,22 @@ def starts_from_clicks(
         lengths: what is known of dimensions of the target that are free, too.
 
     Raises:
-        InputError: a point that the target does not have, or points of which three lie on a line.
+        InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
     for name in clicks.points:
         if name not in target.point_index:
             raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
     index = np.array([target.point_index[name] for name in clicks.points], dtype=np.int32)
     pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
-    middle = 0.5 * (np.array(image_size) - 1.0)
-    half = 0.5 * float(np.hypot(*image_size))
-    cameras = []
-    for stretch in _STRETCHES:
-        lens = Radial((0.0, (stretch - 1.0) / half**2, 0.0, 0.0), (2, 3, 4, 5))
-        lifted = (pixels - middle) * (1.0 + lens.values[1] * np.sum((pixels - middle) ** 2, axis=1))[:, None]
-        try:
-            homography = homography_from_points(plane[:, :2], lifted)
-        except DegenerateError as error:
-            raise InputError(f"the points to start from tell no pose: {error}") from None
-        phi = _phi(homography, half)
-        pose = pose_from_homography(homography, phi)
-        if pose.position[2] < 0.0:
-            raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
-        cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
-    phi = float(np.median([camera.phi for camera in cameras]))
+    if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 1e-6:
+        raise InputError(f"all {len(plane)} points to start from lie on one line: show more corners")
+    every = [_with_stretch(stretch, pixels, plane, image_size) for stretch in _STRETCHES]
+    fitting = [camera for camera, off_px in every if off_px.max() < _WRONG * SIGMA_PX]
+    if not fitting:
+        raise InputError(_odd_one(list(clicks.points), min((off for _, off in every), key=np.median)))
+    phi = float(np.median([camera.phi for camera in fitting]))
     hints = PointHints(index, pixels, np.full(len(index), SIGMA_PX))
-    return cameras, unknown_optics(image_size, phi, hints, lengths)
+    return fitting, unknown_optics(image_size, phi, hints, lengths)
 
 
 def unknown_optics(
@@ -120,8 +111,28 @@ def unknown_optics(
     return FreeIntrinsics(_FREED, (*priors, *lengths), hints)
 
 
-def _phi(homography: Array, half_px: float) -> float:
-    """The focal length that makes the field's axes square, held near what lenses have where the view is too frontal."""
-    error = orthogonality_error(homography[None], _PHI * half_px)[:, 0]
-    cost = (error / _SQUARE) ** 2 + (np.log(_PHI / USUAL_PHI) / np.log(USUAL_PHI_FACTOR)) ** 2
-    return float(_PHI[np.argmin(cost)] * half_px)
+def _with_stretch(stretch: float, pixels: Array, plane: Array, image_size: tuple[int, int]) -> tuple[Camera, Array]:
+    """The camera with so wide a lens that suits the clicks best, and how far off each click is, (N,) px."""
+    middle, half = 0.5 * (np.array(image_size) - 1.0), 0.5 * float(np.hypot(*image_size))
+    lens = Radial((0.0, (stretch - 1.0) / half**2, 0.0, 0.0), (2, 3, 4, 5))
+    lifted = (pixels - middle) * (1.0 + lens.values[1] * np.sum((pixels - middle) ** 2, axis=1))[:, None]
+    usual = float(np.log(USUAL_PHI * half)), float(np.log(USUAL_PHI_FACTOR))
+    known = Beforehand(np.zeros(3), np.full(3, np.inf), usual, 0.0, least_px=0.5 * SIGMA_PX)
+    lines = Sightlines.of_points(lifted, plane, half)
+    best = searched(lines, lines, known).poses
+    rotation, phi = best.rotations[0].T, float(np.exp(best.log_phi[0]))
+    pose = Pose(rotation, -rotation @ best.positions[0])
+    camera = Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose)
+    off = np.linalg.norm(lines.equations(best)[0][0].reshape(2, -1), axis=0)
+    return camera, np.where(lines.seen(best)[0][: len(plane)], off, np.inf)
+
+
+def _odd_one(names: list[str], off_px: Array) -> str:
+    """What is wrong with clicks: the one that the others contradict, or all."""
+    wrong = [name for name, off in zip(names, off_px, strict=True) if off > _WRONG * SIGMA_PX]
+    if len(names) - len(wrong) < FEWEST:
+        return (
+            "the points to start from are those of no camera above the target: check names, and that none go round the "
+            "wrong way, as if seen from below"
+        )
+    return f"point {wrong[0]!r} to start from lies {off_px.max():.0f} px from where the others have it: check its name"

@@ -1,0 +1,216 @@
+"""What a start is found for: python scripts/run.py starts [--help]
+
+"middle" and "quarter": cameras of a division A field as halls have them, the middle one over a touch line, the halfway
+line and the circle (and the centre line), a quarter's over lines of its corner, 30 points on each, with and without a
+height. "drawn": 2 to 8 features of a field before a camera whose phi is known or not. Counted are refusals of scenes
+that a rank by finite differences of the exact scene calls solvable, and calibrations of which a number that is called
+"known" is over 5 standard deviations off. "labels": two lines of a field under each other's names. Exits with 1 where
+there are any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from runner import Row, over, script
+
+from accuracy.odd_scenes import MOST_SIGMAS, farthest
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.moves.labels import mended, renamings
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.columns import taken
+from ceres_cal.problem.parameters import Options
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_curve, nearest_on_curve
+from ceres_cal.scene.lens import Brown, Radial
+from ceres_cal.scene.targets import ssl_field
+from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+
+_FIELD = ssl_field("A")
+_SIZE = (1280, 1024)
+_MOST_ON_A_CURVE = 30
+_NOISE_PX = 0.3
+_SOLVABLE = 1e-5  # least over largest singular value, each number in its own unit: the scenes drawn leave a gap there
+_STEP = 1e-6
+_MIDDLE = ("TopTouchLine", "HalfwayLine", "CenterCircle", "CenterLine")
+_QUARTER = ("TopTouchLine", "LeftGoalLine", "LeftPenaltyStretch", "LeftFieldRightPenaltyStretch", "HalfwayLine")
+_HELD = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one scene: the message of a refusal, or by how many standard deviations what is known is off."""
+
+    refused: str = ""
+    sigmas: float = 0.0
+    which: str = ""
+
+
+def middle(runs: int) -> Iterator[Row]:
+    yield from _rows("middle", list(over(_middle, range(runs))))
+
+
+def quarter(runs: int) -> Iterator[Row]:
+    yield from _rows("quarter", list(over(_quarter, range(runs))))
+
+
+def drawn(runs: int) -> Iterator[Row]:
+    found = list(over(_drawn, range(runs)))
+    yield Row("drawn", "scenes that are solvable", sum(one is not None for one in found))
+    yield from _rows("drawn", [one for one in found if one is not None])
+
+
+def labels(runs: int) -> Iterator[Row]:
+    found = list(over(_exchanged, range(runs)))
+    yield Row("labels", f"exchanged in pairs, named and mended, of {runs}", sum(found), least=runs)
+
+
+def _exchanged(seed: int) -> bool:
+    """Whether two exchanged curves of a field are found to be, and nothing else is."""
+    rng = np.random.default_rng([seed, 24])
+    camera = Camera(_SIZE, rng.uniform(500.0, 700.0), (639.5, 511.5), Radial((rng.uniform(-6e-5, 0.0), 5e-7)))
+    x, y, height = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(5.0, 6.5)
+    pose = overhead_pose(x, y, height, rng.uniform(-15.0, 15.0), rng.uniform(-15.0, 15.0))
+    field = ssl_field("AB"[seed % 2])
+    scene = field_scene(field, {"c": camera}, {"c": Station("c", pose)})
+    right = _thinned(simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), seed).observations)
+    straight = [f for f in np.unique(right.curves.feature) if not field.is_arc[f]]
+    first, second = rng.permutation(straight)[:2]
+    feature = right.curves.feature.copy()
+    feature[right.curves.feature == first], feature[right.curves.feature == second] = second, first
+    wrong = replace(right, curves=replace(right.curves, feature=feature))
+    try:
+        calibration = calibrate(wrong, Options(lens="radial"))
+    except CalibrationError:
+        return False
+    return bool(
+        np.array_equal(mended(wrong, tuple(renamings(wrong, calibration))).curves.feature, right.curves.feature)
+    )
+
+
+def _rows(case: str, found: Sequence[Outcome]) -> Iterator[Row]:
+    refused = [one.refused for one in found if one.refused]
+    yield Row(case, f"refused, of {len(found)}", len(refused), most=0, note=refused[0][:60] if refused else "")
+    wrong = [one for one in found if one.sigmas > MOST_SIGMAS]
+    yield Row(case, 'a number called "known" over 5 sd off', len(wrong), most=0, note=wrong[0].which if wrong else "")
+
+
+def _middle(seed: int) -> Outcome:
+    rng = np.random.default_rng([seed, 21])
+    position = (rng.uniform(-0.5, 0.5), rng.uniform(1.6, 2.4), rng.uniform(4.5, 6.0))
+    return _hall(rng, _MIDDLE[: 3 + seed % 2], position, stated=seed % 4 > 1)
+
+
+def _quarter(seed: int) -> Outcome:
+    rng = np.random.default_rng([seed, 22])
+    position = (rng.uniform(-3.5, -2.5), rng.uniform(1.8, 2.6), rng.uniform(4.5, 6.0))
+    return _hall(rng, _QUARTER, position, stated=seed % 4 > 1)
+
+
+def _hall(
+    rng: np.random.Generator, curves: tuple[str, ...], position: tuple[float, float, float], *, stated: bool
+) -> Outcome:
+    """A camera over a hall's field, with an exact height or none."""
+    tilts = rng.uniform(-6.0, 6.0, 2)
+    camera = Camera(_SIZE, rng.uniform(700.0, 900.0), (639.5, 511.5), Radial((rng.uniform(-6e-5, 0.0), 5e-7)))
+    pose = overhead_pose(*position, tilts[0], tilts[1], yaw_deg=rng.uniform(-180.0, 180.0))
+    scene = field_scene(_FIELD, {"c": camera}, {"c": Station("c", pose)}, points=(), curves=curves, spacing_m=0.02)
+    priors = (Prior("station", "c", "height_m", (position[2],), (0.003,)),) if stated else ()
+    observations = replace(_thinned(simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), 1).observations), priors=priors)
+    return _outcome(scene, observations, Options(lens="radial"))
+
+
+def _drawn(seed: int) -> Outcome | None:
+    """None where the scene is not solvable."""
+    rng = np.random.default_rng([seed, 23])
+    phi_known = bool(rng.random() < 0.5)
+    camera = Camera(_SIZE, rng.uniform(500.0, 1400.0), (639.5, 511.5), Brown((0.0,) * 5))
+    tilt, to = rng.uniform(0.0, 45.0), rng.uniform(0.0, 2.0 * np.pi)
+    place = rng.uniform(-4.0, 4.0), rng.uniform(-3.0, 3.0), rng.uniform(3.0, 7.0)
+    pose = overhead_pose(
+        place[0], place[1], place[2], tilt * np.cos(to), tilt * np.sin(to), yaw_deg=rng.uniform(-180.0, 180.0)
+    )
+    scene = field_scene(_FIELD, {"c": camera}, {"c": Station("c", pose)}, spacing_m=0.02)
+    every = _thinned(simulate(scene, Disturbance(), 1).observations)
+    seen = [(0, f) for f in np.unique(every.points.feature)] + [(1, f) for f in np.unique(every.curves.feature)]
+    if len(seen) < 2:
+        return None
+    chosen = {tuple(seen[k]) for k in rng.permutation(len(seen))[: rng.integers(2, 9)]}
+    exact = _of_features(every, chosen)
+    if not _is_solvable(exact, camera, pose, phi_known=phi_known):
+        return None
+    noisy = _of_features(_thinned(simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), 1).observations), chosen)
+    fixed = {**_HELD, **({"phi": camera.phi} if phi_known else {})}
+    return _outcome(scene, noisy, Options(lens="brown", fixed=fixed, free_principal_point=False))
+
+
+def _outcome(scene: Scene, observations: Observations, options: Options) -> Outcome:
+    try:
+        calibration = calibrate(observations, options)
+    except CalibrationError as error:
+        return Outcome(refused=str(error))
+    sigmas, which, _ = farthest(calibration, scene)
+    return Outcome("", sigmas, which)
+
+
+def _thinned(observations: Observations) -> Observations:
+    """So many on each curve, evenly."""
+    kept = np.zeros(len(observations.curves), dtype=bool)
+    for feature in np.unique(observations.curves.feature):
+        own = np.flatnonzero(observations.curves.feature == feature)
+        kept[own[np.unique(np.linspace(0, len(own) - 1, _MOST_ON_A_CURVE).round().astype(int))]] = True
+    return replace(observations, curves=taken(observations.curves, kept))
+
+
+def _of_features(observations: Observations, chosen: set[tuple[int, int]]) -> Observations:
+    points, curves = observations.points, observations.curves
+    shown = (
+        np.array([(kind, feature) in chosen for feature in columns.feature.tolist()], dtype=bool)
+        for kind, columns in enumerate((points, curves))
+    )
+    first, second = shown
+    return replace(observations, points=taken(points, first), curves=taken(curves, second))
+
+
+def _is_solvable(exact: Observations, camera: Camera, pose: Pose, *, phi_known: bool) -> bool:
+    """Whether what is seen changes, to first order, with every pose and phi: by differences of `Camera.project`."""
+    field = next(iter(exact.targets.values()))
+    curves = list(field.curves.values())
+    places, beside = [field.point_array[exact.points.feature], np.empty((0, 3))], [np.empty((0, 3))]
+    there = camera.at(pose)
+    for feature in np.unique(exact.curves.feature):
+        own = exact.curves.pixels[exact.curves.feature == feature]
+        on = np.column_stack([there.locate(own), np.zeros(len(own))])
+        s = nearest_on_curve(curves[feature], on)
+        places.append(along_curve(curves[feature], s))
+        beside.append(along_curve(curves[feature], s + 1e-4))
+    along = _project(camera, pose, np.concatenate(beside)) - _project(camera, pose, np.concatenate(places[1:]))
+    across = np.column_stack([-along[:, 1], along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]
+    columns = []
+    for number in range(6 if phi_known else 7):
+        step = np.zeros(7)
+        step[number] = _STEP
+        moved = replace(camera, phi=camera.phi * (1.0 + step[6]))
+        off = _project(moved, Pose.exp(step[:6]) @ pose, np.concatenate(places))
+        off = (off - _project(camera, pose, np.concatenate(places))) / _STEP
+        of_points, of_curves = off[: len(places[0])], off[len(places[0]) :]
+        columns.append(np.concatenate([of_points.ravel(), np.sum(of_curves * across, axis=1)]))
+    matrix = np.array(columns).T
+    if len(matrix) < matrix.shape[1]:
+        return False
+    sizes = np.linalg.svd(matrix / np.linalg.norm(matrix, axis=0), compute_uv=False)
+    return bool(sizes[-1] > _SOLVABLE * sizes[0])
+
+
+def _project(camera: Camera, pose: Pose, places: Array) -> Array:
+    return camera.at(pose).project(places)
+
+
+main = script(
+    {"middle": middle, "quarter": quarter, "drawn": drawn, "labels": labels}, __doc__, (144, "scenes of each case")
+)

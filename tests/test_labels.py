@@ -1,0 +1,54 @@
+"""Features that were seen under the name of another are named, and given their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.moves.labels import mended, renamings
+from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import ssl_field
+from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+
+CAMERA = Camera((1280, 960), 700.0, (639.5, 479.5), Radial((-5e-5, 6e-7)))
+
+
+@pytest.fixture(scope="module")
+def right() -> Observations:
+    station = Station("c", overhead_pose(0.3, -0.2, 4.5, 6.0, -9.0))
+    scene = field_scene(ssl_field("B"), {"c": CAMERA}, {"c": station}, spacing_m=0.3)
+    return simulate(scene, Disturbance(0.3, 0.3), 1).observations
+
+
+def renamed(observations: Observations, kind: str, names: dict[str, str]) -> Observations:
+    columns = getattr(observations, f"{kind}s")
+    index = getattr(observations.targets["field"], f"{kind}_index")
+    feature = columns.feature.copy()
+    for name, other in names.items():
+        feature[columns.feature == index[name]] = index[other]
+    return replace(observations, **{f"{kind}s": replace(columns, feature=feature)})
+
+
+@pytest.mark.parametrize(
+    "kind, first, second",
+    [
+        ("curve", "HalfwayLine", "CenterLine"),
+        ("curve", "BottomTouchLine", "RightGoalLine"),
+        ("point", "CenterMark", "TopRightCorner"),
+    ],
+)
+def test_exchanged_names_are_found_and_mended(right: Observations, kind: str, first: str, second: str) -> None:
+    wrong = renamed(right, kind, {first: second, second: first})
+    found = tuple(renamings(wrong, calibrate(wrong, Options(lens="radial"))))
+    assert {(one.kind, one.name, one.right) for one in found} == {(kind, first, second), (kind, second, first)}
+    again = mended(wrong, found)
+    assert np.array_equal(again.points.feature, right.points.feature)
+    assert np.array_equal(again.curves.feature, right.curves.feature)
+
+
+def test_right_names_stay(right: Observations) -> None:
+    assert not list(renamings(right, calibrate(right, Options(lens="radial"))))
