@@ -768,7 +768,7 @@ def test_no_answer_is_said_and_is_1(say: Say, calibrated: Path) -> None:
 
 def test_beyond_the_lens(say: Say, calibrated: Path, tmp_path: Path) -> None:
     data = json.loads(calibrated.read_text())
-    data["cameras"]["overhead"]["lens"]["coefficients"] = {"a2": -5e-4, "a3": 0.0}  # folds over at 1000 px
+    data["cameras"]["overhead"]["lens"]["coefficients"] = {"a2": -5e-4, "a3": 0.0, "p1": 0.0, "p2": 0.0}  # folds over at 1000 px
     (tmp_path / "weak.json").write_text(json.dumps(data))
     said = say("locate", tmp_path / "weak.json", "2000,480")
     assert said.code == 1 and "past the 1000 px from the principal point" in said.out

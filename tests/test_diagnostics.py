@@ -32,7 +32,7 @@ from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
 from ceres_cal.simulate import Disturbance, simulate
 
-PLAIN = Options(lens="radial", loss="trivial")
+PLAIN = Options(lens="radial", usual_camera=False, loss="trivial")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def linearised(observations: Observations, calibration: Calibration) -> Equation
 def test_rows_are_the_derivatives_of_the_residuals(lens: str) -> None:
     scene = usual.field_and_boards(lens)
     seen = simulate(scene, scenes.NOISE, 1).observations
-    options = Options(lens=usual.camera(lens).lens.kind, powers=usual.camera(lens).lens.powers)
+    options = Options(lens=usual.camera(lens).lens.kind, powers=usual.camera(lens).lens.powers, usual_camera=False)
     calibration = calibrate(seen, replace(options, powers=options.powers if options.lens == "radial" else (2, 3)))
     equations, estimate = linearised(seen, calibration), calibration.estimate
     sights = gather_sights(seen)
@@ -156,7 +156,7 @@ def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:
 
 def test_leverage_foretells_the_residual_without_the_observation() -> None:
     seen = simulate(scenes.overhead(frames=1, boards=0), scenes.NOISE, 5).observations
-    options = Options(lens="radial", loss="trivial", noise_scale="stated", reject_sigma=100.0)
+    options = Options(lens="radial", usual_camera=False, loss="trivial", noise_scale="stated", reject_sigma=100.0)
     table = diagnose(calibrate(seen, options), seen).table
     chosen = int(np.argmax(np.where(table.is_curve, table.leverage, 0.0)))
     row = int(table.row[chosen])

@@ -76,8 +76,8 @@ def per_view(observations: Observations, precision: Any) -> tuple[list[Any], lis
 def ours(lens: str, free_aspect: bool = True, fixed: tuple[str, ...] = ()) -> tuple[Calibration, Answer]:
     """Plain least squares: no robust loss, no rejection, the stated sigmas."""
     options = Options(
-        lens=lens, free_aspect=free_aspect, fixed=dict.fromkeys(fixed, 0.0), loss="trivial", noise_scale="stated",
-        reject_sigma=1e9,
+        usual_camera=False, lens=lens, free_aspect=free_aspect, fixed=dict.fromkeys(fixed, 0.0), loss="trivial",
+        noise_scale="stated", reject_sigma=1e9,
     )  # fmt: skip
     calibration = calibrate(corners(lens), options)
     camera = calibration.cameras["camera"]
@@ -225,7 +225,7 @@ def test_pycolmap_projects_as_we_do(name: str) -> None:
 def test_sony_boards(sony_boards: BoardDetections) -> None:
     """OpenCV on these corners, k1 and k2 only: 0.138 px and 702.59; on its own 0.162 px, 700.93; published: 701.0."""
     assert len(sony_boards.observations.views) == 13
-    options = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0, "k3": 0.0})
+    options = Options(usual_camera=False, lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0, "k3": 0.0})
     calibration = calibrate(sony_boards.observations, options)
     assert calibration.fit.points_rms_px <= 0.139  # 0.1384 measured
     assert calibration.fit.points == 13 * 24
@@ -238,7 +238,7 @@ def test_gopro_boards(gopro_boards: BoardDetections) -> None:
     """OpenCV with three radial coefficients, on its own corners: 0.5235 px and 560.07; some are 2 px and more off."""
     observations = gopro_boards.observations
     assert len(observations.views) >= 35
-    options = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0})
+    options = Options(usual_camera=False, lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0})
     calibration = calibrate(observations, options)
     assert calibration.fit.points_rms_px <= 0.53  # 0.444 measured, without 7 corners
     assert len(calibration.rejected) < 0.01 * len(observations.points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -53,7 +54,7 @@ def refusal(observations: Observations, options: Options | None = None) -> str:
 def test_a_mirrored_picture_is_refused(name: str, how: str) -> None:
     seen = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
     text = refusal(with_pixels(seen, MIRRORED[how]))
-    assert "the camera stands 5.2" in text and " m under the floor that it sees: " in text and ANY in text
+    assert re.search(r"the camera stands 5\.(19|2\d*) m under the floor that it sees: ", text) and ANY in text
     assert text.endswith("or left and right are exchanged in the labels: correct the observations")
     assert "\n" not in text
 

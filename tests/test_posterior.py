@@ -46,7 +46,7 @@ def problem(name: str, **more: Any) -> tuple[Problem, Estimate]:
         Prior("camera", camera, "principal_point", (651.0, 469.0), (2.0, 3.0)),
         Prior("station", station, "height_m", (height,), (0.01,)),
     )
-    options = Options(lens=lens.kind, powers=getattr(lens, "powers", (2, 3)), priors=priors, **more)
+    options = Options(usual_camera=False, lens=lens.kind, powers=getattr(lens, "powers", (2, 3)), priors=priors, **more)
     observations = simulate(scene, NOISE, 1).observations
     estimate = calibrate(observations, options).estimate
     known = gather_priors(observations, options, estimate.structure)
@@ -222,9 +222,12 @@ def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
     observations = simulate(SCENES["radial-2-3/lines"](), NOISE, 1).observations
     stated = replace(observations, curves=replace(observations.curves, sigma_px=0.25 * observations.curves.sigma_px))
     told = calibrate(
-        observations, Options(lens="radial", noise_scale="stated", loss="trivial", reject_sigma=50.0)
+        observations,
+        Options(usual_camera=False, lens="radial", noise_scale="stated", loss="trivial", reject_sigma=50.0),
     ).posterior
-    found = calibrate(stated, Options(lens="radial", noise_scale=noise_scale, loss="trivial", reject_sigma=50.0))
+    found = calibrate(
+        stated, Options(usual_camera=False, lens="radial", noise_scale=noise_scale, loss="trivial", reject_sigma=50.0)
+    )
     assert told is not None and found.posterior is not None
     assert found.posterior.by_model is not None and told.by_model is not None
     ratio = found.posterior.by_model.spread.sd / told.by_model.spread.sd
@@ -234,4 +237,4 @@ def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
 
 def test_the_closed_form_alone_knows_nothing_of_it() -> None:
     observations = simulate(SCENES["radial-2-3/corners"](), NOISE, 1).observations
-    assert calibrate(observations, Options(lens="radial", closed_form_only=True)).posterior is None
+    assert calibrate(observations, Options(usual_camera=False, lens="radial", closed_form_only=True)).posterior is None

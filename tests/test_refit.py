@@ -74,7 +74,7 @@ def two_cameras() -> tuple[Calibration, dict[str, Station]]:
     """Two cameras over one field that is not as drawn: its tolerances tie them together."""
     cameras, stations = side_by_side(CAMERA)
     scene = field_scene(FIELD, cameras, stations, frames=2, spacing_m=0.15)
-    options = Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.005)})
+    options = Options(usual_camera=False, lens="radial", tolerances={"field": Tolerance(lines_m=0.005)})
     return calibrate(simulate(scene, NOISE, 0).observations, options), stations
 
 

@@ -22,7 +22,7 @@ from ceres_cal.simulate import BoardRanges, Disturbance, board_scene, simulate
 from ceres_cal.start.same_labels import with_same_labels
 
 __all__ = ["say"]
-_BROWN = Options(lens="brown")
+_BROWN = Options(usual_camera=False, lens="brown")
 _LEFT = scenes.camera("brown")
 _BASELINE_M, _ANGLE_RAD = 0.3, 0.12
 _STATIONS = {

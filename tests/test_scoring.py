@@ -34,7 +34,7 @@ def _boards(count: int, seed: int, sigma_px: float = 0.2) -> Observations:
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    return calibrate(_boards(12, 1), Options(lens="brown"))
+    return calibrate(_boards(12, 1), Options(usual_camera=False, lens="brown"))
 
 
 def test_new_boards_are_predicted_to_the_noise(calibration: Calibration) -> None:
@@ -69,7 +69,7 @@ def test_the_poses_of_a_rig_are_tested_where_they_are_held() -> None:
     scene = scenes.two_cameras("brown")
     boards = replace(scene, views=tuple(plan for plan in scene.views if plan.target == "board"))
     noise = Disturbance(points_sigma_px=0.2, curves_sigma_px=0.2)
-    known = calibrate(simulate(scene, noise, seed=1).observations, Options(lens="brown"))
+    known = calibrate(simulate(scene, noise, seed=1).observations, Options(usual_camera=False, lens="brown"))
     seen = simulate(boards, noise, seed=2).observations
     assert score(known, seen, hold_stations=True)["east"].misfit.noise[0] == pytest.approx(1.0, abs=0.12)
     east = known.estimate.stations["east"]
@@ -82,7 +82,7 @@ def test_the_poses_of_a_rig_are_tested_where_they_are_held() -> None:
 
 def test_a_field_alone_leaves_nothing_to_pose_under_held_stations() -> None:
     seen = simulate(scenes.corners("brown"), seed=1).observations
-    known = calibrate(seen, Options(lens="brown"))
+    known = calibrate(seen, Options(usual_camera=False, lens="brown"))
     (answer,) = score(known, seen).values()
     assert answer.misfit.points_rms_px < 1e-6
     with pytest.raises(InputError, match="ceres-cal check"):
@@ -93,7 +93,7 @@ def test_everything_held_calibrates(calibration: Calibration) -> None:
     camera = calibration.cameras["camera"]
     numbers = {"phi": camera.phi, "cx": camera.principal_point[0], "cy": camera.principal_point[1]}
     seen = _boards(6, 4)
-    held = calibrate(seen, Options(lens="brown", fixed={**numbers, **camera.lens.coefficients}))
+    held = calibrate(seen, Options(usual_camera=False, lens="brown", fixed={**numbers, **camera.lens.coefficients}))
     assert held.fit.points_rms_px == pytest.approx(score(calibration, seen)["camera"].misfit.points_rms_px, rel=1e-4)
     assert held.uncertainty.posterior.keys == ()
 
@@ -109,7 +109,7 @@ def test_equal_cameras_differ_nowhere(calibration: Calibration) -> None:
 
 
 def test_repetitions_are_explained(calibration: Calibration) -> None:
-    others = [calibrate(_boards(12, seed), Options(lens="brown")) for seed in (5, 6, 7)]
+    others = [calibrate(_boards(12, seed), Options(usual_camera=False, lens="brown")) for seed in (5, 6, 7)]
     for other in others:
         (found,) = compare_cameras(calibration, other).values()
         assert found.holds and found.image is not None
@@ -164,7 +164,9 @@ def test_score_and_compare_as_typed(say: Say, calibration: Calibration, tmp_path
 def test_ov_plane() -> None:
     """Its own split: scipy leaves 0.482 px in training, and 0.475 px of the test views with poses alone."""
     parts = [ov_plane(name) for name in ("train", "test")]
-    known = calibrate(parts[0], Options(lens="kannala-brandt", free_aspect=True, loss="trivial", reject_sigma=1e9))
+    known = calibrate(
+        parts[0], Options(usual_camera=False, lens="kannala-brandt", free_aspect=True, loss="trivial", reject_sigma=1e9)
+    )
     assert known.fit.points_rms_px == pytest.approx(0.4815, abs=5e-4)
     (answer,) = score(known, parts[1]).values()
     assert answer.misfit.points_rms_px == pytest.approx(0.4746, abs=5e-4)

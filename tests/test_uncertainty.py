@@ -120,7 +120,7 @@ def test_more_tilt_tells_more(tilt_deg: float, verdict: str) -> None:
 
 def cost_at(calibration: Calibration, observations: Observations, phi: float | None) -> float:
     """Twice the least cost, at the calibration's noise, with phi held somewhere or free."""
-    options = Options(lens="radial", fixed={} if phi is None else {"phi": phi})
+    options = Options(usual_camera=False, lens="radial", fixed={} if phi is None else {"phi": phi})
     fit, estimate = calibration.fit, calibration.estimate
     if phi is not None:
         camera = replace(estimate.cameras["overhead"], phi=phi)
@@ -211,7 +211,7 @@ def test_another_lens_widens_a_valley_on_the_floor_alike_at_every_phi() -> None:
 def test_a_prior_on_phi_is_part_of_its_profile() -> None:
     """Too wide for the quadratic picture, and almost all that is known: the bounds are the prior's own."""
     prior = Prior("camera", "overhead", "phi", (560.0,), (60.0,))
-    calibration = calibrate(observed(1.0), Options(lens="radial", priors=(prior,)))
+    calibration = calibrate(observed(1.0), Options(usual_camera=False, lens="radial", priors=(prior,)))
     verdict = phi_of(calibration)
     assert verdict.by_profile and verdict.verdict == "weak" and calibration.warnings == ()
     assert (verdict.low, verdict.high) == pytest.approx((560.0 - 117.6, 560.0 + 117.6), abs=12.0)  # 447, 683 measured

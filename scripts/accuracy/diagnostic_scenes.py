@@ -28,7 +28,7 @@ from ceres_cal.simulate import (
     simulate,
 )
 
-RADIAL = Options(lens="radial")
+RADIAL = Options(lens="radial", usual_camera=False)
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 OUTLIERS = replace(NOISE, outliers=0.1, hidden_stretches=4, hidden_points=0.1)
 USUAL: Lens = Radial((-5.2e-5, 6.1e-7), (2, 3))
@@ -66,7 +66,7 @@ def _plain(scene: Callable[[], Scene], disturbance: Disturbance = NOISE, **optio
     def observe(seed: int) -> Observations:
         return simulate(scene(), disturbance, seed).observations
 
-    return Problem(observe, Options(**{"lens": "radial", **options}))  # type: ignore[arg-type]
+    return Problem(observe, Options(**{"lens": "radial", "usual_camera": False, **options}))  # type: ignore[arg-type]
 
 
 def _with_prior(seed: int) -> Observations:
@@ -225,7 +225,11 @@ def bump(seed: int) -> Observations:
 
 
 FAULTS: dict[str, tuple[Problem, str, str]] = {
-    "polynomial too short (r^2)": (Problem(short_polynomial, Options(powers=(3,))), "radius", "overhead"),
+    "polynomial too short (r^2)": (
+        Problem(short_polynomial, Options(powers=(3,), usual_camera=False)),
+        "radius",
+        "overhead",
+    ),
     "polynomial too short (r^5)": (Problem(longer_polynomial, RADIAL), "radius", "overhead"),
     "line 12 mm aside": (Problem(line_aside, RADIAL), "curve aside", "field/LeftPenaltyStretch"),
     "one mislabelled corner": (

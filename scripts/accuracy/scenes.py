@@ -64,14 +64,14 @@ def boards(phi: float, lens: Lens, count: int = 20) -> Problem:
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=BoardRanges((0.5, 1.5)))
-    return Problem(scene, Options(lens=lens.kind))
+    return Problem(scene, Options(usual_camera=False, lens=lens.kind))
 
 
 def over_the_field() -> Problem:
     """One camera over a division B field: its points, lines and circle; the height is known to 10 mm."""
     pose = overhead_pose(-0.3, 0.2, 5.2, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=1.6)
     scene = field_scene(FIELD, {"overhead": _camera()}, {"overhead": Station("overhead", pose)}, spacing_m=_SPACING_M)
-    return Problem(scene, Options(lens="radial"), (_height(scene, "overhead", 0.010),))
+    return Problem(scene, Options(usual_camera=False, lens="radial"), (_height(scene, "overhead", 0.010),))
 
 
 def two_cameras() -> Problem:
@@ -85,7 +85,7 @@ def two_cameras() -> Problem:
     field = field_scene(FIELD, cameras, stations, spacing_m=_SPACING_M)
     board = checkerboard(9, 6, 0.1)
     both = board_scene(board, cameras, stations, count=6, seed=2, held=BoardRanges((3.0, 5.0), (20.0, 50.0)))
-    return Problem(join(field, both), Options(lens="radial"))
+    return Problem(join(field, both), Options(usual_camera=False, lens="radial"))
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
@@ -109,7 +109,7 @@ def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0
         shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, held=BoardRanges((1.0, 2.0)))
         scene = join(scene, shown)
     priors = () if height_sigma_m is None else (_height(scene, "overhead", height_sigma_m),)
-    return Problem(scene, Options(lens="radial"), priors)
+    return Problem(scene, Options(usual_camera=False, lens="radial"), priors)
 
 
 # ---- mirrored poses -------------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def ssl_problem(half: bool, lens: Radial) -> Problem:
         points=("TopLeftCorner", "BottomLeftCorner", *right),
         spacing_m=_SPACING_M,
     )
-    return Problem(scene, Options(powers=lens.powers), (_height(scene, "overhead", 0.005),))
+    return Problem(scene, Options(usual_camera=False, powers=lens.powers), (_height(scene, "overhead", 0.005),))
 
 
 SSL_PROBLEMS: dict[str, Callable[[], Problem]] = {

@@ -14,7 +14,6 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, Any, Literal, TypeVar
 
@@ -22,6 +21,7 @@ import msgspec
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import printable
+from ceres_cal.base.written import note
 
 T = TypeVar("T")
 Units = Literal["metres, radians, pixels"]
@@ -311,26 +311,3 @@ def make_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
     return folder
-
-
-# ---- what was written -----------------------------------------------------------------------------------------------
-
-_noted: ContextVar[list[str] | None] = ContextVar("noted", default=None)
-
-
-@contextmanager
-def noting() -> Iterator[list[str]]:
-    """The files that are written while it lasts, as they come: for those who must say so when they are interrupted."""
-    files: list[str] = []
-    token = _noted.set(files)
-    try:
-        yield files
-    finally:
-        _noted.reset(token)
-
-
-def note(path: object) -> None:
-    """That a file is in its place."""
-    files = _noted.get()
-    if files is not None:
-        files.append(str(path))

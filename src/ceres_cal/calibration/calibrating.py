@@ -40,8 +40,8 @@ from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.repeats import AsBuilt
-from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.robust.usable import require_fits, require_possible, require_usable
+from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
+from ceres_cal.robust.usable import require_possible, require_usable
 from ceres_cal.robust.wholes import Subproblem
 from ceres_cal.start.initialise import Start, initialise
 

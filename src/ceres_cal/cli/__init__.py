@@ -11,8 +11,8 @@ import sys
 from collections.abc import Sequence
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
-from ceres_cal.base.files import noting
 from ceres_cal.base.words import first_of
+from ceres_cal.base.written import noting
 from ceres_cal.cli import terminal
 from ceres_cal.cli.command import COMMANDS, Command, print_answer
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended

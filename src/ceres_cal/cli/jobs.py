@@ -11,9 +11,10 @@ from pathlib import Path
 import msgspec
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert, note, read_bytes
+from ceres_cal.base.files import convert, read_bytes
 from ceres_cal.base.version import __version__
 from ceres_cal.base.words import printable
+from ceres_cal.base.written import note
 
 RESULTS = "results.jsonl"
 LEVELS = ("failed", "no", "care", "good")

@@ -13,8 +13,8 @@ from select import select
 from typing import Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import note
 from ceres_cal.base.words import first_of, plural
+from ceres_cal.base.written import note
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.targets import Target

@@ -28,8 +28,7 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.conflicts import without_suspicious
-from ceres_cal.robust.robust import RobustSolution
-from ceres_cal.robust.usable import require_fits
+from ceres_cal.robust.robust import RobustSolution, require_fits
 from ceres_cal.robust.wholes import (
     FEWEST,
     ObservationGroups,

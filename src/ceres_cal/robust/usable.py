@@ -122,32 +122,12 @@ def _cause(camera: Camera) -> str:
     return f"the image is mirrored, or {swapped}, or y points upwards"
 
 
-# Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
-# that is too simple stays below a few pixels. Nothing changes from half to double.
-_NO_FIT = 0.015
 # Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
 _OFF_CENTRE = 0.15
 # Share of a side that observations of an image usually reach beyond.
 _UNFILLED = 0.9
 # Of the image's diagonal: three standard deviations of usual principal points (`priors.USUAL_CENTRE`).
 _UNUSUAL = 0.045
-
-
-def require_fits(end: RobustSolution, problem: Problem) -> None:
-    """Raise SolutionError where the solve failed, or its end explains too little."""
-    if end.solution.failed:
-        raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
-    points, curves = end.residuals.lengths
-    for name, camera in end.solution.estimate.cameras.items():
-        own = problem.sights.of_camera(name)
-        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
-        met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
-        met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
-        if 2 * met < len(own.point_rows) + len(own.curve_rows):
-            raise SolutionError(
-                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
-                "check labels, target dimensions and which lens it is"
-            )
 
 
 def all_shown(camera: Camera, sights: Sights) -> bool:
