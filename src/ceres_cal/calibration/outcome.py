@@ -45,9 +45,10 @@ _UNKNOWN = (
 _LOST = 1e3
 # Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
 _RESTING = 1.5
-USUAL = (
-    "camera {!r}: phi, and what goes with it, rests on what is usual of cameras, a principal point near the middle of "
-    "the image, square pixels and little decentring: without that its standard deviation is {}"
+RESTING = "rests on what is usual of cameras"
+_USUAL = (
+    f"camera {{!r}}: phi, and what goes with it, {RESTING}, a principal point near the middle of the image, square "
+    "pixels and little decentring: without that its standard deviation is {}"
 )
 
 
@@ -90,7 +91,7 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
             at = reduced.shared.columns([key])[0]
             sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
             if alone > _RESTING * sd:
-                yield USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
+                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
 
 
 def _share_text(share: float) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.words import counted, first_of, mm, sentence, short
+from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
@@ -122,7 +123,8 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     known = [conflict.words for conflict in calibration.conflicts]
     for text in calibration.warnings:
         if text not in known:
-            yield "" if text.endswith(COUNTED_ONCE) else "care", f"{sentence(text)}."
+            is_harmless = text.endswith(COUNTED_ONCE) or RESTING in text  # which is in every standard deviation
+            yield "" if is_harmless else "care", f"{sentence(text)}."
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:

@@ -289,7 +289,8 @@ def _angle_sds(rotation: Array, covariance: Array, sd: Array) -> Array:
         [(_angles_deg(rotation_exp(_TURN * axis) @ rotation) - _angles_deg(rotation)) / _TURN for axis in np.eye(3)], 1
     )
     slopes = (slopes + 180.0 / _TURN) % (360.0 / _TURN) - 180.0 / _TURN  # a turn past 180 degrees is a small one
-    spread = np.stack([np.einsum("ai,ij,aj->a", slopes * s, correlation, slopes * s) for s in sd.T], 1)
+    with np.errstate(invalid="ignore"):  # of what is unknown; an angle that does not depend on it is unknown, too
+        spread = np.stack([np.einsum("ai,ij,aj->a", slopes * s, correlation, slopes * s) for s in sd.T], 1)
     return np.where(np.isfinite(spread), np.sqrt(np.maximum(spread, 0.0)), np.inf)
 
 
