@@ -56,6 +56,6 @@ def test_lenses_are_timed_side_by_side(tmp_path: Path) -> None:
     command = [sys.executable, str(SCRIPT), "--lenses", "--frames", "20", "--repeat", "1", "--warm-up", "0"]
     printed = subprocess.run([*command, "--json", str(path)], capture_output=True, text=True, check=True).stdout
     (row,) = json.loads(path.read_text(encoding="utf-8"))["lenses"]
-    assert row["chosen"] == "brown k1 k2" and row["chosen"] in printed
+    assert row["chosen"] == "brown k1 k2 p1 p2" and row["chosen"] in printed
     assert row["spline_times"] == pytest.approx(row["spline"] / row["brown"])
     assert row["auto_adds"] == pytest.approx(100.0 * (row["auto"] / row["by_name"] - 1.0))

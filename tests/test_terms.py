@@ -137,7 +137,7 @@ def test_files_of_before_load(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(data))
     loaded = Calibration.load(tmp_path / "a.json")
     assert loaded.cameras == calibration.cameras
-    assert loaded.options == replace(calibration.options, free_aspect=False, free_skew=False)
+    assert loaded.options == replace(calibration.options, free_aspect=False)
 
 
 def test_the_command_line_takes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

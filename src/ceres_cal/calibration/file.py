@@ -174,5 +174,5 @@ def options_from_json(data: Mapping[str, Any]) -> Options:
     """The options that a file describes; InputError naming what is wrong."""
     entries = convert(data.get("priors", []), list[dict[str, Any]], "options.priors")
     priors = tuple(prior_from_json(entry, "options.priors") for entry in entries)
-    before = {"lens": "radial", "usual_camera": False, "free_aspect": False, "free_skew": False}  # as in older files
+    before = {"lens": "radial", "usual_camera": False, "free_aspect": False}  # as in older files
     return convert({**before, **data, "priors": priors}, Options, "options")

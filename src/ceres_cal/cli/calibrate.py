@@ -94,9 +94,7 @@ class CalibrateArguments(ReportArguments):
         default=None,
         group=_CAMERA,
     )
-    free_skew: bool | None = switch(
-        "the pixels' columns may lean against their rows as they like (default: hardly)", default=None, group=_CAMERA
-    )
+    free_skew: bool = switch("let the pixels' columns lean against their rows", group=_CAMERA)
     usual_camera: bool = switch(
         "nothing is taken for usual: no principal point near the middle, no little decentring; pixels are square",
         default=True,

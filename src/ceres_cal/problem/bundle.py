@@ -19,7 +19,6 @@ from ceres_cal.problem.charts import Chart, ChartedCost, chart_of
 from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
 from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.prior_cost import PriorCost
-from ceres_cal.problem.priors import USUAL_BENDS
 from ceres_cal.problem.problem import Problem, Weighting
 
 _AT_REST = 10  # iterations
@@ -235,8 +234,7 @@ def solve(
     for cost, arrays in assembly.costs:
         own = [charts.get(id(array)) for array in arrays]
         if arrays:
-            loss = pyceres.CauchyLoss(USUAL_BENDS) if getattr(cost, "is_usual", False) else None
-            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, loss, arrays)
+            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
     assembly.blocks.change(charts, Chart.moved)
     settings = _solver_options(problem, assembly, precision)
     settings.callbacks = [_Watcher(run, progress, precision)]

@@ -45,9 +45,9 @@ class Options:
             residuals ask for from there on (`calibration.lens_growing`).
         coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
-        free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free, with nothing known of them
-            (True), or held (False) at 1 and 0 or what `fixed` says. None: free under what is usual of cameras, and held
-            without that.
+        free_aspect: whether fy / fx is free, with nothing known of it (True), or held (False) at 1 or what `fixed`
+            says. None: free under what is usual of cameras, and held without that.
+        free_skew: whether the lean of the pixels' columns is free; else it is 0, or what `fixed` says.
         usual_camera: whether what is usual of cameras is taken to hold of numbers that nobody states: a principal point
             near the middle of its image, square pixels, little decentring (`priors.usual_cameras`), under
             distributions with heavy tails that give way to observations.
@@ -77,7 +77,7 @@ class Options:
     coefficients: tuple[str, ...] | None = None
     free_principal_point: bool = True
     free_aspect: bool | None = None
-    free_skew: bool | None = None
+    free_skew: bool = False
     terms: tuple[str, ...] = ()
     usual_camera: bool = True
     fixed: Mapping[str, float] = field(default_factory=dict)
@@ -285,9 +285,10 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     held = {*options.held, *options.blank_lens.set_at_start}
     if not options.free_principal_point:
         held |= {"cx", "cy"}
-    for name, free in (("aspect", options.free_aspect), ("skew", options.free_skew)):
-        if not (options.usual_camera if free is None else free):
-            held |= {name}
+    if not (options.usual_camera if options.free_aspect is None else options.free_aspect):
+        held |= {"aspect"}
+    if not options.free_skew:
+        held |= {"skew"}
     free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
     views = observations.shown_views
     return Layout(

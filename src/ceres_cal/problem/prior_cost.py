@@ -12,7 +12,9 @@ from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotatio
 from ceres_cal.problem.costs import CachedCost, CostValue, Run
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
-from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior
+
+_NEAR = 1e-6  # residuals that Cauchy's loss leaves as they are
 
 
 class _Linear(NamedTuple):
@@ -67,7 +69,7 @@ class PriorCost(CachedCost):
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
         super().__init__(run)
-        self.is_usual = prior.is_usual
+        self._is_usual = prior.is_usual
         self._root, self._mean = prior.information.root, prior.mean
         parts = dict(_parts(prior, estimate, layout))
         self._parts, self.owners = list(parts.values()), list(parts)
@@ -78,8 +80,21 @@ class PriorCost(CachedCost):
         off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
         for part, block in blocks:
             off[part.columns] += part.values(block)
-        slopes = [(self._root[:, part.columns] @ part.slopes(block)).reshape(-1) for part, block in blocks]
-        return CostValue(at, self._root @ off, slopes)
+        residuals = self._root @ off
+        root = self._root
+        if self._is_usual:
+            residuals, slope = _bent(residuals)
+            root = slope[:, None] * root
+        slopes = [(root[:, part.columns] @ part.slopes(block)).reshape(-1) for part, block in blocks]
+        return CostValue(at, residuals, slopes)
+
+
+def _bent(residuals: Array) -> tuple[Array, Array]:
+    """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
+    weight = 1.0 / (1.0 + (residuals / USUAL_BENDS) ** 2)
+    bent = USUAL_BENDS * np.sign(residuals) * np.sqrt(np.log1p((residuals / USUAL_BENDS) ** 2))
+    far = np.abs(residuals) > _NEAR
+    return bent, np.where(far, weight * residuals / np.where(far, bent, 1.0), 1.0)
 
 
 def _parts(

@@ -26,9 +26,9 @@ from ceres_cal.scene.lens import Lens
 USUAL_CENTRE = 0.015
 """Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the
 middle of pictures that were not cropped."""
-# Standard deviations of fy / fx about 1, of the lean of the pixels' columns, which lithography draws upright, and of
-# either decentring coefficient. Of the public cameras tried, fy / fx is up to 0.6 % off and p1 and p2 are up to 1e-3.
-_USUAL_ASPECT, _USUAL_SKEW, _USUAL_DECENTRING = 5e-4, 3e-5, 5e-4
+# Standard deviations of fy / fx about 1, and of either decentring coefficient. Of the public cameras tried, fy / fx is
+# up to 0.6 % off and p1 and p2 are up to 1e-3.
+_USUAL_ASPECT, _USUAL_DECENTRING = 5e-4, 5e-4
 # Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
 # that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
 USUAL_BENDS = 2.0
@@ -63,9 +63,11 @@ class GaussianPrior:
         return self.information.keys
 
     @property
-    def is_known(self) -> bool:
-        """Whether its numbers use up no observation: of what is usual, that pixels are square."""
-        return not self.is_usual or {key.quantity for key in self.keys} <= {"aspect", "skew"}
+    def known(self) -> int:
+        """How many numbers use up no observation for it: of what is usual, that pixels are square."""
+        if not self.is_usual:
+            return len(self.information.root)
+        return sum(key.quantity == "aspect" for key in self.keys)
 
     def given(self, keys: Collection[Key]) -> GaussianPrior:
         """What it says of those of its numbers that are among the keys, with all others held at their mean."""
@@ -93,20 +95,22 @@ class GaussianPrior:
         return np.asarray(self.information.root @ self.offsets(estimate))
 
     def weighted_at(self, estimate: Estimate) -> GaussianPrior:
-        """The normal distribution that pulls as much at an estimate: what is usual counts with Cauchy's weight."""
+        """The normal distribution that pulls as much at an estimate: what is usual counts with Cauchy's weights."""
         if not self.is_usual:
             return self
-        weight = 1.0 / (1.0 + float(np.sum(self.residuals(estimate) ** 2)) / USUAL_BENDS**2)
-        return self._times(weight)
+        return self._times(
+            1.0 / (1.0 + (self.offsets(estimate) / USUAL_BENDS) ** 2 * np.diagonal(self.information.matrix))
+        )
 
     def loosened(self, factor: float) -> GaussianPrior:
         """With standard deviations so many times as large, where it is usual: beside observations that are off by as
         much more than their noise.
         """
-        return self._times(factor**-2) if self.is_usual else self
+        return self._times(np.full(len(self.keys), factor**-2)) if self.is_usual else self
 
-    def _times(self, weight: float) -> GaussianPrior:
-        return replace(self, information=replace(self.information, matrix=weight * self.information.matrix))
+    def _times(self, weights: Array) -> GaussianPrior:
+        """Of numbers that are stated one by one."""
+        return replace(self, information=replace(self.information, matrix=weights[:, None] * self.information.matrix))
 
 
 def gather_priors(
@@ -162,20 +166,19 @@ def usual_cameras(
     """What is usual of cameras, but for what somebody stated or set free: a principal point near the middle of its
     image, square pixels, a lens that is little decentred.
     """
-    freed = {"aspect": options.free_aspect, "skew": options.free_skew}
     for name, size in observations.cameras.items():
         lens = lenses.get(name, options.blank_lens)
-        keys = {key.quantity: key for key in intrinsic_keys(name, lens) if key not in stated and not freed.get(key[2])}
+        keys = {key.quantity: key for key in intrinsic_keys(name, lens) if key not in stated}
         centre = 0.5 * (np.array(size, dtype=float) - 1.0)
-        for names, mean, sigma in (
-            (("cx", "cy"), centre, USUAL_CENTRE * float(np.hypot(*size))),
-            (("aspect",), np.ones(1), _USUAL_ASPECT),
-            (("skew",), np.zeros(1), _USUAL_SKEW),
-            (lens.tangential, np.zeros(len(lens.tangential)), _USUAL_DECENTRING),
-        ):
-            if names and keys.keys() >= set(names):
-                information = Information.of_sigmas(dict.fromkeys([keys[one] for one in names], sigma))
-                yield GaussianPrior(information, mean, is_usual=True)
+        off_centre = USUAL_CENTRE * float(np.hypot(*size))
+        usual = {"cx": (centre[0], off_centre), "cy": (centre[1], off_centre)}
+        usual |= {"aspect": (1.0, _USUAL_ASPECT)}
+        usual |= dict.fromkeys(lens.tangential, (0.0, _USUAL_DECENTRING))
+        usual.pop("aspect" if options.free_aspect else "", None)
+        about = {keys[quantity]: known for quantity, known in usual.items() if quantity in keys}
+        if about:
+            information = Information.of_sigmas({key: sigma for key, (_, sigma) in about.items()})
+            yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), is_usual=True)
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:

@@ -141,7 +141,7 @@ class Problem:
 
     def unknowns(self, estimate: Estimate) -> int:
         """Number of free numbers that use up observations: what is known beforehand does not."""
-        known = sum(len(prior.information.root) for prior in self.priors_of(estimate) if prior.is_known)
+        known = sum(prior.known for prior in self.priors_of(estimate))
         return max(self.layout.size + len(estimate.structure.values) - known, 0)
 
     def weighted(self, weighting: Weighting) -> Problem:

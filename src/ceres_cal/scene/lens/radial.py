@@ -140,11 +140,11 @@ class Radial(Lens):
             return invert_increasing(self._profile, ideal.ravel()).reshape(ideal.shape)
 
     def _distort(self, rays: Array, phi: float) -> Array:
-        flat = rays[:, :2] / ahead(rays)
-        radius = phi * np.hypot(flat[:, 0], flat[:, 1])
+        ideal = phi * rays[:, :2] / ahead(rays)
+        radius = np.hypot(ideal[:, 0], ideal[:, 1])
         shrink = np.where(radius > 0.0, self.measured_radius(radius) / radius, 1.0)
-        measured = phi * flat * shrink[:, None]
-        return measured + phi * self._decentring(flat) if self._across else measured
+        measured = np.asarray(ideal * shrink[:, None])
+        return measured + phi * self._decentring(ideal / phi) if self._across else measured
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
         ideal = self._ideal(offsets)
