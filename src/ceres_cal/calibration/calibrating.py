@@ -186,6 +186,7 @@ def _of_lens(
     start: Start, observations: Observations, sights: Sights, options: Options, watched: Watched
 ) -> Calibration:
     """With a lens that is named."""
+    options = options.with_first_power(len(sights))
     problem = problem_of(observations, sights, options, start.estimate)
     if options.closed_form_only:
         return of_closed_form(start, observations, problem)

@@ -29,6 +29,7 @@ PAPERS_POWERS = (2, 3)
 _OF_POWERS = "radial"  # the lens that powers stand for where none is named
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
 """The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
+_ENOUGH_VIEWS = 8  # that tell a skew beside a lens without a formula: no test decides there
 _LARGEST = 2**31 - 1  # whole number that Ceres counts with
 # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
 _SIGMAS = (1e-3, 1e9)
@@ -47,7 +48,8 @@ class Options:
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect: whether fy / fx is free, with nothing known of it (True), or held (False) at 1 or what `fixed`
             says. None: free under what is usual of cameras, and held without that.
-        free_skew: whether the lean of the pixels' columns is free; else it is 0, or what `fixed` says.
+        free_skew: whether the lean of the pixels' columns is free; else it is 0, or what `fixed` says. That of a
+            "spline" whose powers are open is free from eight views on.
         usual_camera: whether what is usual of cameras is taken to hold of numbers that nobody states: a principal point
             near the middle of its image, square pixels, little decentring (`priors.usual_cameras`), under
             distributions with heavy tails that give way to observations.
@@ -155,6 +157,14 @@ class Options:
         """The chosen lens with its fixed coefficients; the others are 0."""
         lens = self._unset
         return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names]) if self.fixed else lens
+
+    def with_first_power(self, views: int) -> Options:
+        """These options with a skew, which displaces by the first power, of a lens whose powers are left open, where so
+        many views tell it.
+        """
+        if self.powers or views < _ENOUGH_VIEWS or not self.usual_camera:
+            return self
+        return replace(self, free_skew="skew" not in self.fixed)
 
     @property
     def _unset(self) -> Lens:
