@@ -123,7 +123,7 @@ def scene_of(set_up: SetUp, rng: np.random.Generator) -> Scene:
     return join(*scenes)
 
 
-def outcome(set_up: SetUp, seed: int) -> Outcome:
+def outcome(set_up: SetUp, seed: int, most_seconds: float = MOST_SECONDS) -> Outcome:
     """Calibrate one; the same set-up and seed give the same."""
     rng = np.random.default_rng([seed, SET_UPS.index(set_up)])
     scene = scene_of(set_up, rng)
@@ -147,7 +147,7 @@ def outcome(set_up: SetUp, seed: int) -> Outcome:
         fault = fault or ("" if calibration is None else _fault(calibration, scene, priors))
     fault = fault or "".join(f"warned: {one.message}" for one in warned[:1])
     fault = fault or ("a refusal of several lines" if "\n" in refused else "")
-    fault = fault or (f"{seconds:.1f} s" if seconds > MOST_SECONDS else "")
+    fault = fault or (f"{seconds:.1f} s" if seconds > most_seconds else "")
     return Outcome(set_up, seed, seconds, refused, fault)
 
 
