@@ -47,6 +47,8 @@ _NOISE_PX = 0.3
 _PLACES = np.array([[x, y] for x in (-4.0, -2.0, 0.0, 2.0, 4.0) for y in (-2.8, -1.0, 1.0, 2.8)])
 _SIZE = (1280, 960)
 _FAR = 5.0  # standard deviations
+_Drawn = Callable[[np.random.Generator], tuple[float, Lens]]
+"""phi and a lens."""
 
 
 def _brown(rng: np.random.Generator) -> tuple[float, Lens]:
@@ -58,8 +60,7 @@ def _round(rng: np.random.Generator) -> tuple[float, Lens]:
     return 868.0 * rng.uniform(0.9, 1.1), Radial((-5.2e-5, 6.1e-7))
 
 
-def _scene(seed: int, lens: Callable[[np.random.Generator], tuple[float, Lens]], tilts_deg: tuple[float, ...],
-           middle_m: float = 0.0, boards: int = 0) -> Scene:  # fmt: skip
+def _scene(seed: int, lens: _Drawn, tilts_deg: tuple[float, ...], middle_m: float = 0.0, boards: int = 0) -> Scene:
     """A camera 4.2 m over a place of the field, once at each tilt, and boards before it."""
     rng = np.random.default_rng([seed, 34])
     phi, model = lens(rng)
@@ -179,10 +180,19 @@ def _is_accused(off: float, tilt_deg: float, seed: int) -> bool:
     return any(one.quantity == "height" for one in calibration.conflicts)
 
 
+_WRONG = (
+    (0.05, 12.0, 0.95, 1.0),
+    (0.05, 20.0, 0.95, 1.0),
+    (-0.2, 20.0, 0.95, 1.0),
+    (0.02, 20.0, 0.95, 1.0),
+    (0.0, 12.0, 0.0, 0.005),
+)
+"""By how much the height is wrong, the tilt, deg, and how often a contradiction may be named."""
+
+
 def heights(runs: int) -> Iterator[Row]:
     """How often a stated height is said to be contradicted."""
-    for off, tilt_deg, least, most in ((0.05, 12.0, 0.95, 1.0), (0.05, 20.0, 0.95, 1.0), (-0.2, 20.0, 0.95, 1.0),
-                                       (0.02, 20.0, 0.95, 1.0), (0.0, 12.0, 0.0, 0.005)):  # fmt: skip
+    for off, tilt_deg, least, most in _WRONG:
         share = float(np.mean(list(over(partial(_is_accused, off, tilt_deg), range(runs)))))
         name = f"a height {100.0 * off:g} % wrong, {tilt_deg:g} deg" if off else "a height that is right"
         yield Row(name, "contradiction named", share, share_error(share, runs), least, most)

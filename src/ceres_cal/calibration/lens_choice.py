@@ -160,9 +160,9 @@ class Comparison:
         placements = Poses.of(start.estimate.placements)
         placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
         others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # with a plainer lens so far
-        near = replace(start, estimate=replace(there, placements=placements), others=others)
-        near = replace(near, is_near=not form.blank.roughness)
-        return Chosen(form.of(self.seen.options), near, _choice(self), self)
+        near = replace(there, placements=placements)
+        start = replace(start, estimate=near, is_near=not form.blank.roughness, others=others)
+        return Chosen(form.of(self.seen.options), start, _choice(self), self)
 
     def instead(self, points: Mask, curves: Mask) -> Chosen | None:
         """See `Chosen.instead`; of very many observations some were compared, and the rest is not looked at. What

@@ -41,9 +41,9 @@ _UNKNOWN = (
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
 )
 # Sizes that move a pixel of the image's corner by half the diagonal: a lens in which so many are one standard deviation
-# is none. Of boards that fill a tenth of the picture it is a hundred.
+# is none. Where as many equations as numbers leave a coefficient to rounding it is thousands of times that.
 _LOST = 1e3
-# Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
+# Times the standard deviation of phi without what is usual of cameras: what rests on it is said.
 _RESTING = 1.5
 RESTING = "rests on what is usual of cameras"
 _USUAL = (

@@ -27,7 +27,7 @@ USUAL_CENTRE = 0.015
 """Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the
 middle of pictures that were not cropped."""
 # Standard deviations of fy / fx about 1, and of either decentring coefficient. Of the public cameras tried, fy / fx is
-# up to 0.6 % off and p1 and p2 are up to 1e-3.
+# up to 0.6 % off and p1 and p2 are up to 3e-3.
 _USUAL_ASPECT, _USUAL_DECENTRING = 5e-4, 5e-4
 # Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
 # that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
@@ -172,9 +172,9 @@ def usual_cameras(
         centre = 0.5 * (np.array(size, dtype=float) - 1.0)
         off_centre = USUAL_CENTRE * float(np.hypot(*size))
         usual = {"cx": (centre[0], off_centre), "cy": (centre[1], off_centre)}
-        usual |= {"aspect": (1.0, _USUAL_ASPECT)}
+        if not options.free_aspect:
+            usual["aspect"] = 1.0, _USUAL_ASPECT
         usual |= dict.fromkeys(lens.tangential, (0.0, _USUAL_DECENTRING))
-        usual.pop("aspect" if options.free_aspect else "", None)
         about = {keys[quantity]: known for quantity, known in usual.items() if quantity in keys}
         if about:
             information = Information.of_sigmas({key: sigma for key, (_, sigma) in about.items()})

@@ -148,6 +148,11 @@ class Problem:
         """The same with other weights."""
         return replace(self, weighting=weighting)
 
+    def rough(self, weighting: Weighting) -> Problem:
+        """The same with the weights of residuals that are more than noise, and what is usual known as much less."""
+        loose = tuple(prior.loosened(max(1.0, *weighting.scales)) for prior in self.priors)
+        return replace(self, priors=loose, weighting=weighting)
+
     def used(self, points: Mask, curves: Mask) -> Problem:
         """The problem of these rows of the observations alone."""
         return replace(self, sights=self.sights.used(points, curves))

@@ -192,9 +192,7 @@ class _RowRounds:
         # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
-        loose = tuple(prior.loosened(max(1.0, *visible.scales)) for prior in self._problem.priors)
-        problem = replace(self._problem, priors=loose, weighting=weighting, feet=there.feet)
-        problem = problem.used(visible.points, visible.curves)
+        problem = replace(self._problem.rough(weighting), feet=there.feet).used(visible.points, visible.curves)
         if not len(problem.sights):
             raise DegenerateError(
                 "the observations fix no pose that could show them: add points or lines of the targets"
@@ -221,9 +219,8 @@ class _RowRounds:
             if not _much_below(scales, self._scales):
                 break
             self._scales = scales
-            loose = tuple(prior.loosened(max(1.0, *scales)) for prior in self._problem.priors)
-            few = replace(few, priors=loose)
-            few = few.weighted(replace(few.weighting, point_scale=scales[0], curve_scale=scales[1]))
+            few = replace(few, priors=self._problem.priors)
+            few = few.rough(replace(few.weighting, point_scale=scales[0], curve_scale=scales[1]))
             estimate, *_ = without_mirrored_poses(few, solution.estimate, frozenset(few.sights.keys))
             solution = solve(few, estimate, self._progress, precision=self._rough_end, is_near=False)
         return solution
