@@ -233,10 +233,9 @@ def _sections(detections: FieldDetections, merged: dict[str, Any] | None, output
     points, curves = len(observations.points), len(observations.curves)
     every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
     lengths = {prior.quantity: prior.value[0] for prior in observations.priors if prior.dimension}
-    stretched = any(_stretched(one.camera) for one in detections.found.values())
     seen = f"{len(images)} of {every} images show the field"
     first = f"{seen}: {plural(curves, 'line observation')}, {plural(points, 'corner')} and crossings"
-    yield Section("", [first], {"points": points, "curves": curves, "found": images, "stretched": stretched})
+    yield Section("", [first], {"points": points, "curves": curves, "found": images})
     said = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
     rough = [f"lengths, roughly, for `calibrate` to solve for: {said} m"] if lengths else []
     yield Section("", rough, {"lengths_m": lengths})
@@ -285,8 +284,8 @@ def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:
     for one in images:
         if "aspect" in one:
             yield (
-                f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: was the picture "
-                "stretched? Give the original, or let it be solved for (`calibrate --free-aspect`)"
+                f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: if the picture was "
+                "stretched, the original is better"
             )
     yield from (f"{one['image']}: {words}" for one in images for words in one["not_as_drawn"])
     yield from (f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in images if one["lacking"])

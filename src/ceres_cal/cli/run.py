@@ -160,10 +160,9 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
 
 def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step:
     observations = [data["output"] for data in detected]
-    stretched = ["--free-aspect"] if any(data.get("stretched") for data in detected) else []
     priors = [word for prior in args.prior for word in ("--prior", prior)]
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    asked = [*observations, "--lens", args.lens, *stretched, *priors, *goal]
+    asked = [*observations, "--lens", args.lens, *priors, *goal]
     return _step(args, "calibrate", asked, titles=_SHOWN)
 
 

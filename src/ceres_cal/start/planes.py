@@ -100,8 +100,8 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
 
 def _usual_height(sight: Sights, level: Mask) -> float:
     """z at which most of the places and level curves lie, each counted once: 0 where there are none."""
-    places = np.unique(sight.points.round(9), axis=0)[:, 2]
-    tracks = np.unique(sight.track_index[level[sight.track_index]])
+    places = distinct(sight.points.round(9), axis=0)[:, 2]
+    tracks = distinct(sight.track_index[level[sight.track_index]])
     heights, votes = np.unique(np.append(places, sight.tracks[tracks, 0, 2].round(9)), return_counts=True)
     return float(heights[np.argmax(votes)]) if len(heights) else 0.0
 

@@ -291,9 +291,8 @@ class _Tracker:
             if lens.set_at_start:
                 continue  # a few lines do not tell a lens without a formula
             try:
-                powers, stretched = (lens.trial_powers or ((),))[-1], followed.camera.aspect != 1.0
-                options = Options(lens=kind, powers=powers, priors=known, free_aspect=stretched)
-                calibration = calibrate(observations, options)
+                powers = (lens.trial_powers or ((),))[-1]
+                calibration = calibrate(observations, Options(lens=kind, powers=powers, priors=known))
             except CalibrationError:
                 # quiet: a lens of several that does not fit these lines; where none does, they are judged as found
                 continue
