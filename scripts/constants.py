@@ -106,7 +106,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("start.closed_forms", "_WRONG", "calibrate"),
     *_of("start.world", "_HOLDS _SCALES _ROUGH _LEFT_OVER _TOLD _OPEN _ALIKE _APART", "calibrate"),
     *_of("posterior.assess", "_BENT", "verdicts"),
-    *_of("effects.between", "_LEAST_LEFT", "verdicts"),
+    *_of("effects.groups", "_LEAST_LEFT", "verdicts"),
     *_of("posterior.profile", "_FAR _BOUNDED _SHRINKING", "verdicts"),
     *_of("posterior.weak", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
     *_of("diagnostics.advice.ranking", "_MUST_LEAVE _LARGER _LESS", "advice"),
