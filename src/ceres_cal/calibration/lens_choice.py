@@ -8,7 +8,7 @@ lens predict the others no better: a criterion that counts observations would ta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -200,12 +200,24 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
     observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
+    by_themselves = replace(by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start)))
     try:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate)
         return _among(seen, share, as_good, start, kinds).outcome
     except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
         failed = "" if isinstance(error, FewGroupsError) else str(error)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
+
+
+def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:
+    """That phi is about what the start guessed, where the observations left it open and nobody stated it: along that
+    valley normal equations would lead from one lens to another through cameras that are none.
+    """
+    stated = {prior.name for prior in (*observations.priors, *options.priors) if prior.quantity == "phi"}
+    for name, phi_from in start.phi_from.items():
+        if phi_from == "guess" and name not in stated and "phi" not in options.held:
+            phi = start.estimate.cameras[name].phi
+            yield Prior("camera", name, "phi", (phi,), (_VAGUE_SHARE * phi,))
 
 
 def _loosely(prior: Prior) -> Prior:

@@ -163,9 +163,11 @@ def last_resort(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:
     """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together.
 
     Not of so few placements that their features are held out one by one: what goes together within each would be
-    predicted, too. Nor of one view of a floor: a line that is painted aside bends there as by a lens.
+    predicted, too. Nor where some camera has one view, of a floor: a line that is painted aside bends there as by a
+    lens.
     """
-    if len(seen.sights) > 1 and not seen.splits_placements and _between_cells(seen, chosen.of) > _TOGETHER:
+    views = [len(seen.sights.of_camera(name)) for name in seen.sights.cameras]
+    if min(views) > 1 and not seen.splits_placements and _between_cells(seen, chosen.of) > _TOGETHER:
         for forms in without_formula():
             yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
 

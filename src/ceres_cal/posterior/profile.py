@@ -201,7 +201,7 @@ def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> N
     if known is None:
         return None
     there = solution.estimate
-    stated = float(sum(np.sum(prior.residuals(there) ** 2) for prior in held.stated_at(there)))
+    stated = sum(prior.cost(there) for prior in held.stated_at(there))
     cost = (2.0 * solution.cost - stated) / inflation + stated + _cost_of_phi(camera, problem, there)
     return Node(there, cost, known)
 
@@ -209,7 +209,7 @@ def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> N
 def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
     """What priors on phi alone add to twice the cost: a solve that holds phi leaves them out."""
     own = [prior for prior in problem.priors if [key[:3] for key in prior.keys] == [("camera", camera, "phi")]]
-    return float(sum(np.sum(prior.residuals(estimate) ** 2) for prior in own))
+    return sum(prior.cost(estimate) for prior in own)
 
 
 def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float) -> Iterator[Node]:

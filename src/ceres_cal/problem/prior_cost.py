@@ -12,7 +12,7 @@ from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotatio
 from ceres_cal.problem.costs import CachedCost, CostValue, Run
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
-from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior
+from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, logarithmic
 
 _NEAR = 1e-6  # residuals that Cauchy's loss leaves as they are
 
@@ -69,7 +69,7 @@ class PriorCost(CachedCost):
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
         super().__init__(run)
-        self._is_usual = prior.is_usual
+        self._is_usual, self._is_log = prior.is_usual, prior.is_log
         self._root, self._mean = prior.information.root, prior.mean
         parts = dict(_parts(prior, estimate, layout))
         self._parts, self.owners = list(parts.values()), list(parts)
@@ -80,8 +80,11 @@ class PriorCost(CachedCost):
         off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
         for part, block in blocks:
             off[part.columns] += part.values(block)
-        residuals = self._root @ off
         root = self._root
+        if self._is_log:
+            off, slope = logarithmic(off, self._mean)
+            root = root * slope
+        residuals = self._root @ off
         if self._is_usual:
             residuals, slope = _bent(residuals)
             root = slope[:, None] * root

@@ -32,6 +32,11 @@ _USUAL_ASPECT, _USUAL_DECENTRING = 5e-4, 5e-4
 # Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
 # that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
 USUAL_BENDS = 2.0
+_LEAST_RATIO = 1e-6  # of a number to its mean: a step of the solver may pass 0
+ANY_PHI = 1.1, 0.8
+"""phi in half image diagonals, and the standard deviation of its logarithm: fisheyes of 0.3 and lenses of cranes and
+stands, five half diagonals, are within two of it. Without it a view from straight above, which tells phi over height
+alone, let solves run away along their valley, to cameras that are none."""
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
 
 
@@ -44,12 +49,14 @@ class GaussianPrior:
         rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
         is_usual: whether nobody stated it: it is what is usual of cameras, under a distribution with heavy tails, which
             gives way to observations that say otherwise.
+        is_log: whether the logarithms of its numbers are normal: offsets are mean log(x / mean).
     """
 
     information: Information
     mean: Array
     rotations: Mapping[str, Array] = field(default_factory=dict)
     is_usual: bool = False
+    is_log: bool = False
 
     @classmethod
     def about(cls, information: Information, estimate: Estimate) -> GaussianPrior:
@@ -88,19 +95,28 @@ class GaussianPrior:
             for key, angle in zip(pose_keys("station", name)[3:], turn.tolist(), strict=True):
                 if key in self.keys:
                     off[self.information.columns([key])] = angle
-        return off
+        return logarithmic(off, self.mean)[0] if self.is_log else off
 
     def residuals(self, estimate: Estimate) -> Array:
         """(R,) root (x - mean), in standard deviations."""
         return np.asarray(self.information.root @ self.offsets(estimate))
 
+    def cost(self, estimate: Estimate) -> float:
+        """Twice what it adds to the cost: squares of its residuals, Cauchy's loss of what is usual."""
+        squares = self.residuals(estimate) ** 2
+        return float(np.sum(USUAL_BENDS**2 * np.log1p(squares / USUAL_BENDS**2) if self.is_usual else squares))
+
     def weighted_at(self, estimate: Estimate) -> GaussianPrior:
         """The normal distribution that pulls as much at an estimate: what is usual counts with Cauchy's weights."""
         if not self.is_usual:
             return self
-        return self._times(
-            1.0 / (1.0 + (self.offsets(estimate) / USUAL_BENDS) ** 2 * np.diagonal(self.information.matrix))
-        )
+        off = self.offsets(estimate)
+        weights = 1.0 / (1.0 + (off / USUAL_BENDS) ** 2 * np.diagonal(self.information.matrix))
+        if not self.is_log:
+            return self._times(weights)
+        here = values_of(estimate, self.keys)
+        slope = logarithmic(here - self.mean, self.mean)[1]
+        return replace(self._times(weights * slope**2), mean=here - off / slope, is_log=False)
 
     def loosened(self, factor: float) -> GaussianPrior:
         """With standard deviations so many times as large, where it is usual: beside observations that are off by as
@@ -111,6 +127,12 @@ class GaussianPrior:
     def _times(self, weights: Array) -> GaussianPrior:
         """Of numbers that are stated one by one."""
         return replace(self, information=replace(self.information, matrix=weights[:, None] * self.information.matrix))
+
+
+def logarithmic(off: Array, mean: Array) -> tuple[Array, Array]:
+    """(K,) mean log(x / mean) of numbers x that are `off` the mean, and its derivative by x; far below 0 of x <= 0."""
+    ratio = np.maximum(1.0 + off / mean, _LEAST_RATIO)
+    return mean * np.log(ratio), 1.0 / ratio
 
 
 def gather_priors(
@@ -164,7 +186,7 @@ def usual_cameras(
     observations: Observations, options: Options, stated: Collection[Key], lenses: Mapping[str, Lens]
 ) -> Iterator[GaussianPrior]:
     """What is usual of cameras, but for what somebody stated or set free: a principal point near the middle of its
-    image, square pixels, a lens that is little decentred.
+    image, square pixels, a lens that is little decentred, a phi of lenses that people have.
     """
     for name, size in observations.cameras.items():
         lens = lenses.get(name, options.blank_lens)
@@ -179,6 +201,10 @@ def usual_cameras(
         if about:
             information = Information.of_sigmas({key: sigma for key, (_, sigma) in about.items()})
             yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), is_usual=True)
+        if "phi" in keys:
+            phi = ANY_PHI[0] * 0.5 * float(np.hypot(*size))
+            information = Information.of_sigmas({keys["phi"]: ANY_PHI[1] * phi})
+            yield GaussianPrior(information, np.array([phi]), is_usual=True, is_log=True)
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:

@@ -18,6 +18,7 @@ from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, Options, Station, anchored_stations, unit_px
+from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
@@ -34,9 +35,6 @@ _MARGIN = 1.15  # of what a start takes for the edge of the picture: its profile
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 _RADII = np.linspace(0.02, 1.0, 50)  # of the observed ones, at which lenses are compared
-_ANY_PHI = (
-    0.8  # standard deviation of log phi for a search: lenses of cranes and stands, five half diagonals, are within two
-)
 _LEAST_SD = 1e-3  # of phi, as a share: a start is no better
 _GRAZING = 0.02  # cosine of the angle at which a ray has no ideal radius any more
 
@@ -185,7 +183,7 @@ def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> 
     for prior in priors:
         if prior.quantity == "phi":
             return float(np.log(prior.value[0])), max(prior.sigma[0] / prior.value[0], _LEAST_SD)
-    return float(np.log(USUAL_PHI * unit)), _ANY_PHI
+    return float(np.log(ANY_PHI[0] * unit)), ANY_PHI[1]
 
 
 def _with_lens(blank: Camera, sights: Sights, profile: RadialProfile, phi: float, options: Options) -> Camera:
