@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.labels import mended, renamings
+from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
@@ -39,6 +39,8 @@ def renamed(observations: Observations, kind: str, names: dict[str, str]) -> Obs
         ("curve", "HalfwayLine", "CenterLine"),
         ("curve", "BottomTouchLine", "RightGoalLine"),
         ("point", "CenterMark", "TopRightCorner"),
+        ("curve", "LeftFieldRightPenaltyStretch", "RightFieldLeftPenaltyStretch"),  # on one line
+        ("curve", "LeftFieldLeftPenaltyStretch", "RightFieldLeftPenaltyStretch"),  # each taken out as a whole
     ],
 )
 def test_exchanged_names_are_found_and_mended(right: Observations, kind: str, first: str, second: str) -> None:
