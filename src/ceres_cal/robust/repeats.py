@@ -20,6 +20,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.words import two_digits
+from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.evidence import RandomEffects, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
 from ceres_cal.observations import Observations
@@ -82,8 +83,10 @@ def estimate_as_built(
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
         return (), as_stated
-    screened = _StructureColumns.of(structure, stated, observations, end, _some(end.problem.sights, _MOST_SCREENED))
-    scores = screened.by_sight(screened.score)
+    sights = _some(end.problem.sights, _MOST_SCREENED)
+    equations, weights = _equations(stated, observations, end, sights)
+    residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
+    scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
     loud = {of: numbers for of, numbers in kinds.items() if agreement(scores[:, numbers]) > _REPEATS}
     if not loud:
         return (), as_stated
@@ -109,57 +112,24 @@ def _some(sights: Sights, most: int) -> Sights:
 # ---- columns of the structure ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _StructureColumns:
-    """Columns of the Q structure numbers over E equations, each of which has BUILT at most.
+def _equations(
+    stated: Structure, observations: Observations, end: RobustSolution, sights: Sights
+) -> tuple[Equations, Weights]:
+    """Of some sights, with the residuals to the drawing, offsets that were found before taken off."""
+    estimate = end.solution.estimate
+    equations = equations_of(observations, sights, estimate, end.residuals)
+    stated_alone = stated.carrying(estimate.structure)
+    before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
+    solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
+    weights = _weights(observations, end, equations)
+    return replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1)), weights
 
-    Attributes:
-        slots: (E, BUILT) which numbers, Q for none. values: (E, BUILT) of them, in standard deviations. size: Q.
-        sight: (E,) of the equation; sights: how many there are. score: (E,) robust residuals, in standard deviations.
-    """
 
-    slots: Indices
-    values: Array
-    size: int
-    sight: Indices
-    sights: int
-    score: Array
-    equations: Equations
-
-    @classmethod
-    def of(
-        cls, structure: Structure, stated: Structure, observations: Observations, end: RobustSolution, sights: Sights
-    ) -> _StructureColumns:
-        """Of some sights; the residuals are those to the drawing, offsets that were found before taken off."""
-        estimate = end.solution.estimate
-        equations = equations_of(observations, sights, estimate, end.residuals)
-        weights = _weights(observations, end, equations)
-        stated_alone = stated.carrying(estimate.structure)
-        before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
-        solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
-        equations = replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1))
-        slots, scale = equations.slots(structure), weights.inverse_sigma * weights.used
-        values = np.where(slots >= 0, equations.built * scale[:, None], 0.0)
-        score = weights.robust * scale * equations.residual
-        size = len(structure.names)
-        slots = np.where(slots >= 0, slots, size)
-        return cls(slots, values, size, equations.sight, len(sights), score, equations)
-
-    def gathered(self, factors: Array, owner: Indices, owners: int) -> Array:
-        """(owners, Q) sums of the values times factors (E,) or (E, BUILT), by number and owner (E,)."""
-        products = self.values * (factors if factors.ndim == 2 else factors[:, None])
-        key = owner[:, None] * (self.size + 1) + self.slots
-        sums = np.bincount(key.ravel(), products.ravel(), minlength=owners * (self.size + 1))
-        return np.asarray(sums.reshape(owners, -1)[:, :-1])
-
-    def by_sight(self, factors: Array) -> Array:
-        """(S, Q) the same by sight."""
-        return self.gathered(factors, self.sight, self.sights)
-
-    def products(self) -> Array:
-        """(Q, Q) X^T X."""
-        every = [self.gathered(self.values[:, k], self.slots[:, k], self.size + 1) for k in range(self.slots.shape[1])]
-        return np.asarray(np.sum(every, axis=0)[:-1])
+def _columns(structure: Structure, equations: Equations, weights: Weights) -> SparseColumns:
+    """Of the structure's numbers."""
+    slots, scale = equations.slots(structure), weights.inverse_sigma * weights.used
+    values = np.where(slots >= 0, equations.built * scale[:, None], 0.0)
+    return SparseColumns(np.where(slots >= 0, slots, len(structure.names)), values, len(structure.names))
 
 
 def _weights(observations: Observations, end: RobustSolution, equations: Equations) -> Weights:
@@ -193,24 +163,21 @@ class _StructureEvidence:
         cls, structure: Structure, stated: Structure, observations: Observations, end: RobustSolution
     ) -> _StructureEvidence:
         """At the end of all rounds."""
-        columns = _StructureColumns.of(structure, stated, observations, end, _some(end.problem.sights, _MOST_SIGHTS))
-        model = _drawn(columns, stated, observations, end)
-        left, here = model.left_over, np.zeros(len(model.left_over), dtype=np.int64)
-        private = np.array([columns.by_sight(column) for column in model.private.T])
-        shared = np.array([columns.gathered(column, here, 1)[0] for column in model.shared.T])
-        taken = private.reshape(-1, columns.size)
-        score = columns.gathered(left, here, 1)[0]
-        information = columns.products() - taken.T @ taken - shared.T @ shared
+        sights = _some(end.problem.sights, _MOST_SIGHTS)
+        equations, weights = _equations(stated, observations, end, sights)
+        columns, model = _columns(structure, equations, weights), _drawn(equations, weights, stated, end)
+        information, score = columns.left_of(model)
         ridge = _DETERMINED * float(np.max(np.diagonal(information))) * np.eye(columns.size)
         inverse = np.linalg.inv(information + ridge)
-        left = left - _placed(model, np.sum(columns.values * np.append(inverse @ score, 0.0)[columns.slots], axis=1))
+        left = model.left_over - _placed(model, columns.at(inverse @ score))
         spare = model.spare - float(np.sum(inverse * information))
         least = spare * (_LEAST_PX * median(model.weight)) ** 2
+        taken, alone = np.sum(columns.in_private(model) ** 2, axis=0), (equations.sight, len(sights))
         return cls(
             score,
             information,
-            columns.by_sight(left),
-            columns.by_sight(columns.values) - np.sum(private**2, axis=0),
+            columns.gathered(left, *alone),
+            columns.gathered(columns.values, *alone) - taken,
             max(float(left @ left), least),
             spare,
         )
@@ -253,13 +220,10 @@ def _placed(model: Linearised, column: Array) -> Array:
     return np.asarray(rest - model.shared @ (model.shared.T @ rest))
 
 
-def _drawn(
-    columns: _StructureColumns, stated: Structure, observations: Observations, end: RobustSolution
-) -> Linearised:
+def _drawn(equations: Equations, weights: Weights, stated: Structure, end: RobustSolution) -> Linearised:
     """The linear model of the targets as drawn, smooth displacements of the image free besides."""
-    equations, estimate = columns.equations, replace(end.solution.estimate, structure=stated)
+    estimate = replace(end.solution.estimate, structure=stated)
     problem = end.problem.of_sights(np.flatnonzero([key in equations.sights.keys for key in end.problem.sights.keys]))
-    weights = _weights(observations, end, equations)
     model = make_linear_model(problem, estimate, equations, weights)
     return model.with_columns(np.column_stack(list(_of_image(equations, estimate))))
 
