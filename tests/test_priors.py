@@ -192,7 +192,8 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
 def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
     """Not where it is stated, held back by the options, or known by an earlier calibration."""
     seen, structure, options = observed(), estimated().structure, replace(RADIAL, usual_camera=True)
-    (usual,) = (one for one in gather_priors(seen, options, structure) if one.is_usual)
+    usual, phi = (one for one in gather_priors(seen, options, structure) if one.is_usual)
+    assert [key.quantity for key in phi.keys] == ["phi"] and phi.is_log
     assert [key.quantity for key in usual.keys] == ["cx", "cy", "aspect"]
     assert usual.mean[:2] == pytest.approx(0.5 * (np.array(next(iter(seen.cameras.values()))) - 1.0))
     name = next(iter(seen.cameras))
@@ -200,7 +201,7 @@ def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
     carried = gather_priors(seen, options, structure, GaussianPrior(usual.information, usual.mean))
     for priors in (gather_priors(seen, RADIAL, structure), carried):
         assert not any(one.is_usual for one in priors)
-    (beside,) = (one for one in gather_priors(seen, stated, structure) if one.is_usual)
+    beside, _ = (one for one in gather_priors(seen, stated, structure) if one.is_usual)
     assert [key.quantity for key in beside.keys] == ["cy", "aspect"]
 
 
@@ -209,7 +210,26 @@ def test_every_lens_is_little_decentred_as_is_usual(lens: str) -> None:
     options = Options(lens=lens, terms=("tangential",) if "tangential" in LENSES[lens].more_terms else ())
     priors = gather_priors(observed(), options, estimated().structure)
     names = {key.quantity for one in priors if one.is_usual for key in one.keys}
-    assert names == {"cx", "cy", "aspect", *options.blank_lens.tangential}
+    assert names == {"phi", "cx", "cy", "aspect", *options.blank_lens.tangential}
+
+
+@given(st.floats(0.05, 20.0))
+def test_the_usual_phi_pulls_as_its_cost_rises(ratio: float) -> None:
+    """The normal distribution in its place has the cost's own derivative, for lenses of any phi."""
+    seen, estimate = observed(), estimated()
+    every = gather_priors(seen, replace(RADIAL, usual_camera=True), estimate.structure)
+    prior = next(one for one in every if one.is_log)
+    (name,), mean = seen.cameras, float(prior.mean[0])
+
+    def at(phi: float) -> Estimate:
+        return replace(estimate, cameras={name: replace(estimate.cameras[name], phi=phi)})
+
+    phi, step = ratio * mean, 1e-4 * ratio * mean
+    slope = (prior.cost(at(phi + step)) - prior.cost(at(phi - step))) / (2.0 * step)
+    local = prior.weighted_at(at(phi))
+    pull = 2.0 * float(local.information.matrix[0, 0] * local.offsets(at(phi))[0])
+    assert pull == pytest.approx(slope, rel=1e-5, abs=1e-9)
+    assert prior.cost(at(phi)) == pytest.approx(prior.cost(at(mean**2 / phi)))  # as far above as below
 
 
 @given(st.floats(0.0, 1e4))

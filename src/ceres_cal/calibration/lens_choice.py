@@ -200,7 +200,9 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
     observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
-    by_themselves = replace(by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start)))
+    by_themselves = replace(
+        by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start))
+    )
     try:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate)
         return _among(seen, share, as_good, start, kinds).outcome

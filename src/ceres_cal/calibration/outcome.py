@@ -47,8 +47,8 @@ _LOST = 1e3
 _RESTING = 1.5
 RESTING = "rests on what is usual of cameras"
 _USUAL = (
-    f"camera {{!r}}: phi, and what goes with it, {RESTING}, a principal point near the middle of the image, square "
-    "pixels and little decentring: without that its standard deviation is {}"
+    f"camera {{!r}}: phi, and what goes with it, {RESTING}, a usual phi, a principal point near the middle of the "
+    "image, square pixels and little decentring: without that its standard deviation is {}"
 )
 
 

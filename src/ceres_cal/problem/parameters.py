@@ -51,8 +51,8 @@ class Options:
         free_skew: whether the lean of the pixels' columns is free; else it is 0, or what `fixed` says. That of a
             "spline" whose powers are open is free from eight views on.
         usual_camera: whether what is usual of cameras is taken to hold of numbers that nobody states: a principal point
-            near the middle of its image, square pixels, little decentring (`priors.usual_cameras`), under
-            distributions with heavy tails that give way to observations.
+            near the middle of its image, square pixels, little decentring, a phi that lenses have
+            (`priors.usual_cameras`), under distributions with heavy tails that give way to observations.
         terms: of the lens, besides those that it always has: names of its `more_terms`.
         fixed: numbers held, by name: phi, aspect, cx, cy (px), skew and the lens's coefficients in the units of the
             files.
