@@ -481,14 +481,14 @@ def test_warns_where_phi_is_unknown(say: Say, tmp_path: Path) -> None:
     said = say("calibrate", frontal(tmp_path))
     assert said.code == 0
     for words in (
-        "px, unknown: anything (",
-        "m, unknown: anything\n",
+        " px, unknown: below ",
+        " m, unknown: below ",
         "mm on the floor",
         "unknown at 150 mm",
         "warning   ",
     ):
         assert words in said.out, words
-    assert "too frontal to tell phi, which is anything at 95 %" in " ".join(said.out.split())
+    assert "too frontal to tell phi, which is below " in " ".join(said.out.split())
     held = say("calibrate", tmp_path / "frontal.json", "--prior", "height_m=4:0.01")
     assert "warning" not in held.out and "weak" not in held.out and "unknown" not in held.out
 
@@ -496,7 +496,7 @@ def test_warns_where_phi_is_unknown(say: Say, tmp_path: Path) -> None:
 def test_unknown_is_null_for_scripts(say: Say, tmp_path: Path) -> None:
     data = json.loads(say("calibrate", frontal(tmp_path), "--json").out)["uncertainty"]
     phi = data["numbers"][0]
-    assert (phi["verdict"], phi["low"], phi["high"], phi["sd"]) == ("unknown", 0.0, None, None)
+    assert (phi["verdict"], phi["low"]) == ("unknown", 0.0) and phi["high"] > 3000.0  # 5382 px measured
     assert data["maps"]["overhead"][1]["worst_sd_mm"] is None
 
 

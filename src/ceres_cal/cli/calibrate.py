@@ -96,7 +96,8 @@ class CalibrateArguments(ReportArguments):
     )
     free_skew: bool = switch("let the pixels' columns lean against their rows", group=_CAMERA)
     usual_camera: bool = switch(
-        "nothing is assumed to be usual: no phi, no principal point near the middle, no little decentring; pixels are square",
+        "nothing is assumed to be usual: no phi, no principal point near the middle, no little decentring; "
+        "pixels are square",
         default=True,
         flags=("--no-usual-camera",),
         group=_CAMERA,
