@@ -98,6 +98,7 @@ def test_help_lists_every_command(say: Say) -> None:
     assert set(COMMANDS) == {*written} and len(written) == len(COMMANDS)
     assert set(COMMANDS) == {
         "run",
+        "open",
         "detect board",
         "detect rings",
         "detect field",
