@@ -18,7 +18,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.effects.evidence import RandomEffects
-from ceres_cal.effects.offsets import Offsets, fault_of
+from ceres_cal.effects.offsets import Offsets
+from ceres_cal.effects.priors import VIEW_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key
@@ -255,7 +256,7 @@ def offsets(values: Array) -> Offsets:
     size = np.full(len(values), 20.0)
     effects = RandomEffects(size, values, np.eye(len(values)), 200.0, 200 + len(values))
     modes = np.sqrt(20.0) * np.eye(len(values))[:, :, None]
-    return Offsets(effects, modes, fault_of(features=False))
+    return Offsets(effects, modes, VIEW_ASIDE)
 
 
 @pytest.mark.parametrize(("scatter", "is_wrong"), [(1.0, True), (5.0, False), (25.0, False)])

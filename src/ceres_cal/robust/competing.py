@@ -20,7 +20,8 @@ from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.offsets import Offsets, fault_of, measure_offsets
+from ceres_cal.effects.offsets import Offsets, measure_offsets
+from ceres_cal.effects.priors import FEATURE_ASIDE, VIEW_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.equations import write_equations
@@ -256,7 +257,7 @@ class _Competition:
         none, each = offsets.log_evidence(), offsets.log_evidence_with_each()
         first = int(np.argmax(each))
         for number in np.argsort(-each)[:2]:
-            if each[number] - none > _SUSPECT + np.log(offsets.fault.probability):
+            if each[number] - none > _SUSPECT + np.log(1.0 - offsets.prior.absent):
                 yield (int(chosen[number]),)
         both = offsets.log_evidence_with_each((first,))
         second = int(np.argmax(both))
@@ -340,9 +341,9 @@ class _Competition:
             model = make_linear_model(problem, end.solution.estimate, equations, replace(weights, used=agreeing))
         if len(chosen) < 2:
             return chosen, None
-        fault = fault_of(wholes.of_features)
-        fault = replace(fault, probability=share * fault.probability)  # that it is one of those that are looked at
-        return chosen, measure_offsets(model, columns, group, fault)
+        prior = FEATURE_ASIDE if wholes.of_features else VIEW_ASIDE
+        prior = replace(prior, absent=1.0 - share * (1.0 - prior.absent))  # that it is one of those that are looked at
+        return chosen, measure_offsets(model, columns, group, prior)
 
 
 def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:
