@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.effects.columns import EffectSums, SparseColumns, grouped
+from ceres_cal.effects.columns import EffectColumns, EffectSums, SparseColumns, grouped
 from ceres_cal.effects.effect import Case
 from ceres_cal.effects.evidence import RandomEffects, agreement, likeliest_sizes, logsum
 from ceres_cal.effects.likelihood import likelihoods
@@ -174,7 +174,8 @@ def test_a_line_aside(seen: Seen) -> None:
     model, equations = seen.model, seen.model.equations
     _, group = grouped(equations.view * 100 + equations.feature, equations.is_curve)
     few = np.where(group < 5, group, -1)
-    offsets = measure_offsets(model, np.ones((len(equations), 1)), few, FEATURE_ASIDE)
+    columns = EffectColumns("feature aside", np.ones((len(equations), 1)), few, tuple("abcde"))
+    offsets = measure_offsets(model, columns, FEATURE_ASIDE)
     lines = (few[:, None] == np.arange(5)).astype(float)
 
     def log(wrong: Array, sizes: tuple[float, ...]) -> float:

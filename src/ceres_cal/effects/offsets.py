@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.effects.columns import SparseColumns
+from ceres_cal.base.arrays import Array, median
+from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.evidence import RandomEffects, logsum
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.priors import OFFSETS_SCATTER, SizePrior
@@ -66,13 +66,14 @@ class Offsets:
         return np.asarray(total + count * np.log((1.0 - self.prior.absent) / len(self.modes)))
 
 
-def measure_offsets(model: Linearised, columns: Array, group: Indices, prior: SizePrior) -> Offsets:
+def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) -> Offsets:
     """What a model's residuals say of offsets.
 
     Args:
-        columns: (E, M) of the modes, in standard deviations, of order one. group: (E,) of each equation, -1 in none.
-        prior: of a group that does not belong.
+        effect: its columns, here in standard deviations of an equation, of order one. prior: of a group that does not
+            belong.
     """
+    columns, group = effect.columns, effect.group
     groups, width = int(group.max()) + 1, columns.shape[1]
     rows = np.flatnonzero((group >= 0) & model.used)
     every = SparseColumns.of_groups(model, columns, group, groups)
