@@ -31,7 +31,7 @@ import numpy as np
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words
-from ceres_cal.effects.evidence import SizePrior
+from ceres_cal.effects.priors import SizePrior
 
 
 class Sway(Effect):

@@ -40,10 +40,10 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
+from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
 from ceres_cal.robust.usable import require_possible, require_usable
-from ceres_cal.robust.wholes import Subproblem
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.amounts import Amount
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
+from ceres_cal.effects.priors import SizePrior
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import Equations, plane_shift, whole_structure

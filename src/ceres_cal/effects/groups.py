@@ -28,6 +28,7 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
+from ceres_cal.effects.priors import DEPENDENCE
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
@@ -40,8 +41,6 @@ _RIDGE = 1e-3  # of everything's information: a group that tells a direction alo
 
 
 FEWEST_GROUPS = 3
-INDEPENDENT = 0.8
-"""Probability, before anything was seen, that errors are independent."""
 # Equations that groups leave between them: views that each tell numbers of their own, as of cameras side by side, leave
 # rounding, and the ratio to that was 17 000 where nothing was wrong.
 _LEAST_LEFT = 1.0
@@ -275,8 +274,8 @@ def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, floa
     """
     logs = np.concatenate([[0.0], _LOG_C, -_LOG_C])
     prior = np.exp(-np.abs(logs)) * (logs >= -np.log(max(widened, 1.0)))
-    weights = (1.0 - INDEPENDENT) / prior[1:].sum() * prior
-    weights[0] = INDEPENDENT
+    weights = (1.0 - DEPENDENCE.absent) / prior[1:].sum() * prior
+    weights[0] = DEPENDENCE.absent
     likelihood = -0.5 * degrees * (logs + ratio * np.exp(-logs))
     weights *= np.exp(np.minimum(likelihood - likelihood[weights > 0.0].max(), 0.0))
     weights /= weights.sum()

@@ -1,8 +1,8 @@
-"""Effects of the table that `calibrate` solves for: their sizes, their best amounts, and by how much they widen.
+"""Effects that `calibrate` solves for: their sizes, their best amounts, and by how much they widen.
 
 Such an effect displaces the observations by amounts that are the same in all views. Its size is read off the residuals
-(`effects.sizes`); where it is likelier that there is one than not, its best amounts are taken off the observations and
-everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
+(`effects.evidence`); where it is likelier that there is one than not, its best amounts are taken off the observations
+and everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
 without the effect as far as it is probable, go into the covariance; an effect that is in doubt, but not solved for,
 does with all of its amounts.
 """
@@ -20,9 +20,9 @@ from ceres_cal.effects.amounts import EffectEstimate
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.effect import Case, Effect
 from ceres_cal.effects.estimated import ESTIMATED
+from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
-from ceres_cal.effects.sizes import LIKELY, RepeatedAmounts
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.information import Key
@@ -180,19 +180,11 @@ class _Amounts:
     def shifts(self) -> Iterator[Array]:
         """(K,) each, see `EffectsEnd`."""
         amounts, covariance = self._best
-        yield from _roots(self.taken, covariance)
+        yield from shifts_by(self.taken, covariance)
         for number, group in enumerate(self.groups):
             (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
             if probability > LIKELY:
                 yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
             elif probability > _NEGLIGIBLE:
                 alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))
-                yield from np.sqrt(probability) * np.array([taken @ alone, *_roots(taken, open_)])
-
-
-def _roots(taken: Array, covariance: Array) -> Iterator[Array]:
-    """(K,) shifts by each direction of a covariance (Q, Q) that is not nothing."""
-    values, vectors = np.linalg.eigh(covariance)
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value > 0.0:
-            yield np.sqrt(value) * taken @ vector
+                yield from np.sqrt(probability) * shifts_by(taken, open_ + np.outer(alone, alone))

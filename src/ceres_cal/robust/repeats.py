@@ -1,8 +1,8 @@
 """By how much targets lie off their drawings: what residuals repeat at the same features, and the sigma that it shows.
 
-A board's corners and bows, a field's lines: a few numbers move each of them, the same in all views (`effects.sizes`).
-The free numbers take out smooth displacements that stay in the image besides: what repeats there is the lens'. Whether
-there is anything to look for is asked first of some views, by products of different views alone.
+A board's corners and bows, a field's lines: a few numbers move each of them, the same in all views, see
+`effects.evidence`. The free numbers take out smooth displacements that stay in the image besides: what repeats there is
+the lens'. Whether there is anything to look for is asked first of some views, by products of different views alone.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.effects.amounts import AsBuilt
 from ceres_cal.effects.columns import SparseColumns
-from ceres_cal.effects.evidence import SizePrior, agreement
+from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
-from ceres_cal.effects.sizes import LIKELY, RepeatedAmounts
+from ceres_cal.effects.priors import AS_BUILT
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.equations import Equations, equations_of, whole_structure
@@ -29,8 +29,6 @@ from ceres_cal.robust.robust import RobustSolution
 _MOST_SCREENED, _MOST_SIGHTS = 12, 200  # of a camera: that are asked first, and that tell the sigma
 # Standard deviations of products of different views from which on the likelihood is asked, which costs as much again.
 _REPEATS = 2.0
-AS_BUILT = SizePrior(0.5, tuple(np.geomspace(1e-5, 3e-2, 30).tolist()))
-"""Of how far a target's features lie off its drawing, in its size: that it is as drawn is as likely as not."""
 _DEGREE, _POWERS = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
 
 
