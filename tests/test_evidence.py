@@ -12,11 +12,18 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.columns import EffectColumns, EffectSums, SparseColumns, grouped
 from ceres_cal.effects.effect import Case
-from ceres_cal.effects.evidence import RandomEffects, agreement, likeliest_sizes, logsum
+from ceres_cal.effects.evidence import (
+    FEATURE_ASIDE,
+    OFFSETS_SCATTER,
+    RandomEffects,
+    SizePrior,
+    agreement,
+    likeliest_sizes,
+    logsum,
+)
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
 from ceres_cal.effects.offsets import measure_offsets
-from ceres_cal.effects.priors import FEATURE_ASIDE, OFFSETS_SCATTER, SizePrior
 from ceres_cal.effects.score_tests import score_all
 from ceres_cal.effects.strands import decay, distances_of, families_of, views_or_placements
 from ceres_cal.effects.table import EFFECTS

@@ -14,8 +14,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.effects import estimated
-from ceres_cal.effects.estimated import ESTIMATED, rows_of
+from ceres_cal.effects import table
+from ceres_cal.effects.table import EFFECTS, rows
 from ceres_cal.observations import Observations
 from ceres_cal.problem.quantities import difference
 from ceres_cal.simulate import simulate
@@ -31,7 +31,7 @@ import numpy as np
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words
-from ceres_cal.effects.priors import SizePrior
+from ceres_cal.effects.evidence import SizePrior
 
 
 class Sway(Effect):
@@ -57,14 +57,14 @@ EFFECTS = (Sway(),)
 
 @pytest.fixture(scope="module")
 def added(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The file, put into the folder of those that are estimated."""
-    folder = tmp_path_factory.mktemp("estimated")
+    """The file, put into the folder of the table."""
+    folder = tmp_path_factory.mktemp("table")
     (folder / "sway.py").write_text(FILE)
-    estimated.__path__.append(str(folder))
-    ESTIMATED.update(rows_of(estimated.__name__, estimated.__path__))
+    table.__path__.append(str(folder))
+    EFFECTS.update(rows())
     yield
-    estimated.__path__.remove(str(folder))
-    del ESTIMATED["sway"]
+    table.__path__.remove(str(folder))
+    del EFFECTS["sway"]
 
 
 def swaying(pixels: Array) -> Array:

@@ -23,7 +23,7 @@ from ceres_cal.calibration.outcome import (
 )
 from ceres_cal.effects.amounts import AsBuilt
 from ceres_cal.effects.dependence import Scatter, measure_scatter
-from ceres_cal.effects.estimated import ESTIMATED
+from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -262,7 +262,7 @@ def solved_from(
     if again is None and problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
     beside = None
-    if ESTIMATED and again is None and watched.settle is None:
+    if again is None and watched.settle is None and estimated():
         from ceres_cal.robust.effects import solve_beside_effects
 
         beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)

@@ -24,10 +24,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import student_95
 from ceres_cal.base.words import two_digits
-from ceres_cal.effects.groups import FEWEST_GROUPS, Between, GroupNormals, compare_groups
+from ceres_cal.effects.evidence import DEPENDENCE
+from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
 from ceres_cal.effects.likelihood import Likelihoods, is_loud, likelihoods
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.priors import DEPENDENCE
 from ceres_cal.effects.strands import (
     Strand,
     StrandFamily,
@@ -220,7 +220,7 @@ class Dependence:
     """
 
     correlations: tuple[Correlation, ...] = ()
-    between: Between | None = None
+    between: GroupScatter | None = None
     private: float = 1.0
     inverse_freedom: float = 0.0
 

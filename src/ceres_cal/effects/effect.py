@@ -17,8 +17,8 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.amounts import Amount
 from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.priors import SizePrior
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import Equations, plane_shift, whole_structure
@@ -184,14 +184,15 @@ class Effect(ABC):
         kind: its name. wrong: what is where it is found, see `Finding`. absorbed: whether its displacement is what the
             calibration's free numbers could not have taken up of it.
         built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
-        prior: what is expected of its amounts, in their own unit, of one whose size is estimated.
+        prior: what is expected of its amounts, in their own unit, of one whose size `calibrate` estimates: it solves
+            for it where it is likely, and states no number better than with it in doubt.
     """
 
     kind: ClassVar[str]
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
     built: ClassVar[str] = ""
-    prior: ClassVar[SizePrior]
+    prior: ClassVar[SizePrior | None] = None
 
     @abstractmethod
     def columns(self, case: Case) -> Iterator[EffectColumns]:

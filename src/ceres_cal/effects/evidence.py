@@ -28,14 +28,67 @@ from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.priors import SizePrior
+
+
+@dataclass(frozen=True)
+class SizePrior:
+    """What is expected of an effect's size before anything was seen.
+
+    Attributes:
+        absent: probability that there is no such effect. sizes: standard deviations of its amounts that may be, each
+            as likely.
+    """
+
+    absent: float
+    sizes: tuple[float, ...]
+
+    @property
+    def scatter(self) -> Array:
+        """(1 + N,) no size, and the sizes."""
+        return np.append(0.0, self.sizes)
+
+    @property
+    def probabilities(self) -> Array:
+        """(1 + N,) of these."""
+        return self.over(len(self.sizes))
+
+    def over(self, count: int) -> Array:
+        """(1 + N,) probabilities of none, and of so many that are as likely as one another."""
+        return np.append(self.absent, np.full(count, (1.0 - self.absent) / max(count, 1)))
+
+    def times(self, unit: float) -> SizePrior:
+        """In another unit: sizes are so many times as large."""
+        return SizePrior(self.absent, tuple(unit * size for size in self.sizes))
+
+
+_FAR = (10.0, 40.0, 160.0)  # standard deviations of an observation: all that is no scatter, a factor of four apart
+FEATURE_ASIDE = SizePrior(0.95, (3.0, *_FAR))
+"""Of a feature that does not belong, in standard deviations of an observation: lines are painted by hand.
+
+Of a line 3 px aside the log odds are 10 to 20. At a probability of 0.1 two of 200 sound fields come into doubt; at 0.01
+a quarter of the lines four standard deviations aside go unseen that need not.
+"""
+VIEW_ASIDE = SizePrior(0.99, _FAR)
+"""Of a view or placement that does not belong, in the same unit: it is one from elsewhere, or its target is another."""
+OFFSETS_SCATTER = SizePrior(0.5, tuple(np.geomspace(0.1, 60.0, 14).tolist()))
+"""Of the offsets that features or views have all alike, in the same unit: that errors go together along them is as
+likely as not.
+"""
+AS_BUILT = SizePrior(0.5, tuple(np.geomspace(1e-5, 3e-2, 30).tolist()))
+"""Of how far a target's features lie off its drawing, in its size: that it is as drawn is as likely as not."""
+DEPENDENCE = SizePrior(0.8, ())
+"""Of errors that go together within views, and of views that scatter more than their equations say: errors are
+independent in four of five calibrations. The sizes are those of a grid, or of a factor.
+"""
+
 
 # Degrees of freedom of the views about their mean below which they cannot be told from one another.
 _FEWEST = 4
 LIKELY = 0.5
 """Probability from which on an effect is solved for: it is then the more likely explanation."""
 _SWEEPS = 2  # over the effects, each beside the others
-_LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding repeats
+LEAST_PX = 1e-3
+"""Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
 _Name = TypeVar("_Name", bound=Hashable)
 _STEPS = 200
@@ -226,7 +279,7 @@ class RepeatedAmounts:
         inverse = np.linalg.inv(information + ridge)
         left = np.where(model.used, model.left_over - model.left_of_column(columns.at(inverse @ score)), 0.0)
         spare = model.spare - float(np.sum(inverse * information))
-        least = spare * (_LEAST_PX * median(model.weight)) ** 2
+        least = spare * (LEAST_PX * median(model.weight)) ** 2
         return cls(
             score,
             information,

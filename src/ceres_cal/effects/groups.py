@@ -27,8 +27,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import known_inverses
+from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
-from ceres_cal.effects.priors import DEPENDENCE
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
@@ -210,7 +210,7 @@ def _posed(normals: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Between:
+class GroupScatter:
     """How views or placements scatter.
 
     Attributes:
@@ -224,7 +224,7 @@ class Between:
     degrees_of_freedom: float
 
 
-def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[Between, Array] | None:
+def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[GroupScatter, Array] | None:
     """How the groups scatter, and the covariance (P, P) of the whole score with that in it; None where they have too
     little in common to be compared.
 
@@ -250,7 +250,7 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
     jackknife = _jackknife(groups, expected, white, root)
     factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife
     widened = _widened(factor, white @ (whole - groups.known) @ white)
-    return Between(len(scatter), variance, probability, degrees), root @ widened @ root
+    return GroupScatter(len(scatter), variance, probability, degrees), root @ widened @ root
 
 
 def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:

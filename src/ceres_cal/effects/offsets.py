@@ -21,11 +21,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, median
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
-from ceres_cal.effects.evidence import RandomEffects, logsum
+from ceres_cal.effects.evidence import LEAST_PX, OFFSETS_SCATTER, RandomEffects, SizePrior, logsum
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.priors import OFFSETS_SCATTER, SizePrior
 
-_LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding is no offset
 _DETERMINED = 1e-5  # of the largest squared length of a mode: what the model leaves of directions that can be judged
 
 
@@ -82,7 +80,7 @@ def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) 
     normal, slope = normal[np.ix_(there, there)], slope[there]
     effects = RandomEffects.of(normal, slope, _DETERMINED * float(np.bincount(group[rows]).max()))
     rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
-    least = model.spare * (_LEAST_PX * median(model.weight[rows])) ** 2
+    least = model.spare * (LEAST_PX * median(model.weight[rows])) ** 2
     modes = effects.modes(np.eye(groups * width)[there]).reshape(-1, groups, width)
     effects = replace(effects, rest=max(rest, least), freedom=float(model.spare))
     return Offsets(effects, np.swapaxes(modes, 0, 1), prior)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, median
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.priors import FEATURE_ASIDE, VIEW_ASIDE, SizePrior
+from ceres_cal.effects.evidence import FEATURE_ASIDE, VIEW_ASIDE, SizePrior
 from ceres_cal.observations import Columns, Observations, View
 from ceres_cal.observations.sights import Sights
 from ceres_cal.observations.thinning import column_of
