@@ -102,16 +102,16 @@ def test_it_is_solved_for(calibration: Calibration, without: Calibration) -> Non
     (one,) = calibration.effects
     assert (one.kind, one.subject, one.frame) == ("sway", "overhead", None) and one.probability > 0.999
     (sway,) = one.amounts
-    assert abs(sway.value - SWAY_PX) < 4.0 * sway.sd
-    assert np.max(np.abs(off(calibration))) < 3.5 < np.max(np.abs(off(without)))
-    assert calibration.fit.points_rms_px < 0.97 * without.fit.points_rms_px
+    assert abs(sway.value - SWAY_PX) < 4.0 * sway.sd  # 1.492 +- 0.023
+    assert np.max(np.abs(off(calibration))) < 3.5 < np.max(np.abs(off(without)))  # 2.0, 5.5
+    assert calibration.fit.points_rms_px < 0.9 * without.fit.points_rms_px  # 0.41, 0.51 px
 
 
 def test_it_widens(calibration: Calibration) -> None:
     """By what is open of its amounts: the same noise before a steady camera says more."""
     steady = calibrate(simulate(scenes.overhead(boards=8), scenes.NOISE, 1).observations, RADIAL)
     sds = [one.uncertainty.posterior.sd for one in (calibration, steady)]
-    assert np.all(sds[0] > sds[1]) and np.max(sds[0] / sds[1]) > 1.1, sds[0] / sds[1]
+    assert np.all(sds[0] > sds[1]) and np.max(sds[0] / sds[1]) > 1.1
 
 
 def test_it_is_diagnosed_and_reported(calibration: Calibration, swayed: Observations, tmp_path: Path) -> None:
