@@ -29,7 +29,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.effect import amounts
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 from ceres_cal.effects.evidence import SizePrior
 

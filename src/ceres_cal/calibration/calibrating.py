@@ -21,8 +21,8 @@ from ceres_cal.calibration.outcome import (
     resting_phi,
     unknown_phi,
 )
-from ceres_cal.effects.amounts import AsBuilt
 from ceres_cal.effects.dependence import Scatter, measure_scatter
+from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled

@@ -4,8 +4,7 @@ from ceres_cal.diagnostics.checks import CHECKS, Check, DiagnosisCase, Noise, Te
 from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE, Diagnosis, diagnose
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summaries, Summary
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.amounts import Amount
-from ceres_cal.effects.effect import Finding
+from ceres_cal.effects.effect import Amount, Finding
 
 __all__ = [
     "CHECKS",

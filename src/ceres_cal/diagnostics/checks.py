@@ -17,8 +17,7 @@ from ceres_cal.base.tails import log_chi2_tail, log_f_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled, Mislabelling
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.amounts import Amount, AsBuilt, EffectEstimate
-from ceres_cal.effects.effect import Case, Finding, Words, Wrong
+from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words, Wrong
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import Selection
 from ceres_cal.effects.table.target import feature_of

@@ -22,8 +22,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.effects.amounts import AsBuilt
 from ceres_cal.effects.columns import SparseColumns
+from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, LIKELY, RepeatedAmounts, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
 from ceres_cal.observations import Observations, Prior

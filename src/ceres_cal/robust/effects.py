@@ -16,9 +16,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
-from ceres_cal.effects.amounts import EffectEstimate
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
-from ceres_cal.effects.effect import Case, Effect
+from ceres_cal.effects.effect import Case, Effect, EffectEstimate
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
