@@ -5,7 +5,8 @@ from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE, Diagnosis, diagnose
 from ceres_cal.diagnostics.leftover import Noise
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summaries, Summary
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.effect import Amount, Finding
+from ceres_cal.effects.amounts import Amount
+from ceres_cal.effects.effect import Finding
 
 __all__ = [
     "CHECKS",

@@ -18,12 +18,12 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled, Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.effect import Amount, Case, Finding, Words, Wrong
+from ceres_cal.effects.amounts import Amount, AsBuilt, EffectEstimate
+from ceres_cal.effects.effect import Case, Finding, Words, Wrong
 from ceres_cal.effects.score_tests import Selection
 from ceres_cal.effects.table.target import feature_of
 from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.structure import numbers_by_kind
-from ceres_cal.robust.repeats import AsBuilt
 
 _MOST_NAMED = 5
 
@@ -34,7 +34,8 @@ class DiagnosisCase(Case):
 
     Attributes:
         calibration: of other observations, which may not hold on these; None where these are its own.
-        as_built: what the calibration found not to be as drawn, and solved for.
+        as_built, effects: what the calibration found not to be as drawn, and what else displaces the observations;
+            both were solved for.
     """
 
     inliers: Inliers
@@ -42,6 +43,7 @@ class DiagnosisCase(Case):
     labels: Mislabelling
     calibration: Calibration | None
     as_built: tuple[AsBuilt, ...] = ()
+    effects: tuple[EffectEstimate, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,8 +113,12 @@ def diagnose(
 
 def _findings(tested: Tested) -> Iterator[Finding]:
     """Of effects, also of those that the calibration solved for by itself, and of checks."""
+    solved = {(one.kind, one.subject, one.frame) for one in tested.case.effects}
     for effect in EFFECTS.values():
-        yield from effect.findings(tested.case, tested.selection)
+        for finding in effect.findings(tested.case, tested.selection):
+            if (finding.kind, finding.subject, finding.frame) in solved:
+                finding = replace(finding, wrong="observations", sentence=f"{finding.sentence}; it was solved for")
+            yield finding
         for one in tested.case.as_built:
             if one.kind == effect.built and one.probability >= 1.0 - tested.rate:
                 yield solved_for(effect.kind, one, tested)
@@ -151,8 +155,8 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
         model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
     labels = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
-    other, as_built = (calibration, ()) if new_data else (None, calibration.as_built)
-    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, other, as_built)
+    known = (calibration,) if new_data else (None, calibration.as_built, calibration.effects)
+    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, *known)
     used = _recalled(case)
     if np.array_equal(used, model.used):
         return case

@@ -6,7 +6,7 @@ What is found of it: the cause by name, how large, how sure.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -15,7 +15,9 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
+from ceres_cal.effects.amounts import Amount
 from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
@@ -27,21 +29,6 @@ from ceres_cal.problem.structure import Structure
 SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
 Wrong = Literal["model", "calibration", "observations"]
-
-
-@dataclass(frozen=True)
-class Amount:
-    """One number that would mend it: its name, value, standard deviation and unit ("mm", "deg", "px", "")."""
-
-    name: str
-    value: float
-    sd: float
-    unit: str
-
-
-def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
-    """Several numbers of one unit."""
-    return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
 
 
 @dataclass(frozen=True)
@@ -197,12 +184,14 @@ class Effect(ABC):
         kind: its name. wrong: what is where it is found, see `Finding`. absorbed: whether its displacement is what the
             calibration's free numbers could not have taken up of it.
         built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
+        prior: what is expected of its amounts, in their own unit, of one whose size is estimated.
     """
 
     kind: ClassVar[str]
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
     built: ClassVar[str] = ""
+    prior: ClassVar[SizePrior]
 
     @abstractmethod
     def columns(self, case: Case) -> Iterator[EffectColumns]:
@@ -216,6 +205,15 @@ class Effect(ABC):
         """The findings of several of its groups, as they are told."""
         yield from findings
 
+    def evidence(self, case: Case, score: ScoreTest, others: Linearised, left_over: Array) -> Evidence:
+        """For one of its groups, beside other effects in a model, which all together leave so much (E,)."""
+        rows = np.any(score.columns != 0.0, axis=1) & case.model.used
+        shift = score.columns @ score.amount
+        if self.absorbed:
+            shift = case.model.unabsorbed(shift)
+        effect = case.effect(shift, rows)
+        return Evidence(case, score, others, shift, effect, effect.px / case.noise_px(left_over, rows))
+
     def findings(self, case: Case, selection: Selection) -> Iterator[Finding]:
         """Of its groups that were chosen."""
         own = [number for number, score in enumerate(selection.chosen) if score.effect.kind == self.kind]
@@ -226,13 +224,9 @@ class Effect(ABC):
         score, others = chosen[number], case.model
         for other in (*chosen[:number], *chosen[number + 1 :]):
             others = others.with_columns(other.columns)
-        rows = np.any(score.columns != 0.0, axis=1) & case.model.used
-        shift = score.columns @ score.amount
-        if self.absorbed:
-            shift = case.model.unabsorbed(shift)
-        effect = case.effect(shift, rows)
-        ratio = effect.px / case.noise_px(selection.model.left_over, rows)
-        sentence, advice, mending = self.words(Evidence(case, score, others, shift, effect, ratio))
+        evidence = self.evidence(case, score, others, selection.model.left_over)
+        effect, ratio = evidence.effect, evidence.noise_ratio
+        sentence, advice, mending = self.words(evidence)
         if score.rivals:
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
             sentence += f"; these data cannot tell it from {names}"

@@ -1,20 +1,14 @@
-"""The table of effects: every module of this folder adds its rows, in its EFFECTS."""
+"""The table of effects: every module of this folder adds its rows, in its EFFECTS, beside those that are estimated."""
 
 from __future__ import annotations
 
-from importlib import import_module
-from pkgutil import iter_modules
+from collections import ChainMap
 
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.effect import Case, Effect
+from ceres_cal.effects.effect import Case
+from ceres_cal.effects.estimated import ESTIMATED, rows_of
 
-
-def _rows() -> list[Effect]:
-    modules = (import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__))
-    return [effect for module in modules for effect in module.EFFECTS]
-
-
-EFFECTS: dict[str, Effect] = {effect.kind: effect for effect in _rows()}
+EFFECTS = ChainMap(rows_of(__name__, __path__), ESTIMATED)
 
 
 def columns_of_all(case: Case) -> list[EffectColumns]:

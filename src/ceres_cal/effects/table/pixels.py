@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 from ceres_cal.problem.parameters import intrinsic_names
 
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 
 # How near to half a pixel a shift must be to be called that: in standard deviations, and px.
 _HALF_SD, _HALF_PX = 3.0, 0.1
