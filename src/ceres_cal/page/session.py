@@ -204,7 +204,7 @@ class Session:
             self.revision += 1
 
     def weigh(self) -> bool:
-        """What takes a second and nobody waits for: advice where the lines were found; before that, what the clicks tell
+        """What takes a second and nobody waits for: advice where the lines were found; before that, what clicks tell
         alone, under a lens of one coefficient. Whether there is anything new to be shown.
         """
         moment, revision, target = self._now, self.revision, self.target(self.state)
