@@ -26,7 +26,8 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
-from ceres_cal.posterior.maps import locate_slopes, radius_95, spread_of_points, visible_pixels
+from ceres_cal.posterior.maps import locate_slopes, spread_of_points, visible_pixels
+from ceres_cal.posterior.mixture import radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
@@ -111,7 +112,7 @@ def test_straight_down_is_an_exact_null_direction() -> None:
 @pytest.mark.parametrize("tilt_deg, verdict", [(8.0, "weak"), (25.0, "known")])
 def test_more_tilt_tells_more(tilt_deg: float, verdict: str) -> None:
     assert phi_of(calibrated(tilt_deg)).verdict == verdict
-    assert calibrated(tilt_deg).posterior is not None and not calibrated(tilt_deg).posterior.profiles  # type: ignore[union-attr]
+    assert calibrated(tilt_deg).posterior is not None and not calibrated(tilt_deg).posterior.followed  # type: ignore[union-attr]
     assert calibrated(tilt_deg).warnings == ()
 
 
@@ -199,11 +200,12 @@ def test_another_lens_widens_a_valley_on_the_floor_alike_at_every_phi() -> None:
     wider = with_other_lenses(posterior, estimate, others_of(estimate, replace(estimate, cameras={"overhead": off})))
     pixels = camera.principal_point + np.array([[0.0, 0.0], [150.0, -80.0]])
     aside = 2.0 * estimate.camera_at("overhead").position[2] / camera.phi
-    for known, step in zip(wider.profiles["overhead"].across, wider.profiles["overhead"].steps, strict=True):
-        there = moved(estimate, wider.profiles["overhead"].keys, step)
-        slopes = locate_slopes(there, known.keys, "overhead", pixels, 0.0)
-        on_floor = np.sqrt(known.spread.through(slopes)[:, 0, 0])
-        assert on_floor == pytest.approx([aside, aside], rel=0.1)
+    before, after = posterior.mixtures["overhead"], wider.mixtures["overhead"]
+    own, other = np.split(after.steps, 2)
+    assert np.array_equal(own, before.steps) and after.weights[: len(own)] == pytest.approx(0.2 * before.weights)
+    for step, shifted in zip(own, other, strict=True):
+        places = [moved(estimate, after.keys, s).camera_at("overhead").locate(pixels, 0.0) for s in (step, shifted)]
+        assert np.linalg.norm(places[1] - places[0], axis=1) == pytest.approx([aside, aside], rel=0.1)
     sd = [calibration.uncertainty.located(pixels).sd_m, spread_of_points(estimate, wider, "overhead", pixels, 0.0).sd_m]
     assert np.all(sd[1] > 3.0 * sd[0])
 
@@ -329,7 +331,7 @@ def test_slopes_of_a_map_are_those_of_its_differences(name: str, height_m: float
 def test_circles_hold_95_percent(ratio: float, correlation: float) -> None:
     covariance = np.array([[1.0, correlation * ratio], [correlation * ratio, ratio**2]])
     draws = np.random.default_rng(0).multivariate_normal([0.0, 0.0], covariance, 200_000)
-    inside = np.linalg.norm(draws, axis=1) <= radius_95(covariance[None])[0]
+    inside = np.linalg.norm(draws, axis=1) <= radii(np.ones(1), np.zeros((1, 1, 2)), covariance[None, None])[0]
     assert np.mean(inside) == pytest.approx(0.95, abs=0.004)  # 0.0026 measured, of one long axis
 
 
@@ -385,7 +387,7 @@ def test_the_predicted_seam_is_what_draws_do() -> None:
     posterior = calibration.posterior
     assert posterior is not None
     places = np.array([[0.0, 0.0], [0.4, 1.5], [-0.5, -2.0]])
-    covariances = predicted(calibration.estimate, posterior, ("left", "right"), places, 0.15)
+    known, visible = predicted(calibration.estimate, posterior, ("left", "right"), places, 0.15)
     pixels = {name: visible_pixels(calibration.estimate, name, places, 0.15) for name in ("left", "right")}
     gaps = []
     for step in drawn(calibration, 1000):
@@ -393,7 +395,7 @@ def test_the_predicted_seam_is_what_draws_do() -> None:
         left, right = (there.camera_at(name).locate(pixels[name], 0.15) for name in ("left", "right"))
         gaps.append(left - right)
     expected = np.sqrt(np.mean(np.sum(np.array(gaps) ** 2, axis=2), axis=0))
-    assert np.sqrt(np.trace(covariances, axis1=1, axis2=2)) == pytest.approx(expected, rel=0.08)  # 3 % measured
+    assert visible.all() and known.sd == pytest.approx(expected, rel=0.08)  # 3 % measured
     seam = calibration.uncertainty.seam_sd_mm("left", "right", 0.15)
     assert 0.3 < seam.mean_mm < 1.0  # 0.7 measured
     assert np.isnan(seam.sd_mm).any() and np.isfinite(seam.sd_mm).sum() > 50  # the middle of the field alone

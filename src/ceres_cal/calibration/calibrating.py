@@ -275,8 +275,8 @@ def solved_from(
         end, posterior = _assess(end, observations, problem, again)
         if again is None:
             require_lens_told(end.solution.estimate, posterior)
-        posterior = with_doubts(posterior, end, conflicts, explanations, others)
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
+        posterior = with_doubts(posterior, end, conflicts, explanations, others)
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
         warnings = (
             *warnings,
