@@ -30,7 +30,8 @@ class Constant:
     """A constant that decides something.
 
     Attributes:
-        module: below `ceres_cal`. name: there; "Class.field" for a default of a dataclass. figures: what it may touch.
+        module: below `ceres_cal`. name: there; "Class.field" for a default of a dataclass,
+            "PRIOR.field" for a prior. figures: what it may touch.
     """
 
     module: str
@@ -45,7 +46,10 @@ class Constant:
         owner = importlib.import_module(f"ceres_cal.{self.module}")
         if "." in self.name:
             cls, field = self.name.split(".")
-            value: Value = inspect.signature(getattr(owner, cls)).parameters[field].default
+            of = getattr(owner, cls)
+            value: Value = (
+                inspect.signature(of).parameters[field].default if inspect.isclass(of) else getattr(of, field)
+            )
         else:
             value = getattr(owner, self.name)
         return value
@@ -55,6 +59,9 @@ class Constant:
         owner, old = importlib.import_module(f"ceres_cal.{self.module}"), self.value
         if "." in self.name:
             cls, field = self.name.split(".")
+            if not inspect.isclass(getattr(owner, cls)):
+                object.__setattr__(getattr(owner, cls), field, value)
+                return
             make = getattr(owner, cls).__init__
             names = [name for name, one in inspect.signature(make).parameters.items() if one.default is not one.empty]
             defaults = list(make.__defaults__)
@@ -97,7 +104,8 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.wholes", "_LEFT", "calibrate"),
     *_of("robust.competing", "DOUBTFUL", "calibrate"),
     *_of("effects.offsets", "_FAULTY_FEATURE _FAULTY_VIEW _INDEPENDENT", "calibrate"),
-    *_of("robust.repeats", "_REPEATS _AS_DRAWN _LIKELY", "calibrate", "diagnose"),
+    *_of("robust.repeats", "_REPEATS AS_BUILT.absent", "calibrate", "diagnose"),
+    *_of("effects.sizes", "LIKELY", "calibrate"),
     *_of("robust.wholes", "FEWEST", "calibrate"),
     *_of("problem.bundle", "_POSED", "calibrate"),
     *_of("problem.costs", "_LEFT_TO_THE_COMPLEMENT", "calibrate"),
@@ -106,16 +114,17 @@ DECIDING: tuple[Constant, ...] = (
     *_of("start.closed_forms", "_WRONG", "calibrate"),
     *_of("start.world", "_HOLDS _SCALES _ROUGH _LEFT_OVER _TOLD _OPEN _ALIKE _APART", "calibrate"),
     *_of("posterior.assess", "_BENT", "verdicts"),
-    *_of("effects.between", "_LEAST_LEFT", "verdicts"),
+    *_of("effects.groups", "_LEAST_LEFT", "verdicts"),
     *_of("posterior.profile", "_FAR", "verdicts"),
     *_of("posterior.mixture", "_BOUNDED _SHRINKING", "verdicts"),
     *_of("posterior.weak", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
     *_of("diagnostics.advice.ranking", "_MUST_LEAVE _LARGER _LESS", "advice"),
     *_of("diagnostics.advice.candidates", "_MARKED", "advice"),
-    *_of("diagnostics.diagnostic", "SMALL", "diagnose"),
+    *_of("effects.effect", "SMALL", "diagnose"),
     *_of("diagnostics.leftover", "LARGER _FEWEST_PAIRS", "diagnose"),
-    *_of("diagnostics.scores", "_LEAST_SHARE", "diagnose"),
-    *_of("diagnostics.of_target", "_FEWEST_ON_CURVE _FEWEST_OF_POINT _FEWEST_AGREE _FAR_M", "diagnose"),
+    *_of("effects.score_tests", "_LEAST_SHARE", "diagnose"),
+    *_of("effects.table.target", "_FEWEST_ON_CURVE _FEWEST_OF_POINT", "diagnose"),
+    *_of("diagnostics.diagnose", "_FEWEST_AGREE _FAR_M", "diagnose"),
     *_of("moves.checks", "_INLIER_SIGMA _LEAST_SHARE _USUAL_EQUATIONS _WILL_DO", "check"),
     *_of("moves.agreement", "FALSE_ALARMS", "check"),
     *_of("problem.residuals", "_STRAY", "check", "refit"),

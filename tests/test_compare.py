@@ -10,7 +10,8 @@ from accuracy.moves import calibrated as calibrated_at_home
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import compare, refit
+from ceres_cal.moves.comparisons import compare
+from ceres_cal.moves.refits import refit
 from ceres_cal.report.maps import comparison_svg
 
 

@@ -18,7 +18,8 @@ from ceres_cal.base.errors import SolutionError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.moves import RefitOptions, refit
+from ceres_cal.moves.refit_plan import RefitOptions
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Options

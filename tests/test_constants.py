@@ -62,10 +62,10 @@ def test_a_constant_is_set_where_it_is_read() -> None:
     """Where it is defined, where it was imported to, and as the default of a dataclass; in a process of its own."""
     code = (
         "from constants import Constant; from ceres_cal.problem.parameters import Options; "
-        "import ceres_cal.diagnostics.of_lens as of_lens; "
+        "import ceres_cal.effects.table.radius as radius; "
         "Constant('problem.parameters', 'Options.reject_sigma', ()).set(7.0); "
-        "Constant('diagnostics.diagnostic', 'SMALL', ()).set(0.8); "
-        "print(Options().reject_sigma, Options().loss_scale, of_lens.SMALL)"
+        "Constant('effects.effect', 'SMALL', ()).set(0.8); "
+        "print(Options().reject_sigma, Options().loss_scale, radius.SMALL)"
     )
     folder = Path(__file__).parents[1] / "scripts"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder)

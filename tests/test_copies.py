@@ -17,7 +17,8 @@ from ceres_cal.base.arrays import AnyArray
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.moves import check, refit
+from ceres_cal.moves.checks import check
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import NO_CURVES, Observations, Points, View, combine, taken
 from ceres_cal.observations.copies import find_copies
 from ceres_cal.simulate import Disturbance, simulate

@@ -17,12 +17,12 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.effects.between import _averaged, _expected
 from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
+from ceres_cal.effects.groups import _averaged, _expected
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.sample import _shown
 from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of
-from ceres_cal.moves import refit
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key

@@ -1,4 +1,4 @@
-"""The table of diagnostics: one that nobody has heard of is tested, named and shown like the built-in ones."""
+"""The table of effects: one that nobody has heard of is tested, named and shown like the built-in ones."""
 
 import json
 from collections.abc import Iterator
@@ -15,8 +15,11 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.diagnostics import DIAGNOSTICS, Case, Evidence, Family, ScoreTest, Words, diagnose
-from ceres_cal.diagnostics.diagnostic import amounts
+from ceres_cal.diagnostics import CHECKS, diagnose
+from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words
+from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import simulate
 
@@ -28,15 +31,15 @@ def wave(pixels: Array) -> Array:
     return np.sin(2.0 * np.pi * pixels[:, 1] / PERIOD_PX)
 
 
-class Wave(ScoreTest):
+class Wave(Effect):
     """Rows of pixels lie to the right and left in turn, as a sensor on a shaking mount reads them."""
 
     kind = "wave"
     absorbed = True
 
-    def families(self, case: Case) -> Iterator[Family]:
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
         columns = case.equations.direction[:, 0] * wave(case.equations.pixel)
-        yield Family(self.kind, columns[:, None], case.camera, case.cameras)
+        yield EffectColumns(self.kind, columns[:, None], case.camera, case.cameras)
 
     def words(self, evidence: Evidence) -> Words:
         amount, sd = evidence.score.amount, evidence.score.sd
@@ -54,7 +57,7 @@ def swaying(pixels: Array) -> Array:
 
 @pytest.fixture(autouse=True)
 def in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(DIAGNOSTICS, "wave", Wave())
+    monkeypatch.setitem(EFFECTS, "wave", Wave())
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +78,7 @@ def calibration(swayed: Observations) -> Calibration:
     return calibrate(swayed, RADIAL)
 
 
-def test_a_diagnostic_of_one_s_own_names_its_fault(calibration: Calibration, swayed: Observations) -> None:
+def test_an_effect_of_one_s_own_names_its_fault(calibration: Calibration, swayed: Observations) -> None:
     diagnosis = diagnose(calibration, swayed)
     (finding,) = diagnosis.findings
     assert (finding.kind, finding.subject, finding.frame) == ("wave", "overhead", None)
@@ -90,7 +93,7 @@ def test_it_counts_among_the_tests_and_is_silent_on_sound_data(monkeypatch: pyte
     sound = simulate(scenes.overhead(boards=4), scenes.NOISE, 2).observations
     diagnosis = diagnose(calibrate(sound, RADIAL), sound)
     assert not diagnosis.findings
-    monkeypatch.delitem(DIAGNOSTICS, "wave")
+    monkeypatch.delitem(EFFECTS, "wave")
     assert diagnose(calibrate(sound, RADIAL), sound).tests == diagnosis.tests - 1
 
 
@@ -114,12 +117,12 @@ def test_it_is_in_the_command_s_answer_and_in_the_report(
 def test_without_it_the_fault_has_no_name(
     calibration: Calibration, swayed: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(DIAGNOSTICS, "wave")
+    monkeypatch.delitem(EFFECTS, "wave")
     assert "wave" not in {finding.kind for finding in diagnose(calibration, swayed).findings}
 
 
 def test_kinds_stand_under_their_own_names() -> None:
-    assert all(kind == diagnostic.kind for kind, diagnostic in DIAGNOSTICS.items())
+    assert all(kind == row.kind for table in (EFFECTS, CHECKS) for kind, row in table.items())
 
 
 class Shaking(Wave):
@@ -131,7 +134,7 @@ class Shaking(Wave):
 def test_what_the_data_cannot_tell_apart_is_named_by_both_names(
     calibration: Calibration, swayed: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(DIAGNOSTICS, "shaking", Shaking())
+    monkeypatch.setitem(EFFECTS, "shaking", Shaking())
     (finding,) = diagnose(calibration, swayed).findings
     other = {"wave": "shaking", "shaking": "wave"}[finding.kind]
     assert finding.sentence.endswith(f"; these data cannot tell it from {other} (overhead)")

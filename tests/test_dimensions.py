@@ -21,7 +21,8 @@ from ceres_cal.cli import main
 from ceres_cal.cli.arguments import parse_estimates
 from ceres_cal.detect.photographs.candidates import candidates, prepare_search
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.moves import check, refit
+from ceres_cal.moves.checks import check
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance

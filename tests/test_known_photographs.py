@@ -17,7 +17,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs import check_photographs, detect_field, detect_known
-from ceres_cal.moves import check, movements, refit
+from ceres_cal.moves.checks import check
+from ceres_cal.moves.refits import movements, refit
 from ceres_cal.observations import Observations, combine
 from ceres_cal.scene.camera import Camera
 from ceres_cal.simulate import built_in_scene

@@ -31,7 +31,7 @@ from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.photographs import detect_field
 from ceres_cal.diagnostics.held_out import choose
-from ceres_cal.effects.left_out import GroupNormals, group_normals
+from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights

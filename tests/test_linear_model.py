@@ -13,7 +13,7 @@ from scenes import side_by_side
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.moves import refit
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.noise import USUAL_EQUATIONS
 from ceres_cal.problem.parameters import Options

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves import RefitOptions, refit
+from ceres_cal.moves.refit_plan import RefitOptions
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.ranges import require_possible_numbers

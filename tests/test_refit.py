@@ -31,10 +31,10 @@ from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.file import PriorFile
-from ceres_cal.moves import RefitOptions, refit
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
-from ceres_cal.moves.refit_plan import carried_prior, make_plan
+from ceres_cal.moves.refit_plan import RefitOptions, carried_prior, make_plan
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.bundle import _ParameterBlocks
 from ceres_cal.problem.costs import Run

@@ -16,7 +16,7 @@ from accuracy.moves import MOVED, NOISE, seen
 from faults import week
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import check
+from ceres_cal.moves.checks import check
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}

@@ -19,7 +19,8 @@ from accuracy.moves import ALARMS, DAY, HOME, NOISE, calibrated, clean, seen, th
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import Agreement, check
+from ceres_cal.moves.agreement import Agreement
+from ceres_cal.moves.checks import check
 from ceres_cal.observations import Observations
 from ceres_cal.problem.quantities import difference
 from ceres_cal.simulate import Disturbance

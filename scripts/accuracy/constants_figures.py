@@ -48,7 +48,9 @@ from ceres_cal.detect.photographs import Auto, follow
 from ceres_cal.detect.photographs.clicks import starts_from_clicks
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.diagnostics.advice import advise
-from ceres_cal.moves import check, compare, refit
+from ceres_cal.moves.checks import check
+from ceres_cal.moves.comparisons import compare
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.quantities import difference

@@ -31,8 +31,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs import FieldOptions, check_photographs, detect_field
-from ceres_cal.moves import refit
 from ceres_cal.moves.refit_plan import make_plan, refit_problem
+from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, combine, taken
 from ceres_cal.posterior.maps import locate_slopes, visible_pixels
 from ceres_cal.problem.information import Key

@@ -26,7 +26,7 @@ from accuracy.moves import DAY, HOME, MOVED, calibrated, seen
 from runner import Row, script
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import check
+from ceres_cal.moves.checks import check
 
 SCRIPT = Path(__file__).parents[1] / "refit_after_move.py"
 PLACES = {"home": HOME, "moved": MOVED}

@@ -3,8 +3,9 @@
 The names are loaded when they are first used, so that `import ceres_cal` costs nothing.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.lazy import names_of
 
 if TYPE_CHECKING:
     from ceres_cal.base.errors import CalibrationError as CalibrationError
@@ -18,12 +19,12 @@ if TYPE_CHECKING:
     from ceres_cal.formats import export as export
     from ceres_cal.formats import import_calibration as import_calibration
     from ceres_cal.formats import import_observations as import_observations
-    from ceres_cal.moves import RefitOptions as RefitOptions
-    from ceres_cal.moves import audit as audit
-    from ceres_cal.moves import check as check
-    from ceres_cal.moves import compare as compare
-    from ceres_cal.moves import refit as refit
-    from ceres_cal.moves import score as score
+    from ceres_cal.moves.audits import audit as audit
+    from ceres_cal.moves.checks import check as check
+    from ceres_cal.moves.comparisons import compare as compare
+    from ceres_cal.moves.refit_plan import RefitOptions as RefitOptions
+    from ceres_cal.moves.refits import refit as refit
+    from ceres_cal.moves.scores import score as score
     from ceres_cal.observations import Curves as Curves
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Points as Points
@@ -55,12 +56,12 @@ _HOME = {
     "DegenerateError": "base.errors",
     "InputError": "base.errors",
     "SolutionError": "base.errors",
-    "refit": "moves",
-    "RefitOptions": "moves",
-    "check": "moves",
-    "audit": "moves",
-    "compare": "moves",
-    "score": "moves",
+    "refit": "moves.refits",
+    "RefitOptions": "moves.refit_plan",
+    "check": "moves.checks",
+    "audit": "moves.audits",
+    "compare": "moves.comparisons",
+    "score": "moves.scores",
     "export": "formats",
     "import_calibration": "formats",
     "import_observations": "formats",
@@ -81,11 +82,4 @@ _HOME = {
     "write_report": "report",
 }
 __all__ = list(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'ceres_cal' has no attribute {name!r}")
-    value = getattr(import_module(f"ceres_cal.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = names_of(__name__, _HOME)

@@ -1,5 +1,6 @@
 """Arrays by the kind of their numbers, once for the whole package. Shapes stand in the docstrings."""
 
+from collections.abc import Hashable, Iterable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -44,3 +45,9 @@ def medians(values: Array) -> Array:
     ordered = np.partition(values, (low, high, last), axis=-1)  # NaN is the last
     largest = ordered[..., last]
     return np.asarray(np.where(np.isnan(largest), largest, 0.5 * (ordered[..., low] + ordered[..., high])))
+
+
+def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
+    """Which of the known names each one is."""
+    order = {name: number for number, name in enumerate(known)}
+    return np.array([order[name] for name in names], dtype=np.int64)

@@ -2,7 +2,7 @@
 
 Some of the observations are solved once, robustly, and from there with the longest lens of each kind. Shorter ones are
 these with coefficients held at 0: what a solve without a group of equations would leave of it follows for every lens
-from the normal equations of each group (`effects/left_out.py`). Errors that go together within a group make a longer
+from the normal equations of each group (`effects/groups.py`). Errors that go together within a group make a longer
 lens predict the others no better: a criterion that counts observations would take them for a lens.
 """
 

@@ -12,7 +12,7 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, CLEARLY, PAPER, Form, standard_errors, surprise
-from ceres_cal.effects.left_out import GroupNormals
+from ceres_cal.effects.groups import GroupNormals
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import moved, values_of

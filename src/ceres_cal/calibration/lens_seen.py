@@ -13,7 +13,7 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.calibration.lens_forms import Form
 from ceres_cal.calibration.lens_kinds import Candidate, Kind
-from ceres_cal.effects.left_out import group_normals
+from ceres_cal.effects.groups import group_normals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.problem.bundle import solve

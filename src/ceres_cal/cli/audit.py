@@ -14,7 +14,7 @@ from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
-    from ceres_cal.moves import Agreement
+    from ceres_cal.moves.agreement import Agreement
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class AuditArguments(Arguments):
 def _run(args: AuditArguments) -> Document:
     from ceres_cal.calibration import Calibration
     from ceres_cal.formats import import_calibration
-    from ceres_cal.moves import audit
+    from ceres_cal.moves.audits import audit
 
     if args.form is None and args.file.suffix == ".json" and _is_ours(args.file):
         given = Calibration.load(args.file)

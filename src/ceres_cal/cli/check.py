@@ -19,7 +19,7 @@ from ceres_cal.scene.heights import HEIGHTS_M, at_height
 
 if TYPE_CHECKING:
     from ceres_cal.detect.photographs import KnownDetections
-    from ceres_cal.moves import Agreement, Agreements
+    from ceres_cal.moves.agreement import Agreement, Agreements
 
 
 def _share(text: str) -> float:
@@ -54,7 +54,7 @@ def _run(args: CheckArguments) -> Document:
     if images:
         answer, detections = _photographed(args, images)
     else:
-        from ceres_cal.moves import check
+        from ceres_cal.moves.checks import check
 
         answer = check(
             read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks

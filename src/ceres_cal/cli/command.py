@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, NoReturn, get_type_hints
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import LazyTable
 from ceres_cal.base.words import sentence
 from ceres_cal.cli.options import Arguments, add_options, filled
 from ceres_cal.cli.terminal import coloured, in_colour
@@ -92,6 +92,7 @@ def print_answer(answer: Document, *, as_json: bool) -> None:
 
 
 _MODULES = {
+    "open": "open",
     "run": "run",
     "detect board": "detect",
     "detect rings": "detect_rings",
@@ -122,22 +123,9 @@ _MODULES = {
 }
 
 
-class _Commands(Mapping[str, Command]):
-    """Each command's module is imported when it is asked for: a start with all of them takes longer."""
-
-    def __getitem__(self, name: str) -> Command:
-        module = import_module(f"ceres_cal.cli.{_MODULES[name]}")
-        return next(one for one in vars(module).values() if isinstance(one, Command) and one.name == name)
-
-    def __contains__(self, name: object) -> bool:
-        return name in _MODULES
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(_MODULES)
-
-    def __len__(self) -> int:
-        return len(_MODULES)
+def _command_of(module: Any, name: str) -> Command:
+    return next(one for one in vars(module).values() if isinstance(one, Command) and one.name == name)
 
 
-COMMANDS: Mapping[str, Command] = _Commands()
+COMMANDS: Mapping[str, Command] = LazyTable("ceres_cal.cli", _MODULES, _command_of)
 """Every command by its name."""

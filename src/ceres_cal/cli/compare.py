@@ -19,7 +19,7 @@ from ceres_cal.report.document import Document, Section
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
     from ceres_cal.calibration import Calibration
-    from ceres_cal.moves import Agreement
+    from ceres_cal.moves.agreement import Agreement
 
 _TABLE_SIZE = 9, 7
 
@@ -56,7 +56,7 @@ def _run(args: CompareArguments) -> Document:
 def _over_image(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
     if args.picture is not None or args.station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
-    from ceres_cal.moves import compare_cameras
+    from ceres_cal.moves.comparisons import compare_cameras
 
     comparisons = compare_cameras(first, second, without_turn=args.without_turn)
     return Document(tuple(section for one in comparisons.values() for section in _camera(one)))
@@ -64,7 +64,7 @@ def _over_image(args: CompareArguments, first: Calibration, second: Calibration)
 
 def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
     from ceres_cal.base.files import write_bytes
-    from ceres_cal.moves import compare
+    from ceres_cal.moves.comparisons import compare
 
     comparisons = compare(first, second, metres(args.height_mm), args.station)
     if args.picture is not None:

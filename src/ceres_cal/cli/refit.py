@@ -60,7 +60,8 @@ def _run(args: RefitArguments) -> Document:
     calibration = read_calibration(args.calibration)
     detections = _photographed(args, calibration, images) if images else None
     observations = read_observations(args.inputs) if detections is None else detections.require()
-    from ceres_cal.moves import RefitOptions, movements, refit
+    from ceres_cal.moves.refit_plan import RefitOptions
+    from ceres_cal.moves.refits import movements, refit
     from ceres_cal.report.quality import quality_of
 
     photographs = report_photographs(args, observations, calibration, images)

@@ -14,7 +14,7 @@ from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.moves import Agreement, Agreements
+    from ceres_cal.moves.agreement import Agreement, Agreements
 
 _MOST_VIEWS = 3  # shown
 
@@ -46,7 +46,7 @@ def _run(args: ScoreArguments) -> Document:
     require_different(args.observations)
     from dataclasses import replace
 
-    from ceres_cal.moves import score
+    from ceres_cal.moves.scores import score
 
     calibration = read_calibration(args.calibration)
     asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}

@@ -1,30 +1,26 @@
 """Reading what is left over: a table, what it says of the model, the choice of lens by held-out error."""
 
+from ceres_cal.diagnostics.checks import CHECKS, Check, DiagnosisCase, Tested
 from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE, Diagnosis, diagnose
-from ceres_cal.diagnostics.diagnostic import Amount, Case, Diagnostic, Evidence, Finding, ScoreTest, Tested, Words
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.registry import DIAGNOSTICS
-from ceres_cal.diagnostics.scores import Family
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summaries, Summary
 from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.effects.amounts import Amount
+from ceres_cal.effects.effect import Finding
 
 __all__ = [
-    "DIAGNOSTICS",
+    "CHECKS",
     "FALSE_ALARM_RATE",
     "Amount",
-    "Case",
+    "Check",
     "Diagnosis",
-    "Diagnostic",
-    "Evidence",
-    "Family",
+    "DiagnosisCase",
     "Finding",
     "Noise",
     "RadiusTrend",
     "ResidualTable",
-    "ScoreTest",
     "Summaries",
     "Summary",
     "Tested",
-    "Words",
     "diagnose",
 ]

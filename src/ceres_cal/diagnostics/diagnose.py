@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.numerical import numerical
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.diagnostic import Case, Finding, Tested
+from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Tested, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
-from ceres_cal.diagnostics.of_observations import with_newcomers_placed
-from ceres_cal.diagnostics.of_target import recalled
-from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
-from ceres_cal.diagnostics.scores import AlternativeSums, select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
+from ceres_cal.effects.columns import EffectSums
+from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
+from ceres_cal.effects.score_tests import select
+from ceres_cal.effects.table import EFFECTS, columns_of_all
+from ceres_cal.effects.table.target import CurveAside, PointAside
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
+from ceres_cal.problem.parameters import Estimate, Layout
+from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import Residuals, residuals
+from ceres_cal.robust.poses import with_lost_boards_posed
 from ceres_cal.robust.stated import Conflict
 
 FALSE_ALARM_RATE = 0.01
@@ -88,7 +95,7 @@ def diagnose(
     _require_known(calibration, observations, new_data)
     case = _case(calibration, observations, new_data)
     tested = _tested(case, false_alarm_rate)
-    findings = [finding for one in DIAGNOSTICS.values() for finding in one.findings(tested)]
+    findings = list(_findings(tested))
     if any(conflict.kind != "tolerance" for conflict in calibration.conflicts):  # which bends the rest to itself
         findings = [replace(f, advice=f"{_FIRST}; {f.advice}") if f.is_model_error else f for f in findings]
     return Diagnosis(
@@ -104,6 +111,21 @@ def diagnose(
     )
 
 
+def _findings(tested: Tested) -> Iterator[Finding]:
+    """Of effects, also of those that the calibration solved for by itself, and of checks."""
+    solved = {(one.kind, one.subject, one.frame) for one in tested.case.effects}
+    for effect in EFFECTS.values():
+        for finding in effect.findings(tested.case, tested.selection):
+            if (finding.kind, finding.subject, finding.frame) in solved:
+                finding = replace(finding, wrong="observations", sentence=f"{finding.sentence}; it was solved for")
+            yield finding
+        for one in tested.case.as_built:
+            if one.kind == effect.built and one.probability >= 1.0 - tested.rate:
+                yield solved_for(effect.kind, one, tested)
+    for check in CHECKS.values():
+        yield from check.findings(tested)
+
+
 def _require_known(calibration: Calibration, observations: Observations, new_data: bool) -> None:
     if not new_data and observations.digest != calibration.digest:
         raise InputError(
@@ -117,12 +139,12 @@ def _require_known(calibration: Calibration, observations: Observations, new_dat
         require_stations(calibration, observations)
 
 
-def _case(calibration: Calibration, observations: Observations, new_data: bool) -> Case:
+def _case(calibration: Calibration, observations: Observations, new_data: bool) -> DiagnosisCase:
     """Everything there is to read, with those that were taken out and may speak again."""
     problem = calibration.problem(observations, new_data=new_data)
     estimate = calibration.estimate
     if new_data:
-        estimate = with_newcomers_placed(observations, problem, calibration)
+        estimate = _with_newcomers_placed(observations, problem, calibration)
     there = residuals(observations, problem.sights, estimate)
     inliers = _judged(calibration, observations, there, new_data)
     equations = write_equations(observations, problem.sights, estimate, there)
@@ -133,9 +155,9 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
         model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
     labels = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
-    other, as_built = (calibration, ()) if new_data else (None, calibration.as_built)
-    case = Case(observations, problem, estimate, inliers, model, table, labels, other, as_built)
-    used = recalled(case)
+    known = (calibration,) if new_data else (None, calibration.as_built, calibration.effects)
+    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, *known)
+    used = _recalled(case)
     if np.array_equal(used, model.used):
         return case
     again = Weights(weights.inverse_sigma, used, np.where(model.used, weights.robust, 1.0))
@@ -156,10 +178,10 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
     )
 
 
-def _tested(case: Case, rate: float) -> Tested:
+def _tested(case: DiagnosisCase, rate: float) -> Tested:
     """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
-    alternatives = [AlternativeSums.of(case.model, family) for family in all_families(case)]
-    extra = sum(one.tests(case) for one in DIAGNOSTICS.values())
+    alternatives = [EffectSums.of(case.model, columns) for columns in columns_of_all(case)]
+    extra = sum(one.tests(case) for one in CHECKS.values())
     selection = select(case.model, alternatives, rate, extra)
     noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
     level = selection.log_level
@@ -168,3 +190,96 @@ def _tested(case: Case, rate: float) -> Tested:
         selection = select(case.model, alternatives, rate, extra, inflation)
         noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
     return Tested(case, selection, noise, rate)
+
+
+# Rejected observations of one line that must agree on its place: two determine it, three more do not by chance.
+# Nothing changes from half to double.
+_FEWEST_AGREE = 5
+# What lies farther aside is no painting error: its label is wrong. Nothing changes from half to double.
+_FAR_M = 0.1
+
+
+# ---- observations that were taken out and may speak again -----------------------------------------------------------
+
+
+def _recalled(case: DiagnosisCase) -> Mask:
+    """(E,) which equations take part when lines and points that were taken out nearly whole may speak too.
+
+    A feature that lies aside is an outlier everywhere. Where more of its observations agree about one place of their
+    own than agree with the drawing, those take part instead.
+    """
+    equations, weight, used = case.equations, case.model.weight, case.model.used.copy()
+    open_to_it = ~_mislabelled(case)[equations.observation]
+    counted = replace(case, model=replace(case.model, used=open_to_it))
+    for effect in (*CurveAside().columns(counted), *PointAside().columns(counted)):
+        own = (effect.group >= 0) & open_to_it
+        rejected = np.bincount(effect.group[own & ~used], minlength=len(effect.subjects))
+        for number in np.flatnonzero(rejected >= _FEWEST_AGREE):
+            rows = np.flatnonzero(own & (effect.group == number))
+            agree = _agreeing(effect.columns[rows] * weight[rows, None], equations.residual[rows] * weight[rows],
+                              equations.observation[rows], case.problem.options.reject_sigma)  # fmt: skip
+            if np.count_nonzero(agree) > max(int(np.count_nonzero(used[rows])), _FEWEST_AGREE - 1):
+                used[rows] = agree
+    return used
+
+
+def _mislabelled(case: DiagnosisCase) -> Mask:
+    """(N + M,) the observations that a wrong label explains."""
+    points = len(case.observations.points)
+    explained = np.zeros(len(case.table), dtype=bool)
+    for label in case.labels.mislabelled:
+        explained[label.rows + (points if label.is_curve else 0)] = True
+    return explained
+
+
+def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
+    """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
+    columns = columns[:, np.any(columns != 0.0, axis=0)]
+    amount: Array = np.zeros(columns.shape[1])
+    for _ in range(30):
+        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
+        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
+    _, of = np.unique(observation, return_inverse=True)
+    lengths = np.sqrt(np.bincount(of, (residual + columns @ amount) ** 2))
+    agree = (lengths <= reject_sigma)[of]
+    return agree if np.all(np.abs(amount) < _FAR_M) else np.zeros(len(agree), dtype=bool)
+
+
+# ---- new observations ------------------------------------------------------------------------------------------------
+
+
+def _with_newcomers_placed(observations: Observations, problem: Problem, calibration: Calibration) -> Estimate:
+    """The calibration's estimate with every placement that is new among the observations in its best pose.
+
+    Raises:
+        DegenerateError: one of them cannot be posed: fewer than six points, or points in disagreement.
+    """
+    estimate = calibration.estimate
+    new = frozenset(key.placement for key in problem.sights.keys if key.placement) - set(estimate.placements)
+    if not new:
+        return estimate
+    fit, options = calibration.fit, calibration.options
+    behind = Pose(np.eye(3), np.array([0.0, 0.0, -1e6]))  # no camera sees it: any pose is better
+    unplaced = {
+        name: estimate.stations[_first_station(observations, name)].cam_from_world.inverse @ behind for name in new
+    }
+    start = replace(estimate, placements={**estimate.placements, **unplaced})
+    nothing = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
+    blank = Inliers(*nothing, fit.point_scale, fit.curve_scale, np.empty(0), np.empty(0))
+    free = {name: np.empty(0, dtype=np.int64) for name in estimate.cameras}
+    weighting = Weighting(fit.point_scale, fit.curve_scale, "cauchy", options.loss_scale)
+    newcomers = Problem(
+        problem.sights.take(problem.sights.numbers(placements=new)), Layout(free, frozenset(), new), weighting=weighting
+    )
+    posed, _ = with_lost_boards_posed(newcomers, blank, start)
+    for name, pose in unplaced.items():
+        if posed.placements[name] == pose:
+            raise DegenerateError(
+                f"placement {name!r} is not in the calibration and cannot be posed from its points: give at least six "
+                "points of it in one view, or leave its views out"
+            )
+    return posed
+
+
+def _first_station(observations: Observations, placement: str) -> str:
+    return next(view.station for view in observations.views if view.placement == placement)

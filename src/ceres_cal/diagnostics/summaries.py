@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.diagnostics.diagnostic import Case
-from ceres_cal.diagnostics.table import ResidualTable, numbers_of
+from ceres_cal.base.arrays import Array, Indices, Mask, numbers_of
+from ceres_cal.diagnostics.checks import DiagnosisCase
+from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.scene.camera import Camera
 
@@ -69,7 +69,7 @@ class Summaries:
     trends: tuple[RadiusTrend, ...]
 
 
-def summarise(case: Case) -> Summaries:
+def summarise(case: DiagnosisCase) -> Summaries:
     """All summaries of a table."""
     observations, table, cameras = case.observations, case.table, case.estimate.cameras
     several = len(observations.stations) > 1

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask, numbers_of
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
-from ceres_cal.problem.equations import Equations
+from ceres_cal.problem.equations import Equations, pairs_of, plane_shift
 from ceres_cal.problem.noise import Inliers
 from ceres_cal.scene.camera import Camera
 
@@ -184,12 +184,6 @@ def make_table(
     )
 
 
-def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
-    """Which of the known names each one is."""
-    order = {name: number for number, name in enumerate(known)}
-    return np.array([order[name] for name in names], dtype=np.int64)
-
-
 def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """All features as "target/name", points of all targets first, and where each target's points and curves begin."""
     targets = observations.targets
@@ -219,26 +213,6 @@ def error_mm(equations: Equations, values: Array, count: int) -> Array:
         answer[equations.observation[curves]] = x[curves]
         answer[equations.observation[~curves]] = np.hypot(x, y)[~curves]
     return np.where(np.isfinite(answer), answer, np.nan)
-
-
-def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
-    """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""
-    x, y = np.zeros(len(equations)), np.zeros(len(equations))
-    first, second = pairs_of(equations)
-    (a, b), (c, d) = equations.built[first, :2].T, equations.built[second, :2].T
-    p, q = values[first], values[second]
-    determinant = a * d - b * c
-    x[first] = x[second] = 1e3 * (d * p - b * q) / determinant
-    y[first] = y[second] = 1e3 * (a * q - c * p) / determinant
-    curves = np.flatnonzero(equations.is_curve)
-    x[curves] = 1e3 * values[curves] / np.hypot(*equations.built[curves, :2].T)  # it grows fastest across the curve
-    return x, y
-
-
-def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
-    """The two equations of each point, which follow one another."""
-    first, second = np.flatnonzero(~equations.is_curve).reshape(-1, 2).T
-    return first, second
 
 
 def _mean_leverage(model: Linearised, count: int) -> Array:

@@ -1,6 +1,6 @@
 """What the residuals say of the errors' dependence, as one covariance of everything shared (a sandwich).
 
-First what goes together within a view, then whether views scatter as that says (`effects/between.py`). In
+First what goes together within a view, then whether views scatter as that says (`effects/groups.py`). In
 directions in which the model knows everything shared to one (root root^T its covariance) the observations, of
 information A, have a score of covariance C = M - P with P the priors: with S = root^T A and B = S root they say
 A + S^T (C^-1 - B^-1) S instead of A. Priors are as certain as they were; what nothing tells stays unknown.
@@ -21,13 +21,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import student_95
 from ceres_cal.base.words import two_digits
-from ceres_cal.effects.between import FEWEST_GROUPS, INDEPENDENT, Between, compare_groups
+from ceres_cal.effects.groups import FEWEST_GROUPS, INDEPENDENT, Between, GroupNormals, compare_groups
 from ceres_cal.effects.likelihood import Likelihoods, is_loud, likelihoods
-from ceres_cal.effects.sample import Sample, take_sample
-from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of
+from ceres_cal.effects.linearised import Linearised
+from ceres_cal.effects.sample import sampled, views_or_placements
+from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of, families_of, go_over_groups
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import Estimate
@@ -72,18 +73,23 @@ class Covariances:
     kinds: tuple[Correlation, ...] = ()
 
 
-def correlated(sample: Sample) -> Covariances:
-    """The covariance of each group's score, with what errors have in common."""
-    scores, private, inverse, kinds = sample.informations.copy(), [1.0], 0.0, []
+def correlated(model: Linearised, group: Indices, informations: Array) -> Covariances:
+    """The covariance of each group's score, with what errors have in common.
+
+    Args:
+        model: of some views, in directions in which everything is known to one. group: (E,) of the G views or
+            placements that are compared. informations: (G, P, P) of each, were errors independent.
+    """
+    scores, private, inverse, kinds = informations.copy(), [1.0], 0.0, []
     for is_curve, kind in ((False, "points"), (True, "curves")):
-        rows = sample.is_curve == is_curve
+        rows = model.equations.is_curve == is_curve
         if np.count_nonzero(rows) < _FEWEST_ROWS:
             continue
-        families = sample.families(is_curve)
+        families = families_of(model, group, is_curve)
         if not any(map(is_loud, families)):
             continue
-        average = _Average.of(sample, families, rows, may_be_smooth=not is_curve)
-        change, factor = average.change(sample)
+        average = _Average.of(model.shared, families, rows, may_be_smooth=not is_curve)
+        change, factor = average.change(model.columns, group)
         scores += change
         private.append(factor)
         inverse += average.inverse_freedom
@@ -107,9 +113,9 @@ class _Average:
     inverse_freedom: float
 
     @classmethod
-    def of(cls, sample: Sample, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
+    def of(cls, shared: Array, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
         """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
-        own = np.sum(sample.shared[rows] ** 2)
+        own = np.sum(shared[rows] ** 2)
         at = likelihoods(families, may_be_smooth, float(own))
         weight = np.full(len(at.share), (1.0 - INDEPENDENT) / max(len(at.share) - 1, 1))
         weight[0] = INDEPENDENT
@@ -118,7 +124,7 @@ class _Average:
         weight /= weight.sum()
         weight[weight < _NEGLIGIBLE] = 0.0
         weight /= weight.sum()
-        used, rest = weight > 0.0, sample.shared.shape[1] - own  # what all other rows say
+        used, rest = weight > 0.0, shared.shape[1] - own  # what all other rows say
         mixed = 1.0 / _freedom_of_mixture(weight[used], (rest + variance * at.trace)[used])
         return cls(families, at, variance, weight, mixed + float(weight @ at.inverse_freedom))
 
@@ -130,18 +136,23 @@ class _Average:
         share, lasting = float(self.at.share[best]), self.families[int(self.at.family[best])].lasting
         return Correlation(kind, probability, None if aside else length, share, lasting)
 
-    def change(self, sample: Sample) -> tuple[Array, float]:
-        """(G, P, P) what is added to the covariance of each group's score, and the factor on private placements."""
-        scores, private = np.zeros_like(sample.informations), np.zeros(2)
+    def change(self, columns: Array, group: Indices) -> tuple[Array, float]:
+        """(G, P, P) what is added to the covariance of each group's score, and the factor on private placements.
+
+        Args:
+            columns: (E, 6 + P + 1) of the linear model.
+        """
+        size = columns.shape[1] - 7
+        scores, private = np.zeros((int(group.max()) + 1, size, size)), np.zeros(2)
         for number, family in enumerate(self.families):
             here = self.at.family == number
             each, share = (self.weight * self.variance)[here], self.at.share[here]
             alone = float(np.sum(each * (1.0 - share))) - (1.0 if number == 0 else 0.0)
             for strands in map(family.strands.__getitem__, family.of_shape):
                 kernel = self._kernel(strands[0], here, each * share)
-                x = sample.columns[np.array([strand.rows for strand in strands])][..., :-1]
+                x = columns[np.array([strand.rows for strand in strands])][..., :-1]
                 product = np.swapaxes(x, 1, 2) @ (alone * x + kernel @ x)
-                np.add.at(scores, sample.group[[strand.rows[0] for strand in strands]], product[:, 6:, 6:])
+                np.add.at(scores, group[[strand.rows[0] for strand in strands]], product[:, 6:, 6:])
                 if number == 0:
                     private[1] += float(np.sum(x[..., :6] ** 2))
                 # What moves all of a view is not its scatter.
@@ -261,23 +272,27 @@ def measure_scatter(
         problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
             problem says there.
     """
-    sample = take_sample(observations, problem, there, estimate, reduced)
-    if sample is None or not sample.root.shape[1]:
+    model = sampled(observations, problem, there, estimate, reduced)
+    if model is None or not model.root.shape[1]:
         return None
-    within = correlated(sample)
-    whole = _whole(sample, within.scores)
-    lasting = sample.is_shared and any(kind.lasting for kind in within.kinds)
+    group = views_or_placements(model.equations)
+    prior = model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root
+    groups = GroupNormals.of(model, group, prior)
+    within = correlated(model, group, groups.normal)
+    whole = _whole(groups, within.scores)
+    lasting = any(kind.lasting for kind in within.kinds) and go_over_groups(model.equations, group)
     between, inverse = None, within.inverse_freedom
-    compared = compare_groups(sample, within.scores, whole) if sample.groups >= FEWEST_GROUPS and not lasting else None
+    enough = len(groups.counts) >= FEWEST_GROUPS and not lasting
+    compared = compare_groups(groups, within.scores, whole) if enough else None
     if compared is not None:
         between, whole = compared
         inverse += between.probability / between.degrees_of_freedom
-    return Scatter(sample.root, whole, Dependence(within.kinds, between, within.private, inverse))
+    return Scatter(model.root, whole, Dependence(within.kinds, between, within.private, inverse))
 
 
-def _whole(sample: Sample, scores: Array) -> Array:
+def _whole(groups: GroupNormals, scores: Array) -> Array:
     """(P, P) covariance of the score of everything: the views that were not looked at scatter like those that were."""
-    seen, everything = sample.informations.sum(axis=0), np.eye(len(sample.prior)) - sample.prior
+    seen, everything = groups.normal.sum(axis=0), np.eye(len(groups.known)) - groups.known
     values, vectors = np.linalg.eigh(seen)
     determined = values > 1e-6
     back = vectors[:, determined] / np.sqrt(values[determined])

@@ -27,6 +27,33 @@ _ONE = 1.0  # directions of the least size that count along, so that few data do
 _NO_SCATTER = np.zeros(1)
 
 
+@dataclass(frozen=True)
+class SizePrior:
+    """What is expected of an effect's size before anything was seen.
+
+    Attributes:
+        absent: probability that there is no such effect. sizes: standard deviations of its amounts that may be, each
+            as likely.
+    """
+
+    absent: float
+    sizes: tuple[float, ...]
+
+    @property
+    def scatter(self) -> Array:
+        """(1 + N,) no size, and the sizes."""
+        return np.append(0.0, self.sizes)
+
+    @property
+    def probabilities(self) -> Array:
+        """(1 + N,) of these."""
+        return np.append(self.absent, np.full(len(self.sizes), (1.0 - self.absent) / len(self.sizes)))
+
+    def times(self, unit: float) -> SizePrior:
+        """In another unit: sizes are so many times as large."""
+        return SizePrior(self.absent, tuple(unit * size for size in self.sizes))
+
+
 @dataclass(frozen=True, eq=False)
 class RandomEffects:
     """What residuals say of Q numbers, in the R independent directions that they determine.
@@ -77,6 +104,17 @@ class RandomEffects:
         left = self.rest + np.sum(self.value**2) - explained
         fit = -0.5 * self.freedom * np.log(left / max(self.freedom, 1.0))
         return np.broadcast_to(logs + fit, (len(modes), len(scatter)))
+
+    def scatter_under(self, prior: SizePrior) -> tuple[float, float]:
+        """Root of the mean variance of the numbers, where they scatter at all, and the probability that they do.
+
+        Few numbers leave their variance open: its mean then goes far beyond the likeliest, and what is solved for is
+        held by little.
+        """
+        logs = self.log_evidence(scatter=prior.scatter)[0]
+        weight = prior.probabilities * np.exp(logs - logs.max())
+        variances = prior.scatter[1:] ** 2
+        return float(np.sqrt(weight[1:] @ variances / weight[1:].sum())), float(1.0 - weight[0] / weight.sum())
 
     def amounts(self, root: Array, scatter: float = 0.0) -> tuple[Array, Array]:
         """(Z,) likeliest amounts of a root (Q, Z), best linear unbiased predictions, and (Z,) standard deviations."""

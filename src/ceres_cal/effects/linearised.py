@@ -3,7 +3,8 @@
 The linear model of the bundle at its end, in standard deviations: placements that one sight shows are projected out
 sight by sight, everything shared by one triangular factor, priors as equations of their own. Then a column over the
 equations (an alternative to the model) has a part that the calibration would have absorbed and a part that it cannot;
-the score test (Rao 1948) looks at the second part alone.
+the score test (Rao 1948) looks at the second part alone. It is the only linear model: of all equations or of those of
+some sights, in directions of what all of them know (`linearise_within`) or of what these know by themselves.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import ranges
 from ceres_cal.problem.costs import robust_weights
 from ceres_cal.problem.equations import Equations, of_observations
-from ceres_cal.problem.information import Key, columns_by_owner
+from ceres_cal.problem.information import Information, Key, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
@@ -29,6 +30,7 @@ LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
 SINGULAR = 1e-12
 """Share of its own information that a number must keep beside the others."""
+_DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +92,7 @@ class Linearised:
         score: (E,) robust residuals, in standard deviations; 0 where an equation is not used.
         private: (E, 6) basis of what each private placement does to its sight's equations, 0 elsewhere.
         shared: (E, P) basis of what shared numbers do beyond that; with priors of less than unit length.
+        root: (K, P) from these directions to the K shared numbers.
         step: (P,) how far each direction of `shared` is from its best value, in standard deviations.
         unknowns: how many free numbers the equations determine. prior_equations: how many equations priors add.
         known_noise: equations that what was known of the noise before counts as.
@@ -101,6 +104,7 @@ class Linearised:
     score: Array
     private: Array
     shared: Array
+    root: Array
     step: Array
     unknowns: int
     prior_equations: int
@@ -141,6 +145,11 @@ class Linearised:
         return self.beyond_private(self.score[:, None])[:, 0]
 
     @cached_property
+    def columns(self) -> Array:
+        """(E, 6 + P + 1) private, shared, and `placed_score`."""
+        return np.column_stack([self.private, self.shared, self.placed_score])
+
+    @cached_property
     def left_over(self) -> Array:
         """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
         return np.where(self.used, self.placed_score - self.shared @ self.step, 0.0)
@@ -163,6 +172,14 @@ class Linearised:
         inside = rest[self.used]
         return inside.T @ inside - taken.T @ taken, inside.T @ self.score[self.used] - taken.T @ self.step
 
+    def beside_prior(self, prior: Array) -> Linearised:
+        """The same where these equations and a prior (P, P) in the directions of `shared` are all that is known: in
+        directions in which they know everything to one, from where the equations' least squares are.
+        """
+        back = np.linalg.inv(np.linalg.cholesky(self.shared.T @ self.shared + prior)).T
+        shared = self.shared @ back
+        return replace(self, shared=shared, root=self.root @ back, step=shared.T @ self.placed_score)
+
     def with_columns(self, columns: Array) -> Linearised:
         """The same model with these numbers free."""
         more = self.freed(columns)
@@ -170,6 +187,7 @@ class Linearised:
         return replace(
             self,
             shared=np.hstack([self.shared, basis]),
+            root=np.hstack([self.root, -self.root @ more.taken @ more.root]),
             step=np.concatenate([self.step, more.step]),
             unknowns=self.unknowns + more.root.shape[1],
         )
@@ -182,6 +200,15 @@ class Linearised:
         determined = left > LEAST_LEFT * np.sum(scaled[self.used] ** 2, axis=0)
         slope = rest[self.used].T @ self.score[self.used] - taken.T @ self.step
         return np.where(determined, slope**2 / np.where(determined, left, 1.0), 0.0)
+
+    def taken_by(self, columns: Array) -> Array:
+        """(K, Q) how the shared numbers move with more numbers, columns (E, Q), px per unit, that are at one."""
+        return -self.root @ self._projected(columns * self.weight[:, None])[1]
+
+    def left_of_column(self, column: Array) -> Array:
+        """(E,) what is left of a column, in standard deviations, once everything free followed it."""
+        rest, taken = self._projected(column[:, None])
+        return np.asarray(rest[:, 0] - self.shared @ taken[:, 0])
 
     def unabsorbed(self, shift: Array) -> Array:
         """(E,) px of a displacement (E,) px that the free numbers could not have taken up."""
@@ -267,10 +294,40 @@ def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations
     return replace(
         blank,
         shared=rest @ root,
+        root=root,
         step=root.T @ gradient,
         unknowns=blank.unknowns + root.shape[1],
         prior_equations=len(prior_rows),
     )
+
+
+def linearise_within(
+    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, known: Information
+) -> Linearised:
+    """Some equations in directions in which everything shared is known to one by all that there is.
+
+    Args:
+        known: of the shared numbers, by all equations and priors. `step` is 0: the whole is at its optimum.
+    """
+    blank, columns = without_shared(problem, estimate, equations, weights)
+    root = known_root(known)
+    return replace(blank, shared=blank.beyond_private(columns) @ root, root=root, step=np.zeros(root.shape[1]))
+
+
+def known_root(shared: Information) -> Array:
+    """(K, P) from directions in which all but the structure is known to one, which follows, to the shared numbers.
+
+    How far the targets were built from their drawings has a scatter of its own (see `robust.as_built`).
+    """
+    size, matrix = len(shared.keys), shared.matrix
+    rest = np.array([key.kind != "structure" for key in shared.keys])
+    if rest.all():
+        return inverse_root(matrix, np.diagonal(matrix), _DETERMINED)
+    follows = np.zeros((size, int(np.count_nonzero(rest))))
+    follows[rest] = np.eye(follows.shape[1])
+    follows[~rest] = -np.linalg.solve(matrix[np.ix_(~rest, ~rest)], matrix[np.ix_(~rest, rest)])
+    left = matrix[rest] @ follows
+    return np.asarray(follows @ inverse_root(0.5 * (left + left.T), np.diagonal(left), _DETERMINED))
 
 
 def without_shared(
@@ -281,8 +338,8 @@ def without_shared(
     score = np.where(used, weights.robust * weight * equations.residual, 0.0)
     private, count = _private_basis(equations, problem, weight, used)
     columns = shared_columns(equations, estimate, free_keys(estimate, problem.layout, problem.private))
-    nothing = np.zeros((len(equations), 0))
-    blank = Linearised(equations, weight, used, score, private, nothing, np.zeros(0), count, 0)
+    shared, root = np.zeros((len(equations), 0)), np.zeros((columns.shape[1], 0))
+    blank = Linearised(equations, weight, used, score, private, shared, root, np.zeros(0), count, 0)
     return blank, columns * weight[:, None]
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
+from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.evidence import RandomEffects, logsum
 from ceres_cal.effects.linearised import Linearised
 
@@ -104,11 +105,10 @@ def measure_offsets(model: Linearised, columns: Array, group: Indices, fault: Fa
     """
     groups, width = int(group.max()) + 1, columns.shape[1]
     rows = np.flatnonzero((group >= 0) & model.used)
-    every = np.zeros((len(group), groups, width))
-    every[rows, group[rows]] = columns[rows] / model.weight[rows, None]
-    flat = every.reshape(len(group), -1)
-    there = np.flatnonzero(np.any(flat != 0.0, axis=0))
-    normal, slope = model.left_of(flat[:, there])
+    every = SparseColumns.of_groups(model, columns, group, groups)
+    there = np.flatnonzero(every.summed(every.values))
+    normal, slope = every.left_of(model)
+    normal, slope = normal[np.ix_(there, there)], slope[there]
     effects = RandomEffects.of(normal, slope, _DETERMINED * float(np.bincount(group[rows]).max()))
     rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
     least = model.spare * (_LEAST_PX * median(model.weight[rows])) ** 2

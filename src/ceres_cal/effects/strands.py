@@ -11,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.base.cached import cached_property
+from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations.sights import bounds_of
 from ceres_cal.problem.equations import Equations
 
@@ -36,21 +37,55 @@ class Strand:
         return self.places.tobytes()
 
 
-def strands_of(equations: Equations, owner: Indices) -> Iterator[Strand]:
-    """The curves, and the image axes of points, of each owner (E,): a view or a sight."""
-    axis = (equations.direction[:, 1] > 0.5).astype(np.int64)
-    what = np.where(equations.is_curve, equations.feature + 2, axis)
-    name = owner * (what.max() + 1) + what
+def strands_of(equations: Equations, owner: Indices, rows: Indices) -> Iterator[Strand]:
+    """The curves, and the image axes of points, of each owner (E,), a view or a sight, among some rows."""
+    name = _names_of(equations, owner)[rows]
     order = np.argsort(name, kind="stable")
     ends = np.flatnonzero(np.diff(name[order], append=-1)) + 1
     start = 0
     for end in ends.tolist():
-        rows, start = order[start:end], end
-        places = equations.place[rows]
-        if equations.is_curve[rows[0]]:
+        own, start = rows[order[start:end]], end
+        places = equations.place[own]
+        if equations.is_curve[own[0]]:
             along = np.argsort(places @ _along(places), kind="stable")
-            rows, places = rows[along], places[along]
-        yield Strand(rows, places)
+            own, places = own[along], places[along]
+        yield Strand(own, places)
+
+
+def _names_of(equations: Equations, owner: Indices) -> Indices:
+    """(E,) number of the strand that each equation is of."""
+    axis = (equations.direction[:, 1] > 0.5).astype(np.int64)
+    what = np.where(equations.is_curve, equations.feature + 2, axis)
+    return np.asarray(owner * (what.max() + 1) + what)
+
+
+def go_over_groups(equations: Equations, group: Indices) -> bool:
+    """Whether some strand of a sight goes over several groups (E,)."""
+    names = _names_of(equations, equations.sight)
+    return len(distinct(names * (int(group.max()) + 1) + group)) > len(distinct(names))
+
+
+def families_of(model: Linearised, group: Indices, curves: bool) -> list[StrandFamily]:
+    """The strands of curves or of points, within views and then, where some sight has several, over all of a sight.
+
+    Args:
+        group: (E,) of the views or placements that are compared with one another.
+    """
+    equations = model.equations
+    families, rows = [], np.flatnonzero(equations.is_curve == curves)
+    for lasting, owner in ((False, equations.view), (True, equations.sight)):
+        if lasting and not _has_several_views(equations):
+            continue
+        if strands := list(strands_of(equations, owner, rows)):
+            families.append(StrandFamily.of(strands, lasting, model.columns, group))
+    return families
+
+
+def _has_several_views(equations: Equations) -> bool:
+    """Whether some sight has several views."""
+    sight_of_view = np.full(int(equations.view.max()) + 1, -1)
+    sight_of_view[equations.view] = equations.sight
+    return bool(np.max(np.bincount(sight_of_view[sight_of_view >= 0])) > 1)
 
 
 def _along(places: Array) -> Array:

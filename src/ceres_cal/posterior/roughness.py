@@ -18,15 +18,13 @@ products of different sights do.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.effects.evidence import agreement as agreement_of
 from ceres_cal.effects.evidence import likeliest_sizes
-from ceres_cal.effects.linearised import Linearised, equation_weights, without_shared
-from ceres_cal.effects.sample import known_root
+from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.equations import Equations, equations_of
@@ -134,63 +132,43 @@ def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tupl
     if max(agreement(end, observations.cameras), agreement_in_rings(end)) <= AGREES:
         return (), ()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
-    left = _Left.of(end, observations, reduced)
-    every = [left.shifts_of(name, camera) for name, camera in end.solution.estimate.cameras.items()]
+    model = _linearised(end, observations, reduced)
+    every = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]
     return reduced.shared.keys, [shift for shifts in every for shift in shifts]
 
 
-@dataclass(frozen=True, eq=False)
-class _Left:
-    """What the free numbers leave of some equations, in standard deviations.
+def _linearised(end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> Linearised:
+    """Some sights' equations, beside their share of what was known before."""
+    problem, estimate = end.problem, end.solution.estimate
+    every = max(1, -(-problem.sights.equations // _MOST_EQUATIONS))
+    sights = problem.sights[::every]
+    equations = equations_of(observations, sights, estimate, end.residuals)
+    weights = equation_weights(observations, problem.weighting, equations, end.residuals).within_sigma
+    model = linearise_within(problem, estimate, equations, weights, reduced.shared)
+    share = sights.equations / problem.sights.equations
+    return model.beside_prior(share * model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root)
 
-    Attributes:
-        model: of private placements alone. shared: (E, P) directions of the shared numbers beyond these. root: (K, P)
-            from them to the numbers. normal: (P, P) what the equations and the priors say of them.
-    """
 
-    model: Linearised
-    shared: Array
-    root: Array
-    normal: Array
-
-    @classmethod
-    def of(cls, end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> _Left:
-        problem, estimate = end.problem, end.solution.estimate
-        every = max(1, -(-problem.sights.equations // _MOST_EQUATIONS))
-        sights = problem.sights[::every]
-        equations = equations_of(observations, sights, estimate, end.residuals)
-        weights = equation_weights(observations, problem.weighting, equations, end.residuals).within_sigma
-        model, columns = without_shared(problem, estimate, equations, weights)
-        root = known_root(reduced.shared)
-        shared = model.beyond_private(columns @ root)
-        share = sights.equations / problem.sights.equations
-        prior = root.T @ reduced.priors.over(reduced.shared.keys).matrix @ root
-        return cls(model, shared, root, shared.T @ shared + share * prior)
-
-    def shifts_of(self, name: str, camera: Camera) -> Array:
-        """(R, K) by the bumps of a camera's image."""
-        equations, rows = self.model.equations, self.model.equations.bounds[:-1]
-        own = equations.of_sights(np.array([key.camera == name for key in equations.sights.keys]))
-        every = list(_bumps(equations, camera, own))
-        kind = np.repeat(np.arange(len(every)), [columns.shape[1] for columns in every])
-        inside = self.model.beyond_private(np.hstack(every) * (own * self.model.weight)[:, None])
-        taken = self.shared.T @ inside
-        moved = np.linalg.solve(self.normal, taken)
-        normal = inside.T @ inside - taken.T @ moved
-        score = self.model.placed_score
-        score = score - self.shared @ np.linalg.solve(self.normal, self.shared.T @ score)
-        slope = inside.T @ score
-        best = np.linalg.solve(normal + np.eye(len(kind)) / _LOOSE_PX**2, slope)
-        rest = score - inside @ best + self.shared @ (moved @ best)
-        scatter = np.add.reduceat(inside * rest[:, None], rows), np.add.reduceat(inside**2, rows)
-        within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
-        forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
-        loose, least = np.full((2, len(every)), [[_LOOSE_PX], [_LEAST_PX]])
-        sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, _AT_REST)
-        covariance = np.linalg.inv(sizes.precision)
-        values, vectors = np.linalg.eigh(covariance + np.outer(sizes.amount, sizes.amount))
-        half = vectors * np.sqrt(np.maximum(values, 0.0))
-        return np.asarray(np.linalg.qr((self.root @ moved @ half).T, mode="r"))
+def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
+    """(R, K) by the bumps of a camera's image."""
+    equations, rows = model.equations, model.equations.bounds[:-1]
+    own = equations.of_sights(np.array([key.camera == name for key in equations.sights.keys]))
+    every = list(_bumps(equations, camera, own))
+    kind = np.repeat(np.arange(len(every)), [columns.shape[1] for columns in every])
+    inside = model.beyond_private(np.hstack(every) * (own * model.weight)[:, None])
+    taken = model.shared.T @ inside
+    normal, slope = inside.T @ inside - taken.T @ taken, inside.T @ model.left_over
+    best = np.linalg.solve(normal + np.eye(len(kind)) / _LOOSE_PX**2, slope)
+    rest = model.left_over - inside @ best + model.shared @ (taken @ best)
+    scatter = np.add.reduceat(inside * rest[:, None], rows), np.add.reduceat(inside**2, rows)
+    within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
+    forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
+    loose, least = np.full((2, len(every)), [[_LOOSE_PX], [_LEAST_PX]])
+    sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, _AT_REST)
+    covariance = np.linalg.inv(sizes.precision)
+    values, vectors = np.linalg.eigh(covariance + np.outer(sizes.amount, sizes.amount))
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(np.linalg.qr((model.root @ taken @ half).T, mode="r"))
 
 
 def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:

@@ -85,6 +85,26 @@ class Equations:
         return columns if structure.mixing is None else columns @ structure.mixing
 
 
+def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
+    """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""
+    x, y = np.zeros(len(equations)), np.zeros(len(equations))
+    first, second = pairs_of(equations)
+    (a, b), (c, d) = equations.built[first, :2].T, equations.built[second, :2].T
+    p, q = values[first], values[second]
+    determinant = a * d - b * c
+    x[first] = x[second] = 1e3 * (d * p - b * q) / determinant
+    y[first] = y[second] = 1e3 * (a * q - c * p) / determinant
+    curves = np.flatnonzero(equations.is_curve)
+    x[curves] = 1e3 * values[curves] / np.hypot(*equations.built[curves, :2].T)  # it grows fastest across the curve
+    return x, y
+
+
+def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
+    """The two equations of each point, which follow one another."""
+    first, second = np.flatnonzero(~equations.is_curve).reshape(-1, 2).T
+    return first, second
+
+
 def whole_structure(targets: Mapping[str, Target]) -> Structure:
     """Everything that could be built otherwise than it is drawn."""
     every = {name: Tolerance(1.0, 1.0, 1.0 if target.bows else 0.0) for name, target in targets.items()}

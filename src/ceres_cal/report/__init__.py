@@ -4,7 +4,9 @@ The only package that imports the plotting library. The page is loaded when it i
 quality of a calibration, few for the page.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.lazy import names_of
 
 if TYPE_CHECKING:
     from ceres_cal.report.material import FramePhotographs as FramePhotographs
@@ -12,11 +14,4 @@ if TYPE_CHECKING:
     from ceres_cal.report.report import write_report as write_report
 
 __all__ = ["FramePhotographs", "make_report", "write_report"]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from ceres_cal.report import report
-
-    return getattr(report, name)
+__getattr__ = names_of(__name__, {"FramePhotographs": "material", "make_report": "report", "write_report": "report"})

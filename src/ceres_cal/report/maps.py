@@ -24,7 +24,7 @@ from ceres_cal.scene.heights import at_height
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ceres_cal.moves import Agreement
+    from ceres_cal.moves.agreement import Agreement
 
 _SERIES = (
     (1.0, 2.0, 5.0),

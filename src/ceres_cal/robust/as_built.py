@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.effects.amounts import AsBuilt
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.priors import gather_priors
@@ -28,7 +29,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.structure import Structure, Tolerance, make_structure, numbers_by_kind, redrawn
 from ceres_cal.robust.competing import Explanation, Solver, compete
-from ceres_cal.robust.repeats import AsBuilt, estimate_as_built
+from ceres_cal.robust.repeats import estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, judge_at, solve_robustly
 from ceres_cal.scene.targets import Target
 
@@ -57,7 +58,7 @@ def solve_as_built(
         every, rounds = now, rounds + 1
         held = _held(problem, make_structure(observations.targets, tolerances_of(every)).carrying(whole))
         start = replace(end.solution.estimate, structure=stated)
-        end = solve_robustly(_taking_part(held, observations, explanations), observations, start, is_near=True)
+        end = solve_robustly(taking_part(held, observations, explanations), observations, start, is_near=True)
         tolerances = {**options.tolerances, **tolerances_of(every)}
         structure = make_structure(observations.targets, tolerances, options.dimensions)
         structure = structure.carrying(whole, end.solution.estimate.structure)
@@ -66,7 +67,7 @@ def solve_as_built(
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
     estimate = replace(end.solution.estimate, structure=structure)
-    part = _taking_part(problem, observations, explanations)
+    part = taking_part(problem, observations, explanations)
     if {view.target for view in observations.views if view.placement is None} & {one.target for one in every}:
         end = solve_robustly(part, observations, estimate, is_near=True)
     else:
@@ -104,7 +105,7 @@ def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> Robus
     return replace(end, problem=replace(end.problem, sights=sights), solution=solution)
 
 
-def _taking_part(problem: Problem, observations: Observations, explanations: Sequence[Explanation]) -> Problem:
+def taking_part(problem: Problem, observations: Observations, explanations: Sequence[Explanation]) -> Problem:
     """The problem without what they took out."""
     rows = [one.rows for one in explanations if one.is_taken]
     if not rows:

@@ -12,8 +12,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs.field import FieldOptions, detect_field
 from ceres_cal.detect.photographs.follow import FAR_PX
-from ceres_cal.moves import FALSE_ALARMS, Agreements, check
-from ceres_cal.moves.checks import not_found
+from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
+from ceres_cal.moves.checks import check, not_found
 from ceres_cal.observations import Observations, combine
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target

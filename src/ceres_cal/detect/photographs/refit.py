@@ -21,6 +21,7 @@ from ceres_cal.scene.targets import Target
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
 _QUICK = Options(max_iterations=30, threads=1)
+ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,11 @@ def observations_of(
 
 
 def problem_of(
-    camera: Camera, observations: Observations, free: tuple[str, ...], priors: tuple[Prior, ...]
+    camera: Camera,
+    observations: Observations,
+    free: tuple[str, ...],
+    priors: tuple[Prior, ...],
+    weighting: Weighting = ROBUST,
 ) -> tuple[Problem, Estimate]:
     """What `refit_camera` solves, and where from."""
     names, solved = intrinsic_names(camera.lens), tuple(prior.dimension for prior in priors if prior.dimension)
@@ -85,20 +90,24 @@ def problem_of(
     )
     layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset())
     known = tuple(stated_prior(prior, camera.lens) for prior in priors)
-    weighting = Weighting(loss="cauchy", loss_scale=2.0)
     return Problem(gather_sights(observations), layout, known, weighting, _QUICK), estimate
 
 
 def refit_camera(
-    camera: Camera, observations: Observations, free: tuple[str, ...] = (), priors: tuple[Prior, ...] = ()
+    camera: Camera,
+    observations: Observations,
+    free: tuple[str, ...] = (),
+    priors: tuple[Prior, ...] = (),
+    weighting: Weighting = ROBUST,
 ) -> tuple[Camera, Target] | None:
     """The posed camera that one view's observations tell, from one that is near, and the target; None where they tell
     none.
 
     Args:
         free: names of the intrinsics that are free too. priors: on them, and on dimensions that are solved for.
+        weighting: noise and loss; by default one under which what is far off decides nothing.
     """
-    problem, estimate = problem_of(camera, observations, free, priors)
+    problem, estimate = problem_of(camera, observations, free, priors, weighting)
     try:
         solution = solve(problem, estimate, precision=1e-6)
         refitted = solution.estimate.camera_at(STATION)

@@ -78,7 +78,7 @@ class Sums {
                 each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
         }
         if (newton_) bend_rows<code>(n, MANY);
-        add_products(MANY * filled);
+        add_rows(MANY * filled);
         for (int i = 0; i < n && seen.slots != nullptr; ++i) {
             double directions[BUILT][3] = {};
             shown_.directions(seen, start + i, i, directions);
@@ -100,28 +100,10 @@ class Sums {
             own_.push_back(shown_.rows.x(shown_.pose_row + k)), places_.push_back(unknowns_.shared() + k);
     }
 
-    // normal += P P^T over the rows' first n places, lower triangle; four rows by three, to read each one less. (Of
-    // more sums at once than the processor has registers for each takes longer.)
-    void add_products(int n) {
-        const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(), stride = size + 3,
-                  end = n & ~(LANES - 1);
-        for (int k = 0; k < count; k += 4) {
-            const double *a = own_[k], *b = own_[std::min(k + 1, last)], *c = own_[std::min(k + 2, last)],
-                         *d = own_[std::min(k + 3, last)];
-            for (int j = 0; j < std::min(k + 4, count); j += 3) {
-                const double *x = own_[j], *y = own_[std::min(j + 1, last)], *z = own_[std::min(j + 2, last)];
-                double ax = 0.0, ay = 0.0, az = 0.0, bx = 0.0, by = 0.0, bz = 0.0;
-                double cx = 0.0, cy = 0.0, cz = 0.0, dx = 0.0, dy = 0.0, dz = 0.0;
-                for (int i = 0; i < end; ++i) {
-                    ax += a[i] * x[i], ay += a[i] * y[i], az += a[i] * z[i];
-                    bx += b[i] * x[i], by += b[i] * y[i], bz += b[i] * z[i];
-                    cx += c[i] * x[i], cy += c[i] * y[i], cz += c[i] * z[i];
-                    dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
-                }
-                const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
-                for (int row = 0; row < 4; ++row) std::copy_n(sums[row], 3, products_.data() + stride * (k + row) + j);
-            }
-        }
+    // normal += P P^T over the rows' first n places, lower triangle.
+    void add_rows(int n) {
+        const int count = static_cast<int>(own_.size()), size = unknowns_.size(), stride = count + 3;
+        find_products(own_.data(), count, n, products_.data());
         for (int k = 0; k < count; ++k) {
             double* own = normal_ + size * places_[k];
             for (int j = 0; j <= k; ++j) own[places_[j]] += products_[stride * k + j];

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import msgspec
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.scene.targets.target import Target, TargetKind, require_size
+from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments, require_size
 
 
 def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
@@ -29,21 +25,8 @@ def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
         raise InputError(f"april-grid: tag_m and gap must be positive numbers, not {tag_m} and {gap}")
     x, y = ([(n // 2 * (1.0 + gap) + n % 2) * tag_m for n in range(2 * count)] for count in (columns, rows))
     points = {f"{c},{r}": (x[c], y[r], 0.0) for r in range(2 * rows) for c in range(2 * columns)}
-    given = _AprilGridSpec("april-grid", int(columns), int(rows), float(tag_m), float(gap))
-    return Target(msgspec.to_builtins(given), points, {}, movable=True, bows=True)
-
-
-class _AprilGridSpec(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    columns: int
-    rows: int
-    tag_m: float
-    gap: float
-
-
-def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _AprilGridSpec, where)
-    return april_grid(given.columns, given.rows, given.tag_m, given.gap)
+    numbers = {"columns": int(columns), "rows": int(rows), "tag_m": float(tag_m), "gap": float(gap)}
+    return Target({"kind": "april-grid", **numbers}, points, {}, movable=True, bows=True)
 
 
 KIND = TargetKind(
@@ -52,5 +35,5 @@ KIND = TargetKind(
     "columns and rows (tags), tag_m, gap (between tags, over tag_m)",
     'points "c,r", two of each tag along a row and a column, counted from the top left',
     lambda: {"april-grid": april_grid(6, 6, 0.088, 0.3)},
-    _from_spec,
+    from_arguments("april-grid", april_grid),
 )

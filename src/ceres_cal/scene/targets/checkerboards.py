@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from itertools import product
-from typing import Any
 
-import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
 from ceres_cal.scene.targets.paper import Footprints, Paper, Square, share_inside
-from ceres_cal.scene.targets.target import Grid, Target, TargetKind, require_size
+from ceres_cal.scene.targets.target import Grid, Target, TargetKind, from_arguments, require_size
 
 
 def checkerboard(columns: int, rows: int, square_m: float) -> Target:
@@ -60,23 +57,11 @@ def _squares(grid: Grid) -> Iterator[Square]:
             yield Square((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
 
 
-class _CheckerboardSpec(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    columns: int
-    rows: int
-    square_m: float
-
-
-def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    board = convert(spec, _CheckerboardSpec, where)
-    return checkerboard(board.columns, board.rows, board.square_m)
-
-
 KIND = TargetKind(
     "checkerboard",
     "the inner corners of a checkerboard",
     "columns and rows (inner corners), square_m",
     'points "c,r" at (c, r, 0) squares, c from 0 to columns - 1, r from 0 to rows - 1',
     lambda: {"checkerboard": checkerboard(9, 6, 0.025)},
-    _from_spec,
+    from_arguments("checkerboard", checkerboard),
 )

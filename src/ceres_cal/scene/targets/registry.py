@@ -6,26 +6,24 @@ from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.scene.targets import (
-    april_grids,
-    checkerboards,
-    circle_grids,
-    custom_targets,
-    marker_targets,
-    ring_sheets,
-    tape_grids,
-)
+from ceres_cal.base.lazy import LazyTable
 from ceres_cal.scene.targets.painted_fields import templates
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
-TARGET_KINDS: dict[str, TargetKind] = {
-    kind.name: kind
-    for kind in (
-        *(template.as_kind() for template in templates().values()),
-        *(tape_grids.KIND, checkerboards.KIND, circle_grids.KIND, april_grids.KIND, marker_targets.KIND),
-        *(ring_sheets.KIND, custom_targets.KIND),
-    )
+_MODULES = {
+    "tape-grid": "tape_grids",
+    "checkerboard": "checkerboards",
+    "circle-grid": "circle_grids",
+    "april-grid": "april_grids",
+    "markers": "marker_targets",
+    "rings": "ring_sheets",
+    "custom": "custom_targets",
 }
+TARGET_KINDS: LazyTable[TargetKind] = LazyTable(
+    "ceres_cal.scene.targets",
+    {**{name: template.as_kind() for name, template in templates().items()}, **_MODULES},
+    lambda module, _: module.KIND,
+)
 
 
 def target_from_spec(spec: Any, where: str) -> Target:

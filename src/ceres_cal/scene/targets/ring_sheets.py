@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, Square, share_inside
-from ceres_cal.scene.targets.target import Target, TargetKind
+from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments
 
 
 def rings(radii_m: Sequence[float]) -> Target:
@@ -50,16 +48,11 @@ def _shapes(radii: Sequence[float], border: float) -> Iterator[Square | Disc]:
         yield Disc((0.0, 0.0), radii[number], is_dark=number % 2 == 0)
 
 
-class _RingSheetSpec(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    radii_m: list[float]
-
-
 KIND = TargetKind(
     "rings",
     "concentric circles",
     "radii_m, from the inside out",
     'curves "ring_1", "ring_2", ... from the inside out, point "centre"',
     lambda: {"rings": rings((0.05, 0.1, 0.15))},
-    lambda spec, where: rings(convert(spec, _RingSheetSpec, where).radii_m),
+    from_arguments("rings", rings),
 )

@@ -5,15 +5,11 @@ How many lines there are its spec says, so that it is no data file as other fiel
 
 from __future__ import annotations
 
-from typing import Any
-
-import msgspec
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Curve, Segment
-from ceres_cal.scene.targets.target import Target, TargetKind, require_size
+from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments, require_size
 
 
 def tape_grid(columns: int, rows: int, pitch_m: float, line_thickness_m: float) -> Target:
@@ -40,22 +36,9 @@ def tape_grid(columns: int, rows: int, pitch_m: float, line_thickness_m: float) 
     for r in range(rows):
         curves[f"row_{r}"] = Segment((0.0, r * pitch_m, 0.0), (x, r * pitch_m, 0.0), line_thickness_m)
     points = {f"{c},{r}": (c * pitch_m, r * pitch_m, 0.0) for r in range(rows) for c in range(columns)}
-    given = _TapeGridSpec("tape-grid", int(columns), int(rows), float(pitch_m), float(line_thickness_m))
     sizes = {"pitch_m": float(pitch_m), "line_thickness_m": float(line_thickness_m)}
-    return Target(msgspec.to_builtins(given), points, curves, dimensions=sizes)
-
-
-class _TapeGridSpec(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    columns: int
-    rows: int
-    pitch_m: float
-    line_thickness_m: float
-
-
-def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _TapeGridSpec, where)
-    return tape_grid(given.columns, given.rows, given.pitch_m, given.line_thickness_m)
+    spec = {"kind": "tape-grid", "columns": int(columns), "rows": int(rows), **sizes}
+    return Target(spec, points, curves, dimensions=sizes)
 
 
 KIND = TargetKind(
@@ -64,5 +47,5 @@ KIND = TargetKind(
     "columns and rows (lines), pitch_m (between their centres), line_thickness_m",
     'lines "column_0", ... at x = c pitches and "row_0", ... at y = r pitches, points "c,r" where they cross',
     lambda: {"tape-grid": tape_grid(5, 4, 0.5, 0.02)},
-    _from_spec,
+    from_arguments("tape-grid", tape_grid),
 )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from inspect import signature
 from typing import Any
 
 import msgspec
@@ -12,6 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Arc, Curve, along_curve
 from ceres_cal.scene.targets.crossings import aliases
 from ceres_cal.scene.targets.paper import Paper
@@ -164,6 +167,26 @@ def _farthest(curve: Curve) -> Array:
     low, high = curve.parameter_range
     turns = 0.5 * np.pi * np.arange(np.ceil(low / (0.5 * np.pi)), high / (0.5 * np.pi))
     return np.array([low, *(turns if isinstance(curve, Arc) else ()), high])
+
+
+def from_arguments(kind: str, make: Callable[..., Target]) -> Callable[[dict[str, Any], str], Target]:
+    """`TargetKind.from_spec` of a kind whose spec gives the arguments of the function that makes its targets."""
+
+    @cache
+    def form() -> type[msgspec.Struct]:
+        arguments = signature(make, eval_str=True).parameters.values()
+        given = [
+            (one.name, one.annotation) if one.default is one.empty else (one.name, one.annotation, one.default)
+            for one in arguments
+        ]
+        return msgspec.defstruct(kind, [("kind", str), *given], forbid_unknown_fields=True)
+
+    def from_spec(spec: dict[str, Any], where: str) -> Target:
+        given = msgspec.structs.asdict(convert(spec, form(), where))
+        del given["kind"]
+        return make(**given)
+
+    return from_spec
 
 
 @dataclass(frozen=True)

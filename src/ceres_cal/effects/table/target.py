@@ -1,4 +1,4 @@
-"""Diagnostics of the target as built: a line, an arc or a point aside, a board that is bent."""
+"""The target as built: a line, an arc or a point aside, a board that is bent."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.words import first_of
-from ceres_cal.diagnostics.diagnostic import Amount, Case, Evidence, Finding, ScoreTest, Tested, Words, amounts
-from ceres_cal.diagnostics.scores import Family, grouped
-from ceres_cal.problem.structure import WARP, Kind, numbers_by_kind
-from ceres_cal.robust.repeats import AsBuilt
+from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.columns import EffectColumns, grouped
+from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words
+from ceres_cal.problem.structure import WARP
 from ceres_cal.scene.targets import Arc, Segment
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
@@ -22,34 +21,27 @@ _FEWEST_ON_CURVE = 8
 # Observations that say whether a point lies aside: one could be an outlier that was just not taken out. Nothing
 # changes from half to double.
 _FEWEST_OF_POINT = 2
-# Rejected observations of one line that must agree on its place: two determine it, three more do not by chance.
-# Nothing changes from half to double.
-_FEWEST_AGREE = 5
 # Features aside of one target from which on it is the target. Two may be lines that somebody painted anew.
 _SEVERAL = 3
-# What lies farther aside is no painting error: its label is wrong. Nothing changes from half to double.
-_FAR_M = 0.1
 # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
 _CLEAR = 2.0
 
 
-class _StructureTest(ScoreTest):
+class _StructureTest(Effect):
     """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
 
     Attributes:
-        curves: whether of curves, or of points. places: of the numbers, as in `Equations.built`. built: the kind of
-            what `calibrate` solves for by itself.
+        curves: whether of curves, or of points. places: of the numbers, as in `Equations.built`.
     """
 
     curves: ClassVar[bool] = False
     places: ClassVar[slice]
-    built: ClassVar[Kind]
 
     @property
     def _fewest(self) -> int:
         return _FEWEST_ON_CURVE if self.curves else 2 * _FEWEST_OF_POINT
 
-    def families(self, case: Case) -> Iterator[Family]:
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
         equations, structure = case.equations, case.whole_structure
         slot, own = (slots[:, self.places.start] for slots in case.slots)
         solved = (own >= 0) & (own < case.estimate.structure.own)
@@ -57,14 +49,11 @@ class _StructureTest(ScoreTest):
         numbers, group = grouped(slot, rows)
         counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
         group = np.where(counts[group] >= self._fewest, group, -1)
-        names = tuple(_feature_of(structure.names[number]) for number in numbers)
-        yield Family(self.kind, equations.built[:, self.places], group, names)
+        names = tuple(feature_of(structure.names[number]) for number in numbers)
+        yield EffectColumns(self.kind, equations.built[:, self.places], group, names)
 
-    def findings(self, tested: Tested) -> Iterator[Finding]:
-        yield from _of_each_target(list(super().findings(tested)))
-        for one in tested.case.as_built:
-            if one.kind == self.built and one.probability >= 1.0 - tested.rate:
-                yield _solved_for(self.kind, one, tested)
+    def together(self, findings: Sequence[Finding]) -> Iterator[Finding]:
+        yield from _of_each_target(findings)
 
 
 def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
@@ -88,29 +77,8 @@ def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _solved_for(kind: str, one: AsBuilt, tested: Tested) -> Finding:
-    """What the calibration found by itself, and has in it."""
-    case, structure = tested.case, tested.case.estimate.structure
-    numbers = numbers_by_kind(structure, case.observations.targets)[one.target, one.kind]
-    offsets = np.zeros(len(structure.offsets) + 1)
-    offsets[numbers] = structure.values[numbers]
-    shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)
-    rows = (shift != 0.0) & case.model.used
-    effect = case.effect(shift, rows)
-    most = int(numbers[np.argmax(np.abs(offsets[numbers]))])
-    alone = offsets[most] ** 2 > 0.5 * float(offsets @ offsets) and len(numbers) > 2
-    return Finding(
-        kind, "observations", _feature_of(structure.names[most]) if alone else one.target, None,
-        f"{one.target} is not as drawn: {one.words}, most of all {structure.names[most]} by "
-        f"{1e3 * offsets[most]:+.2f} mm; it was solved for", "none is needed; a flat, exact target needs fewer views",
-        effect.px, effect.mm, effect.px / case.noise_px(tested.selection.model.left_over, rows),
-        (Amount("sigma", 1e3 * one.sigma_m, 0.0, "mm"),), float(np.log10(max(1.0 - one.probability, 1e-300))),
-        effect.observations,
-    )  # fmt: skip
-
-
-def _feature_of(name: str) -> str:
-    """field/CenterCircle.x -> field/CenterCircle"""
+def feature_of(name: str) -> str:
+    """The feature of a structure number: field/CenterCircle.x -> field/CenterCircle."""
     for ending in (".x", ".y"):
         name = name.removesuffix(ending)
     return name.removesuffix("/bow")
@@ -120,7 +88,7 @@ class CurveAside(_StructureTest):
     """A line or an arc is not painted as drawn."""
 
     kind = "curve aside"
-    built: ClassVar = "lines"
+    built = "lines"
     curves = True
     places: ClassVar = slice(0, 3)
 
@@ -148,7 +116,7 @@ class PointAside(_StructureTest):
     """A point does not lie where it is drawn."""
 
     kind = "point aside"
-    built: ClassVar = "points"
+    built = "points"
     places: ClassVar = slice(0, 2)
 
     def words(self, evidence: Evidence) -> Words:
@@ -166,7 +134,7 @@ class BoardBent(_StructureTest):
     """A board is bowed along its sides, twisted or wavy."""
 
     kind = "board bent"
-    built: ClassVar = "warp"
+    built = "warp"
     places: ClassVar = slice(2, 2 + len(WARP))
 
     def words(self, evidence: Evidence) -> Words:
@@ -185,47 +153,4 @@ class BoardBent(_StructureTest):
         )
 
 
-# ---- observations that were taken out and may speak again -----------------------------------------------------------
-
-
-def recalled(case: Case) -> Mask:
-    """(E,) which equations take part when lines and points that were taken out nearly whole may speak too.
-
-    A feature that lies aside is an outlier everywhere. Where more of its observations agree about one place of their
-    own than agree with the drawing, those take part instead.
-    """
-    equations, weight, used = case.equations, case.model.weight, case.model.used.copy()
-    open_to_it = ~_mislabelled(case)[equations.observation]
-    counted = replace(case, model=replace(case.model, used=open_to_it))
-    for family in (*CurveAside().families(counted), *PointAside().families(counted)):
-        own = (family.group >= 0) & open_to_it
-        rejected = np.bincount(family.group[own & ~used], minlength=len(family.subjects))
-        for number in np.flatnonzero(rejected >= _FEWEST_AGREE):
-            rows = np.flatnonzero(own & (family.group == number))
-            agree = _agreeing(family.columns[rows] * weight[rows, None], equations.residual[rows] * weight[rows],
-                              equations.observation[rows], case.problem.options.reject_sigma)  # fmt: skip
-            if np.count_nonzero(agree) > max(int(np.count_nonzero(used[rows])), _FEWEST_AGREE - 1):
-                used[rows] = agree
-    return used
-
-
-def _mislabelled(case: Case) -> Mask:
-    """(N + M,) the observations that a wrong label explains."""
-    points = len(case.observations.points)
-    explained = np.zeros(len(case.table), dtype=bool)
-    for label in case.labels.mislabelled:
-        explained[label.rows + (points if label.is_curve else 0)] = True
-    return explained
-
-
-def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
-    """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
-    columns = columns[:, np.any(columns != 0.0, axis=0)]
-    amount: Array = np.zeros(columns.shape[1])
-    for _ in range(30):
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
-        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
-    _, of = np.unique(observation, return_inverse=True)
-    lengths = np.sqrt(np.bincount(of, (residual + columns @ amount) ** 2))
-    agree = (lengths <= reject_sigma)[of]
-    return agree if np.all(np.abs(amount) < _FAR_M) else np.zeros(len(agree), dtype=bool)
+EFFECTS = (CurveAside(), PointAside(), BoardBent())

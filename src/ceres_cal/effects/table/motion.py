@@ -1,4 +1,4 @@
-"""Diagnostics of a camera that moved: from some frame on, or in one frame alone."""
+"""A camera that moved: from some frame on, or in one frame alone."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, numbers_of
 from ceres_cal.base.transforms import skew
-from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words, amounts
-from ceres_cal.diagnostics.scores import Family, grouped
-from ceres_cal.diagnostics.table import numbers_of
+from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.columns import EffectColumns, grouped
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 
 
-class _PoseTest(ScoreTest):
+class _PoseTest(Effect):
     """Each station turned about the camera's axes, shifted in the world."""
 
     onwards: ClassVar[bool]
@@ -25,7 +25,7 @@ class _PoseTest(ScoreTest):
     def groups(self, group: Indices, count: int) -> Indices:
         """(E,) the frames of `count` that are tested."""
 
-    def families(self, case: Case) -> Iterator[Family]:
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
         equations = case.equations
         frames = [(view.station, view.frame) for view in case.observations.views]
         known = list(dict.fromkeys(frames))
@@ -39,7 +39,7 @@ class _PoseTest(ScoreTest):
             present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
             group, names = self.groups(group, len(present)), tuple(known[number][1] for number in present)
             if np.any(group >= 0):
-                yield Family(self.kind, columns, group, (station,) * len(names), names, self.onwards)
+                yield EffectColumns(self.kind, columns, group, (station,) * len(names), names, self.onwards)
 
     def words(self, evidence: Evidence) -> Words:
         score, others = evidence.score, evidence.others
@@ -104,3 +104,6 @@ def _length(vector: Array, sd: Array) -> tuple[float, float]:
     length = float(np.linalg.norm(vector))
     known = np.isfinite(sd)
     return length, float(np.linalg.norm(vector[known] * sd[known])) / max(length, 1e-300)
+
+
+EFFECTS = (MovedAfter(), MovedIn())

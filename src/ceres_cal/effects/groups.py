@@ -1,8 +1,20 @@
-"""What a solve without each group of equations would leave of them, by the normal equations of each group alone.
+"""Groups of equations against each other: what a solve without one of them would leave of it, and how they scatter.
 
 With A_g the normal equations of a group, u_g its gradient and M the sum of all, leaving the group out moves the free
 numbers by (M - A_g)^-1 u_g. As everything is quadratic, some of the numbers may be held elsewhere instead: a shorter
 lens is the longer one with coefficients at 0, and needs no solve of its own.
+
+Do views scatter as their own equations say? At the optimum their gradients add up to nothing. With A_g the information
+of each where errors are independent, M_g the covariance of its gradient and M that of all of them, in directions in
+which everything together is known to one, the optimum leaves
+
+    Cov(u_g, u_h) = d_gh M_g - A_g M_h - M_g A_h + A_g M A_h.
+
+Their mean square over what is expected is the factor c on the variance, whose own spread follows from the same matrices
+(Satterthwaite). The jackknife (1 - A_g)^-1 u_g, by which the optimum moves without a view, says in which directions
+they scatter (CR3; Bell and McCaffrey, Survey Methodology 28, 2002). With few views, or one that says most, it is
+singular and overshoots: it counts as far as views disagree at all, and as much as G - 1 of G - 1 + P numbers with G the
+number of views that would say as much if all said the same.
 """
 
 from __future__ import annotations
@@ -15,7 +27,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import known_inverses
-from ceres_cal.effects.linearised import SINGULAR, inverse_root, prior_equations
+from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
@@ -27,12 +39,22 @@ _ROUNDING = 1e-12  # of a sum over a group's rows
 _RIDGE = 1e-3  # of everything's information: a group that tells a direction alone cannot be left out
 
 
+FEWEST_GROUPS = 3
+INDEPENDENT = 0.8
+"""Probability, before anything was seen, that errors are independent."""
+# Equations that groups leave between them: views that each tell numbers of their own, as of cameras side by side, leave
+# rounding, and the ratio to that was 17 000 where nothing was wrong.
+_LEAST_LEFT = 1.0
+_LOG_C = np.linspace(0.02, 6.0, 300)  # either way exponential of mean 1, where views do not scatter as expected
+
+
 @dataclass(frozen=True, eq=False)
 class GroupNormals:
     """Normal equations of G groups of equations over K numbers, in standard deviations.
 
     Attributes:
-        normal: (G, K, K). gradient: (G, K) half the derivative of the squared residuals. squares: (G,) these.
+        keys: their names, none of directions. normal: (G, K, K). gradient: (G, K) half the derivative of the squared
+            residuals. squares: (G,) these.
         counts: (G,) equations. known, known_gradient: (K, K), (K,) of priors. sizes: (K,) squared lengths of the
             columns, before anything was eliminated.
     """
@@ -45,6 +67,17 @@ class GroupNormals:
     known: Array
     known_gradient: Array
     sizes: Array
+
+    @classmethod
+    def of(cls, model: Linearised, group: Indices, known: Array) -> GroupNormals:
+        """Of the directions of a linear model, by group (E,), beside what was known of them before, (P, P)."""
+        order = np.argsort(group, kind="stable")
+        columns = model.columns[order, 6:]
+        counts = np.bincount(group)
+        products = np.array([part.T @ part for part in np.split(columns, np.cumsum(counts)[:-1])])
+        normal, gradient, squares = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+        sizes = np.sum(model.shared**2, axis=0) + np.diagonal(known)
+        return cls((), normal, gradient, squares, counts.astype(float), known, np.zeros(len(known)), sizes)
 
     @property
     def least(self) -> float:
@@ -172,3 +205,96 @@ def _posed(normals: Array) -> Array:
     inverse = known_inverses(normals[:, pose, pose], np.full(6, np.inf))
     across = normals[:, pose][:, :, rest]
     return np.asarray(normals[:, rest[:, None], rest] - np.swapaxes(across, 1, 2) @ inverse @ across)
+
+
+# ---- how groups scatter ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Between:
+    """How views or placements scatter.
+
+    Attributes:
+        groups: how many were compared. variance: factor on the variance, beyond what errors within them do.
+        probability: that it is not 1. degrees_of_freedom: behind it.
+    """
+
+    groups: int
+    variance: float
+    probability: float
+    degrees_of_freedom: float
+
+
+def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[Between, Array] | None:
+    """How the groups scatter, and the covariance (P, P) of the whole score with that in it; None where they have too
+    little in common to be compared.
+
+    Args:
+        groups: in directions in which everything is known to one.
+        scatter: (G, P, P) covariance of each group's score, by errors within it.
+        whole: (P, P) of all of them and of the priors.
+    """
+    values, vectors = np.linalg.eigh(whole)
+    values = np.maximum(values, 1e-12 * values[-1])
+    white, root = (vectors * values**-0.5) @ vectors.T, (vectors * values**0.5) @ vectors.T
+    expected, spread = _expected(groups.normal, scatter, whole, white)
+    mean = float(np.sum(np.trace(expected, axis1=1, axis2=2)))
+    if mean < _LEAST_LEFT:
+        return None
+    ratio, degrees = float(np.sum((groups.gradient @ white) ** 2)) / mean, 2.0 * mean**2 / spread
+    variance, probability = _averaged(ratio, degrees, float(np.trace(whole)) / len(whole))
+    size, traces = len(whole), np.trace(groups.normal, axis1=1, axis2=2)
+    alike = (
+        float(np.sum(traces) ** 2 / np.sum(traces**2)) - 1.0
+    )  # groups beyond the first that say as much as one another
+    weight = probability * alike / (alike + size)
+    jackknife = _jackknife(groups, expected, white, root)
+    factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife
+    widened = _widened(factor, white @ (whole - groups.known) @ white)
+    return Between(len(scatter), variance, probability, degrees), root @ widened @ root
+
+
+def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:
+    """(G, P, P) covariance of each group's score, whitened, and the variance of the sum of their squared lengths."""
+    a, m, size = informations @ white, scatter @ white, len(white)
+    left = np.concatenate([a, -m], axis=1)  # Cov(g_i, g_j) is left_i^T right_j for others, and more for i = j
+    right = np.concatenate([whole @ a - m, a], axis=1)
+    cross = np.swapaxes(left, 1, 2) @ right
+    own = cross + white @ m
+    lefts, rights = (np.swapaxes(part, 0, 1).reshape(2 * size, -1) for part in (left, right))
+    pairs = float(np.sum((lefts @ lefts.T) * (rights @ rights.T)))
+    return own, 2.0 * (pairs - float(np.sum(cross**2)) + float(np.sum(own**2)))
+
+
+def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, float]:
+    """Mean of the factor on the variance over what it may be, given a chi-squared ratio; and that it is not 1.
+
+    Args:
+        widened: factor on the variance by errors within the views. No more than that is taken back where the views
+            agree better than it says: what looks like an error of each view is then one of all of them.
+    """
+    logs = np.concatenate([[0.0], _LOG_C, -_LOG_C])
+    prior = np.exp(-np.abs(logs)) * (logs >= -np.log(max(widened, 1.0)))
+    weights = (1.0 - INDEPENDENT) / prior[1:].sum() * prior
+    weights[0] = INDEPENDENT
+    likelihood = -0.5 * degrees * (logs + ratio * np.exp(-logs))
+    weights *= np.exp(np.minimum(likelihood - likelihood[weights > 0.0].max(), 0.0))
+    weights /= weights.sum()
+    return float(weights @ np.exp(logs)), float(1.0 - weights[0])
+
+
+def _jackknife(groups: GroupNormals, expected: Array, white: Array, root: Array) -> Array:
+    """(P, P) how leaving out one group after the other moves it, whitened; 1 on average where they agree."""
+    size = len(white)
+    moves = white @ np.linalg.inv((1.0 + _RIDGE) * np.eye(size) - groups.normal)
+    steps = np.einsum("gij,gj->gi", moves, groups.gradient)
+    turned = moves @ root
+    mean = float(np.sum(turned * (turned @ expected)))
+    return np.asarray(steps.T @ steps * (size / mean))
+
+
+def _widened(factor: Array, observed: Array) -> Array:
+    """The unit matrix with the factor on its part that observations say; what priors say is not theirs."""
+    values, vectors = np.linalg.eigh(observed)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.asarray(np.eye(len(factor)) + root @ (factor - np.eye(len(factor))) @ root)

@@ -1,57 +1,86 @@
-"""Diagnostics of the observations: wrong labels, shifted points, noise larger than stated, neighbours that agree.
-
-Observations that the calibration was not made from: whether it holds on them, and boards that it does not know.
+"""Checks of a diagnosis beside the effects: wrong labels, larger noise, neighbours that agree, a calibration that does
+not hold on new observations; and what a diagnosis is about.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.diagnostic import (
-    Amount,
-    Case,
-    Diagnostic,
-    Evidence,
-    Finding,
-    ScoreTest,
-    Tested,
-    Words,
-    Wrong,
-    amounts,
-)
-from ceres_cal.diagnostics.labels import Mislabelled
+from ceres_cal.diagnostics.labels import Mislabelled, Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.scores import Family
-from ceres_cal.observations import Observations
+from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.effects.amounts import Amount, AsBuilt, EffectEstimate
+from ceres_cal.effects.effect import Case, Finding, Words, Wrong
+from ceres_cal.effects.score_tests import Selection
+from ceres_cal.effects.table.target import feature_of
 from ceres_cal.problem.noise import Inliers
-from ceres_cal.problem.parameters import Estimate, Layout
-from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.robust.poses import with_lost_boards_posed
+from ceres_cal.problem.structure import numbers_by_kind
 
 _MOST_NAMED = 5
-# How near to half a pixel a shift must be to be called that: in standard deviations, and px.
-_HALF_SD, _HALF_PX = 3.0, 0.1
-_HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
 
 
-class WrongLabel(Diagnostic):
+@dataclass(frozen=True, eq=False)
+class DiagnosisCase(Case):
+    """What is diagnosed.
+
+    Attributes:
+        calibration: of other observations, which may not hold on these; None where these are its own.
+        as_built, effects: what the calibration found not to be as drawn, and what else displaces the observations;
+            both were solved for.
+    """
+
+    inliers: Inliers
+    table: ResidualTable
+    labels: Mislabelling
+    calibration: Calibration | None
+    as_built: tuple[AsBuilt, ...] = ()
+    effects: tuple[EffectEstimate, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A case, the effects that its residuals speak for, the noise that these leave, the rate of false alarms."""
+
+    case: DiagnosisCase
+    selection: Selection
+    noise: tuple[Noise, ...]
+    rate: float
+
+
+class Check(ABC):
+    """A kind of finding that is no column over the equations.
+
+    Attributes:
+        kind: its name. wrong: see `Finding`.
+    """
+
+    kind: ClassVar[str]
+    wrong: ClassVar[Wrong] = "observations"
+
+    @abstractmethod
+    def tests(self, case: DiagnosisCase) -> int:
+        """How many tests it makes: they share the rate of false alarms with the effects."""
+
+    @abstractmethod
+    def findings(self, tested: Tested) -> Iterator[Finding]:
+        """Those whose probability is at most the selection's level."""
+
+
+class WrongLabel(Check):
     """A label that stands for another feature, over all its frames."""
 
     kind = "wrong label"
-    wrong: ClassVar[Wrong] = "observations"
 
-    def tests(self, case: Case) -> int:
+    def tests(self, case: DiagnosisCase) -> int:
         return case.labels.tried
 
     def findings(self, tested: Tested) -> Iterator[Finding]:
@@ -81,7 +110,8 @@ class WrongLabel(Diagnostic):
         return Finding(
             self.kind, self.wrong, f"{target}/{names[one.feature]}", frames[0], sentence,
             "correct the label; it was taken out and did no harm", px, mm, px / away, (),
-            tested.log10_p(min(label.log_p for label in labels)), len(rows), tuple((kind, int(row)) for row in rows),
+            tested.selection.log10_p(min(label.log_p for label in labels)), len(rows),
+            tuple((kind, int(row)) for row in rows),
         )  # fmt: skip
 
 
@@ -90,35 +120,10 @@ def _mean(values: Array) -> float:
     return float(np.mean(known)) if len(known) else float("nan")
 
 
-class PointsShifted(ScoreTest):
-    """A camera's points lie aside of its curves: two detectors that count pixels from different places."""
-
-    kind = "points shifted"
-    absorbed = True
-
-    def families(self, case: Case) -> Iterator[Family]:
-        is_curve, camera = case.equations.is_curve, case.camera
-        both = np.isin(camera, camera[is_curve & case.model.used])
-        group = np.where(~is_curve & both, camera, -1)
-        yield Family(self.kind, case.equations.direction * ~is_curve[:, None], group, case.cameras)
-
-    def words(self, evidence: Evidence) -> Words:
-        px, sd = evidence.score.amount, evidence.score.sd
-        half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(_HALF_SD * sd, _HALF_PX)))
-        return Words(
-            f"camera {evidence.score.subject!r}: its points are shifted against its curves by ({px[0]:+.2f} ± "
-            f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px ({evidence.size})",
-            f"{_HALF if half else ''}let both detectors count from the centre of the top-left pixel",
-            amounts(("x", "y"), px, sd, "px"),
-        )
-
-
-class _OfNoise(Diagnostic):
+class _OfNoise(Check):
     """What the noise of points and of curves is like."""
 
-    wrong: ClassVar[Wrong] = "observations"
-
-    def tests(self, case: Case) -> int:
+    def tests(self, case: DiagnosisCase) -> int:
         return 2
 
     @abstractmethod
@@ -135,7 +140,7 @@ class _OfNoise(Diagnostic):
                 mm = px * all_mm / all_px if all_px > 0.0 else float("nan")
                 yield Finding(
                     self.kind, self.wrong, noise.kind, None, words.sentence, words.advice, px, mm, px / noise.sigma_px,
-                    words.amounts, tested.log10_p(log_p), noise.observations,
+                    words.amounts, tested.selection.log10_p(log_p), noise.observations,
                 )  # fmt: skip
 
 
@@ -170,7 +175,7 @@ class Correlated(_OfNoise):
         return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))
 
 
-class DoesNotHold(Diagnostic):
+class DoesNotHold(Check):
     """A refit to new observations would fit them better than chance explains.
 
     The gain of a refit is chi-square where the calibration is exact; its own uncertainty adds as much again for every
@@ -179,9 +184,9 @@ class DoesNotHold(Diagnostic):
     """
 
     kind = "does not hold"
-    wrong: ClassVar[Wrong] = "calibration"
+    wrong = "calibration"
 
-    def tests(self, case: Case) -> int:
+    def tests(self, case: DiagnosisCase) -> int:
         return 1
 
     def findings(self, tested: Tested) -> Iterator[Finding]:
@@ -205,42 +210,29 @@ class DoesNotHold(Diagnostic):
         yield Finding(
             self.kind, self.wrong, ", ".join(case.observations.stations), None, sentence,
             "find out with `ceres-cal check` whether the camera was moved, and refit", px, mm,
-            px / case.noise_px(left, used), (), tested.log10_p(log_p), count,
+            px / case.noise_px(left, used), (), tested.selection.log10_p(log_p), count,
         )  # fmt: skip
 
 
-def with_newcomers_placed(observations: Observations, problem: Problem, calibration: Calibration) -> Estimate:
-    """The calibration's estimate with every placement that is new among the observations in its best pose.
-
-    Raises:
-        DegenerateError: one of them cannot be posed: fewer than six points, or points in disagreement.
-    """
-    estimate = calibration.estimate
-    new = frozenset(key.placement for key in problem.sights.keys if key.placement) - set(estimate.placements)
-    if not new:
-        return estimate
-    fit, options = calibration.fit, calibration.options
-    behind = Pose(np.eye(3), np.array([0.0, 0.0, -1e6]))  # no camera sees it: any pose is better
-    unplaced = {
-        name: estimate.stations[_first_station(observations, name)].cam_from_world.inverse @ behind for name in new
-    }
-    start = replace(estimate, placements={**estimate.placements, **unplaced})
-    nothing = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
-    blank = Inliers(*nothing, fit.point_scale, fit.curve_scale, np.empty(0), np.empty(0))
-    free = {name: np.empty(0, dtype=np.int64) for name in estimate.cameras}
-    weighting = Weighting(fit.point_scale, fit.curve_scale, "cauchy", options.loss_scale)
-    newcomers = Problem(
-        problem.sights.take(problem.sights.numbers(placements=new)), Layout(free, frozenset(), new), weighting=weighting
-    )
-    posed, _ = with_lost_boards_posed(newcomers, blank, start)
-    for name, pose in unplaced.items():
-        if posed.placements[name] == pose:
-            raise DegenerateError(
-                f"placement {name!r} is not in the calibration and cannot be posed from its points: give at least six "
-                "points of it in one view, or leave its views out"
-            )
-    return posed
+CHECKS: dict[str, Check] = {one.kind: one for one in (WrongLabel(), LargerNoise(), Correlated(), DoesNotHold())}
 
 
-def _first_station(observations: Observations, placement: str) -> str:
-    return next(view.station for view in observations.views if view.placement == placement)
+def solved_for(kind: str, one: AsBuilt, tested: Tested) -> Finding:
+    """The finding of an effect that the calibration found by itself, and has in it."""
+    case, structure = tested.case, tested.case.estimate.structure
+    numbers = numbers_by_kind(structure, case.observations.targets)[one.target, one.kind]
+    offsets = np.zeros(len(structure.offsets) + 1)
+    offsets[numbers] = structure.values[numbers]
+    shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)
+    rows = (shift != 0.0) & case.model.used
+    effect = case.effect(shift, rows)
+    most = int(numbers[np.argmax(np.abs(offsets[numbers]))])
+    alone = offsets[most] ** 2 > 0.5 * float(offsets @ offsets) and len(numbers) > 2
+    return Finding(
+        kind, "observations", feature_of(structure.names[most]) if alone else one.target, None,
+        f"{one.target} is not as drawn: {one.words}, most of all {structure.names[most]} by "
+        f"{1e3 * offsets[most]:+.2f} mm; it was solved for", "none is needed; a flat, exact target needs fewer views",
+        effect.px, effect.mm, effect.px / case.noise_px(tested.selection.model.left_over, rows),
+        (Amount("sigma", 1e3 * one.sigma_m, 0.0, "mm"),), float(np.log10(max(1.0 - one.probability, 1e-300))),
+        effect.observations,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Diagnostics of the floor: bowed as a whole, or higher at one place than around it."""
+"""The floor: bowed as a whole, or higher at one place than around it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words, amounts
-from ceres_cal.diagnostics.scores import Family, grouped
+from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.columns import EffectColumns, grouped
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 
 _CELL_M = 1.0  # side of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
 # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted. Nothing
@@ -16,7 +17,7 @@ _CELL_M = 1.0  # side of a place that may be higher: a tile, a cable under the c
 _FEWEST_AT_PLACE = 8
 
 
-class _Floor(ScoreTest):
+class _Floor(Effect):
     """What moves the places of targets that are part of the world up or down."""
 
     wrong = "model"
@@ -28,7 +29,7 @@ class FloorBowed(_Floor):
 
     kind = "floor bowed"
 
-    def families(self, case: Case) -> Iterator[Family]:
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
         target, names = _target_of(case)
         heights = np.zeros((len(target), 3))
         for number in range(len(names)):
@@ -36,7 +37,7 @@ class FloorBowed(_Floor):
             middle, reach = _extent(case.equations.place[own])
             x, y = ((case.equations.place[own, :2] - middle) / reach).T
             heights[own] = np.column_stack([x * x, y * y, x * y])
-        yield Family(self.kind, _raised(case)[:, None] * heights, target, names)
+        yield EffectColumns(self.kind, _raised(case)[:, None] * heights, target, names)
 
     def words(self, evidence: Evidence) -> Words:
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
@@ -58,7 +59,7 @@ class FloorUneven(_Floor):
 
     kind = "floor uneven"
 
-    def families(self, case: Case) -> Iterator[Family]:
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
         target, names = _target_of(case)
         cell = np.floor(case.equations.place[:, :2] / _CELL_M + 0.5).astype(np.int64)
         span = 2 * int(np.abs(cell).max(initial=0)) + 1
@@ -72,7 +73,7 @@ class FloorUneven(_Floor):
             of, x = divmod(rest, span)
             at = [(place - span // 2) * _CELL_M for place in (x, y)]
             subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
-        yield Family(self.kind, _raised(case)[:, None], group, tuple(subjects))
+        yield EffectColumns(self.kind, _raised(case)[:, None], group, tuple(subjects))
 
     def words(self, evidence: Evidence) -> Words:
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
@@ -105,3 +106,6 @@ def _extent(places: Array) -> tuple[Array, float]:
         return np.zeros(2), 1.0
     low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
     return 0.5 * (low + high), max(0.5 * float(np.max(high - low)), 1e-9)
+
+
+EFFECTS = (FloorBowed(), FloorUneven())

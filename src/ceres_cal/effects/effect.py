@@ -1,12 +1,12 @@
-"""What a diagnostic is: a kind of finding with its test and its words; and what it is asked about.
+"""What an effect is: something that may displace the observations, its columns over the equations and its words.
 
-What a diagnosis finds: the cause by name, how large, how sure.
+What is found of it: the cause by name, how large, how sure.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -15,19 +15,16 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
-from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.labels import Mislabelling
-from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.scores import Family, Selection, TestedAlternative
-from ceres_cal.diagnostics.table import ResidualTable, plane_shift
+from ceres_cal.effects.amounts import Amount
+from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
+from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
-from ceres_cal.problem.equations import Equations, whole_structure
-from ceres_cal.problem.noise import Inliers
-from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.equations import Equations, plane_shift, whole_structure
+from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.structure import Structure
-from ceres_cal.robust.repeats import AsBuilt
 
 SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
@@ -35,26 +32,11 @@ Wrong = Literal["model", "calibration", "observations"]
 
 
 @dataclass(frozen=True)
-class Amount:
-    """One number that would mend it: its name, value, standard deviation and unit ("mm", "deg", "px", "")."""
-
-    name: str
-    value: float
-    sd: float
-    unit: str
-
-
-def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
-    """Several numbers of one unit."""
-    return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
-
-
-@dataclass(frozen=True)
 class Finding:
     """One cause of what is left over.
 
     Attributes:
-        kind: of one of DIAGNOSTICS. wrong: what is, the model (no covariance of the parameters contains that), the
+        kind: of the effect or check. wrong: what is, the model (no covariance of the parameters contains that), the
             calibration (a refit would mend it), or the observations, their labels or their noise.
         subject: what it is about: a camera, a station, "target/feature", a board's target, "points" or "curves".
             frame: at which frame, None where it is about all.
@@ -88,10 +70,7 @@ class Finding:
         return self.wrong == "model"
 
 
-_LN_10 = float(np.log(10.0))
-
-
-class Effect(NamedTuple):
+class Displacement(NamedTuple):
     """Root mean square over observations of what moves them, in the image and on their targets' planes."""
 
     px: float
@@ -101,23 +80,16 @@ class Effect(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is diagnosed.
+    """What effects are looked for in: a problem where its solve ended.
 
     Attributes:
-        problem: of all the observations. model: before any alternative is put in.
-        calibration: of other observations, which may not hold on these; None where these are its own.
-        as_built: what the calibration found not to be as drawn, and solved for.
+        problem: of all the observations. model: its equations there, before any effect is put in.
     """
 
     observations: Observations
     problem: Problem
     estimate: Estimate
-    inliers: Inliers
     model: Linearised
-    table: ResidualTable
-    labels: Mislabelling
-    calibration: Calibration | None
-    as_built: tuple[AsBuilt, ...] = ()
 
     @property
     def equations(self) -> Equations:
@@ -143,71 +115,46 @@ class Case:
         """(E, BUILT) the offsets of that structure, and of the estimate's own: see `Equations`."""
         return self.equations.slots(self.whole_structure), self.equations.slots(self.estimate.structure)
 
-    def effect(self, shift: Array, rows: Mask) -> Effect:
+    def effect(self, shift: Array, rows: Mask) -> Displacement:
         """What a displacement (E,) px does to the observations of some equations."""
         count = len(distinct(self.equations.observation[rows]))
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = plane_shift(self.equations, shift)
         twice = np.where(self.equations.is_curve, 1.0, 2.0)  # both equations of a point carry its whole shift in mm
         squared = np.nansum(((x**2 + y**2) / twice)[rows])
-        return Effect(float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count)
+        return Displacement(float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count)
 
     def noise_px(self, left_over: Array, rows: Mask) -> float:
         """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
         count = len(distinct(self.equations.observation[rows]))
         return float(np.sqrt(np.sum((left_over / self.model.weight)[rows] ** 2) / count))
 
+    def offsets(self, camera: str) -> Array:
+        """(E, 2) of every predicted pixel from the principal point, in half image diagonals."""
+        one = self.estimate.cameras[camera]
+        return one.offsets(self.equations.pixel) / unit_px(one)
 
-@dataclass(frozen=True, eq=False)
-class Tested:
-    """A case, the alternatives that its residuals speak for, the noise that these leave, the rate of false alarms."""
-
-    case: Case
-    selection: Selection
-    noise: tuple[Noise, ...]
-    rate: float
-
-    def log10_p(self, log_p: float) -> float:
-        """Decimal logarithm after Bonferroni."""
-        return min(0.0, (log_p + float(np.log(self.selection.tests))) / _LN_10)
-
-
-class Diagnostic(ABC):
-    """A kind of finding.
-
-    Attributes:
-        kind: its name. wrong: see `Finding`.
-    """
-
-    kind: ClassVar[str]
-    wrong: ClassVar[Wrong] = "model"
-
-    def tests(self, case: Case) -> int:
-        """How many tests it makes besides score tests: all share one rate of false alarms."""
-        return 0
-
-    @abstractmethod
-    def findings(self, tested: Tested) -> Iterator[Finding]:
-        """Those whose probability is at most the selection's level."""
-
-
-# ---- score tests ----------------------------------------------------------------------------------------------------
+    def free_coefficients(self, camera: str) -> set[str]:
+        """Names of those that the lens solves for."""
+        lens = self.estimate.cameras[camera].lens
+        names = intrinsic_names(lens)
+        return {names[number] for number in self.problem.layout.free[camera]} & set(lens.names)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """An alternative that the residuals speak for.
+    """A group of an effect that the residuals speak for.
 
     Attributes:
-        others: the model with the other chosen alternatives free. shift: (E,) px that it moves.
+        others: the model with the other chosen effects free. shift: (E,) px that it moves.
         noise_ratio: its effect over the noise of the same observations.
     """
 
     case: Case
-    score: TestedAlternative
+    score: ScoreTest
     others: Linearised
     shift: Array
-    effect: Effect
+    effect: Displacement
     noise_ratio: float
 
     @property
@@ -230,44 +177,60 @@ class Words(NamedTuple):
     amounts: tuple[Amount, ...] = ()
 
 
-class ScoreTest(Diagnostic):
-    """A diagnostic made of alternatives to the model, columns over the equations, of which the residuals choose.
+class Effect(ABC):
+    """A row of the table of effects: what may displace the observations besides the free numbers.
 
     Attributes:
-        absorbed: whether its effect is what the calibration's free numbers could not have taken up of it.
+        kind: its name. wrong: what is where it is found, see `Finding`. absorbed: whether its displacement is what the
+            calibration's free numbers could not have taken up of it.
+        built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
+        prior: what is expected of its amounts, in their own unit, of one whose size is estimated.
     """
 
+    kind: ClassVar[str]
+    wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
+    built: ClassVar[str] = ""
+    prior: ClassVar[SizePrior]
 
     @abstractmethod
-    def families(self, case: Case) -> Iterator[Family]:
-        """Its alternatives, each family of its `kind`."""
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        """Its columns over the equations."""
 
     @abstractmethod
     def words(self, evidence: Evidence) -> Words:
-        """What the finding of one of them says."""
+        """What the finding of one of its groups says."""
 
-    def findings(self, tested: Tested) -> Iterator[Finding]:
-        for number, score in enumerate(tested.selection.chosen):
-            if score.family.kind == self.kind:
-                yield self._finding(tested, number)
+    def together(self, findings: Sequence[Finding]) -> Iterator[Finding]:
+        """The findings of several of its groups, as they are told."""
+        yield from findings
 
-    def _finding(self, tested: Tested, number: int) -> Finding:
-        case, chosen = tested.case, tested.selection.chosen
-        score, others = chosen[number], case.model
-        for other in (*chosen[:number], *chosen[number + 1 :]):
-            others = others.with_columns(other.columns)
+    def evidence(self, case: Case, score: ScoreTest, others: Linearised, left_over: Array) -> Evidence:
+        """For one of its groups, beside other effects in a model, which all together leave so much (E,)."""
         rows = np.any(score.columns != 0.0, axis=1) & case.model.used
         shift = score.columns @ score.amount
         if self.absorbed:
             shift = case.model.unabsorbed(shift)
         effect = case.effect(shift, rows)
-        ratio = effect.px / case.noise_px(tested.selection.model.left_over, rows)
-        sentence, advice, mending = self.words(Evidence(case, score, others, shift, effect, ratio))
+        return Evidence(case, score, others, shift, effect, effect.px / case.noise_px(left_over, rows))
+
+    def findings(self, case: Case, selection: Selection) -> Iterator[Finding]:
+        """Of its groups that were chosen."""
+        own = [number for number, score in enumerate(selection.chosen) if score.effect.kind == self.kind]
+        yield from self.together([self._finding(case, selection, number) for number in own])
+
+    def _finding(self, case: Case, selection: Selection, number: int) -> Finding:
+        chosen = selection.chosen
+        score, others = chosen[number], case.model
+        for other in (*chosen[:number], *chosen[number + 1 :]):
+            others = others.with_columns(other.columns)
+        evidence = self.evidence(case, score, others, selection.model.left_over)
+        effect, ratio = evidence.effect, evidence.noise_ratio
+        sentence, advice, mending = self.words(evidence)
         if score.rivals:
-            names = first_of([f"{one.family.kind} ({one.subject})" for one in score.rivals], 3)
+            names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
             sentence += f"; these data cannot tell it from {names}"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
-            tested.log10_p(score.log_p), effect.observations,
+            selection.log10_p(score.log_p), effect.observations,
         )  # fmt: skip

@@ -1,0 +1,219 @@
+"""Columns of an effect over the equations, and what the residuals say of its amounts once the free numbers followed.
+
+An effect has groups (each line, each frame, everything after a frame) with amounts of their own. What is said of each
+group by itself is enough for a score test (`EffectSums`); what is said of all groups together, for evidence
+(`SparseColumns`). Each amount moves few equations, so sums are taken by amount, and nothing is as large as equations
+times amounts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.cached import cached_property
+from ceres_cal.effects.linearised import Linearised
+
+
+@dataclass(frozen=True, eq=False)
+class EffectColumns:
+    """Columns of an effect over the equations, by group: each group has amounts of its own.
+
+    Attributes:
+        kind: of the effect.
+        columns: (E, Q) px per unit of the Q amounts, for every equation.
+        group: (E,) which group's amounts move each equation, -1 for none.
+        subjects: what each group is about. frames: at which frame; empty where all are about all frames.
+        onwards: whether the amounts of group g move the groups after g instead of group g itself.
+    """
+
+    kind: str
+    columns: Array
+    group: Indices
+    subjects: tuple[str, ...]
+    frames: tuple[str, ...] = ()
+    onwards: bool = False
+
+    def of(self, number: int) -> Array:
+        """(E, Q) columns of one group over all equations."""
+        moved = self.group > number if self.onwards else self.group == number
+        return np.asarray(self.columns * moved[:, None])
+
+
+def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
+    """The different values in the chosen rows, and which of them each row (N,) has, -1 for the others."""
+    numbers, inverse = np.unique(values[rows], return_inverse=True)
+    group = np.full(len(values), -1)
+    group[rows] = inverse
+    return numbers, group
+
+
+@dataclass(frozen=True, eq=False)
+class _MovedRows:
+    """The equations in use that an effect moves, by group of it.
+
+    Attributes:
+        rows: (N,) which they are. columns: (N, Q) of the effect, in standard deviations.
+    """
+
+    effect: EffectColumns
+    rows: Indices
+    columns: Array
+
+    @classmethod
+    def of(cls, model: Linearised, effect: EffectColumns) -> _MovedRows:
+        """By an effect."""
+        inside = np.flatnonzero((effect.group >= 0) & model.used)
+        rows = inside[np.argsort(effect.group[inside], kind="stable")]
+        return cls(effect, rows, effect.columns[rows] * model.weight[rows, None])
+
+    def products(self, values: Array) -> Array:
+        """(G, Q, K) of each group's columns with values (N, K) of the rows."""
+        products = np.zeros((len(self.effect.subjects), self.columns.shape[1], values.shape[1]))
+        for number, first, last in self._runs:
+            np.matmul(self.columns[first:last].T, values[first:last], out=products[number])
+        if self.effect.onwards:  # group g stands for all groups after it
+            products[:-1] = np.cumsum(products[:0:-1], axis=0)[::-1]
+            products[-1] = 0.0
+        return products
+
+    @cached_property
+    def _runs(self) -> list[tuple[int, int, int]]:
+        """Each group that has rows, where they begin and where they end."""
+        group = self.effect.group[self.rows]
+        starts = np.flatnonzero(np.diff(group, prepend=-1))
+        ends = np.append(starts, len(group))[1:]
+        return list(zip(group[starts].tolist(), starts.tolist(), ends.tolist(), strict=True))
+
+    def private_squares(self, model: Linearised) -> Array:
+        """(G, Q, Q) squares of what each group's columns have in the private bases."""
+        size, count = self.columns.shape[1], len(self.effect.subjects)
+        squares, held = np.zeros((count + 1, size, size)), np.flatnonzero(model.of_private[self.rows])
+        if not len(held):
+            return squares[:-1]
+        key = model.equations.sight[self.rows[held]] * count + self.effect.group[self.rows[held]]
+        order = np.argsort(key, kind="stable")
+        key, held = key[order], held[order]
+        starts = np.flatnonzero(np.diff(key, prepend=-1))
+        products = self.columns[held, :, None] * model.private[self.rows[held], None, :]
+        inside = np.add.reduceat(products, starts, axis=0)
+        sight, group = np.divmod(key[starts], count)
+        if not self.effect.onwards:
+            np.add.at(squares, group, inside @ inside.transpose(0, 2, 1))
+            return squares[:-1]
+        # From one group of a sight on, up to the next, the groups move all that come after.
+        first = np.flatnonzero(np.diff(sight, prepend=-1))
+        after = np.vstack([np.cumsum(inside[::-1], axis=0)[::-1], np.zeros_like(inside[:1])])
+        end = np.append(first, len(sight))[np.searchsorted(first, np.arange(len(sight)), side="right")]
+        inside, before = after[:-1] - after[end], np.append(0, group[:-1])
+        before[first] = 0
+        np.add.at(squares, before, inside @ inside.transpose(0, 2, 1))
+        np.subtract.at(squares, group, inside @ inside.transpose(0, 2, 1))
+        return np.cumsum(squares, axis=0)[:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class EffectSums:
+    """What the equations say of each of an effect's G groups: X its columns beyond the free numbers of a model, and r
+    the residuals, both in standard deviations.
+
+    Attributes:
+        sizes: (G, Q) squared lengths of the columns as they are. normals: (G, Q, Q) X'X. scores: (G, Q) X'r.
+        directions: how many shared directions of the model X is beyond.
+    """
+
+    moved: _MovedRows
+    sizes: Array
+    normals: Array
+    scores: Array
+    directions: int = 0
+
+    @classmethod
+    def of(cls, model: Linearised, effect: EffectColumns) -> EffectSums:
+        """Of an effect."""
+        moved = _MovedRows.of(model, effect)
+        sums = moved.products(np.column_stack([moved.columns, model.placed_score[moved.rows]]))
+        normals, scores = sums[:, :, :-1], sums[:, :, -1]
+        sizes = np.diagonal(normals, axis1=1, axis2=2)
+        return cls(moved, sizes, normals - moved.private_squares(model), scores).beside(model)
+
+    def beside(self, model: Linearised) -> EffectSums:
+        """The same beyond all that is free in a model that has more of it."""
+        new = slice(self.directions, None)
+        taken = self.moved.products(model.shared[:, new].take(self.moved.rows, axis=0))
+        normals, scores = taken @ taken.transpose(0, 2, 1), taken @ model.step[new]
+        return replace(self, normals=self.normals - normals, scores=self.scores - scores, directions=len(model.step))
+
+    @property
+    def effect(self) -> EffectColumns:
+        return self.moved.effect
+
+
+@dataclass(frozen=True, eq=False)
+class SparseColumns:
+    """Columns of Q numbers over E equations, in standard deviations.
+
+    Attributes:
+        slots: (E, B) which numbers move each equation, Q for none. values: (E, B) by how much, 0 where it is not used.
+        size: Q.
+    """
+
+    slots: Indices
+    values: Array
+    size: int
+
+    @classmethod
+    def of_groups(cls, model: Linearised, columns: Array, group: Indices, groups: int) -> SparseColumns:
+        """Of groups of equations (E,), -1 for none, which have a number for each of the columns (E, M), in standard
+        deviations; group after group.
+        """
+        width, there = columns.shape[1], (group >= 0) & model.used
+        slots = np.where(there[:, None], group[:, None] * width + np.arange(width), groups * width)
+        return cls(slots, np.where(there[:, None], columns, 0.0), groups * width)
+
+    @classmethod
+    def side_by_side(cls, parts: Sequence[SparseColumns], equations: int) -> SparseColumns:
+        """Those of several effects, one after the other."""
+        firsts = np.cumsum([0, *(part.size for part in parts)])
+        size, nothing = int(firsts[-1]), np.zeros((equations, 0), dtype=np.int64)
+        slots = [
+            np.where(one.slots < one.size, one.slots + first, size) for one, first in zip(parts, firsts, strict=False)
+        ]
+        return cls(np.hstack([nothing, *slots]), np.hstack([nothing, *(part.values for part in parts)]), size)
+
+    def gathered(self, factors: Array, owner: Indices, owners: int) -> Array:
+        """(owners, Q) sums of the values times factors (E,) or (E, B), by number and owner (E,)."""
+        products = self.values * (factors if factors.ndim == 2 else factors[:, None])
+        key = owner[:, None] * (self.size + 1) + self.slots
+        sums = np.bincount(key.ravel(), products.ravel(), minlength=owners * (self.size + 1))
+        return np.asarray(sums.reshape(owners, -1)[:, :-1])
+
+    def summed(self, factors: Array) -> Array:
+        """(Q,) the same over all equations."""
+        return np.asarray(self.gathered(factors, np.zeros(len(self.slots), dtype=np.int64), 1)[0])
+
+    def products(self) -> Array:
+        """(Q, Q) X^T X."""
+        every = [self.gathered(self.values[:, k], self.slots[:, k], self.size + 1) for k in range(self.slots.shape[1])]
+        return np.asarray(np.sum(every, axis=0)[:-1])
+
+    def at(self, amounts: Array) -> Array:
+        """(E,) what amounts (Q,) do to the equations."""
+        return np.asarray(np.sum(self.values * np.append(amounts, 0.0)[self.slots], axis=1))
+
+    def in_private(self, model: Linearised) -> Array:
+        """(6, S, Q) what the private placement of each sight takes of them."""
+        bounds, sight = model.equations.bounds, model.equations.sight
+        return np.array([self.gathered(column, sight, len(bounds) - 1) for column in model.private.T])
+
+    def in_shared(self, model: Linearised) -> Array:
+        """(P, Q) what the shared numbers take of them."""
+        return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
+
+    def left_of(self, model: Linearised) -> tuple[Array, Array]:
+        """V (Q, Q) and u (Q,), see `effects.evidence`."""
+        private, shared = self.in_private(model).reshape(-1, self.size), self.in_shared(model)
+        return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over)

@@ -1,0 +1,106 @@
+"""The pixels: skew, and the numbers that are held, aspect, principal point and phi."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+import numpy as np
+
+from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words
+from ceres_cal.problem.parameters import intrinsic_names
+
+
+class Skew(Effect):
+    """The axes of the pixels are not perpendicular: x grows with y."""
+
+    kind = "skew"
+    absorbed = True
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        down, group = np.zeros(len(case.equations)), case.camera.copy()
+        for number, name in enumerate(case.cameras):
+            own, camera = case.camera == number, case.estimate.cameras[name]
+            if intrinsic_names(camera.lens).index("skew") in case.problem.layout.free[name]:
+                group[own] = -1
+            else:
+                down[own] = camera.offsets(case.equations.pixel[own])[:, 1]
+        yield EffectColumns(self.kind, (case.equations.direction[:, 0] * down)[:, None], group, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad "
+            f"({evidence.size})",
+            "calibrate with --free-skew, which no other program reads; better take pictures as the sensor gives them, "
+            "neither warped nor stabilised",
+            amounts(["skew"], skew, sd, "mrad"),
+        )
+
+
+class HeldNumbers(Effect):
+    """Numbers of the pixels that are held; places: theirs in the intrinsics vector."""
+
+    absorbed = True
+    places: ClassVar[list[int]]
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        free = case.problem.layout.free
+        held = np.array([not set(self.places) & set(free[name].tolist()) for name in case.cameras])
+        group = np.where(held[case.camera], case.camera, -1)
+        yield EffectColumns(self.kind, case.equations.intrinsics[:, self.places], group, case.cameras)
+
+
+class Aspect(HeldNumbers):
+    """How high pixels are beside their width."""
+
+    kind = "aspect"
+    places: ClassVar = [1]
+
+    def words(self, evidence: Evidence) -> Words:
+        score = evidence.score
+        held = evidence.case.estimate.cameras[score.subject].aspect
+        return Words(
+            f"camera {score.subject!r}: its pixels are not as wide as high: aspect {held + score.amount[0]:.5f} ± "
+            f"{score.sd[0]:.5f}, not {held:g} ({evidence.size})",
+            "calibrate with --free-aspect",
+            amounts(["aspect"], score.amount, score.sd, ""),
+        )
+
+
+class PrincipalPoint(HeldNumbers):
+    """Where the optical axis meets the image."""
+
+    kind = "principal point"
+    places: ClassVar = [2, 3]
+
+    def words(self, evidence: Evidence) -> Words:
+        score = evidence.score
+        x, y = score.amount
+        return Words(
+            f"camera {score.subject!r}: the principal point is held, but the residuals ask for it {x:+.1f}, {y:+.1f} "
+            f"px from there ({evidence.size})",
+            "let it free",
+            amounts(["cx", "cy"], score.amount, score.sd, "px"),
+        )
+
+
+class Phi(HeldNumbers):
+    """The focal length."""
+
+    kind = "phi"
+    places: ClassVar = [0]
+
+    def words(self, evidence: Evidence) -> Words:
+        score = evidence.score
+        return Words(
+            f"camera {score.subject!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± "
+            f"{score.sd[0]:.2f} px ({evidence.size})",
+            "let it free, or give it as a prior with a sigma",
+            amounts(["phi"], score.amount, score.sd, "px"),
+        )
+
+
+EFFECTS = (Skew(), Aspect(), PrincipalPoint(), Phi())

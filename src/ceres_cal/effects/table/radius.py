@@ -1,0 +1,109 @@
+"""The radial polynomial of a lens is too short, or a lens is finer than its knots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words
+from ceres_cal.problem.parameters import unit_px
+from ceres_cal.scene.lens import LENSES, Lens
+
+_RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
+# Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few
+# observations.
+_WAVES = range(5, 25)
+
+
+class Radius(Effect):
+    """Residuals follow the radius: the polynomial is too short."""
+
+    kind = "radius"
+    absorbed = True
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        columns = np.zeros((len(case.equations), max(_RADIAL_BASIS, len(_WAVES))))
+        for number, name in enumerate(case.cameras):
+            own = case.camera == number
+            if case.estimate.cameras[name].lens.roughness:
+                columns[own, : len(_WAVES)] = _waves(case, name, own)
+                continue
+            for k, power in enumerate(_missing_powers(case, name)[:_RADIAL_BASIS]):
+                columns[own, k] = _radial_column(case, name, power)[own]
+        yield EffectColumns(self.kind, columns, case.camera, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
+        if case.estimate.cameras[name].lens.roughness:
+            return Words(
+                f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px "
+                f"({evidence.size}): the lens is finer than its knots, and phi, the slope at its axis, may be off by "
+                "more than its standard deviation",
+                "rays are about as wrong as those pixels; for phi by itself look at a lens that has a formula, too",
+            )
+        powers = _missing_powers(case, name)
+        columns = np.column_stack([_radial_column(case, name, power) * own for power in powers])
+        decreases = evidence.others.decreases(columns)
+        power, decrease = powers[int(np.argmax(decreases))], float(np.max(decreases))
+        share = 100.0 * min(1.0, decrease / evidence.others.freed(evidence.score.columns).decrease)
+        judged = "is too short" if evidence.noise_ratio >= SMALL else "is too short by little"
+        sentence = (
+            f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px ({evidence.size}): "
+            f"the radial polynomial {judged}; one more power, r^{power}, explains {share:.0f} % of it"
+        )
+        return Words(sentence, _longer(case, name, power))
+
+
+def _longer(case: Case, camera: str, power: int) -> str:
+    """How to calibrate with one more power."""
+    lens = case.estimate.cameras[camera].lens
+    held = [key for key, order in zip(lens.names, lens.orders, strict=True) if order == power]
+    held = [key for key in held if key not in _across(lens)]
+    if lens.powers:
+        return f"calibrate with --powers {','.join(map(str, sorted({*lens.powers, power})))}"
+    if held:
+        return f"let {held[0]} free (no --fix {held[0]}=...)"
+    if "rational" in lens.more_terms and "rational" not in lens.terms:
+        return "calibrate with --terms rational, which has more along the radius, or with another lens"
+    growing = " or ".join(kind for kind, other in LENSES.items() if other.trial_powers)
+    return f"the {lens.kind} lens has no such power: try another lens or the {growing} one with more powers"
+
+
+def _missing_powers(case: Case, camera: str) -> list[int]:
+    """Powers of the radius that the lens does not solve for, lowest first."""
+    lens = case.estimate.cameras[camera].lens
+    free = case.free_coefficients(camera)
+    solved = {order for name, order in zip(lens.names, lens.orders, strict=True) if name in free - _across(lens)}
+    return [power for power in lens.missing_powers if power not in solved]
+
+
+def _across(lens: Lens) -> set[str]:
+    """Names of coefficients that displace across the radius, which it has or may have."""
+    return {*lens.decentring, *(name for term in ("tangential", "prism") for name in lens.more_terms.get(term, ()))}
+
+
+def _outward(case: Case, camera: str) -> tuple[Array, Array]:
+    """(E,) radius of every predicted pixel, in half image diagonals, and what a px away from the centre does to it."""
+    offsets = case.offsets(camera)
+    radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    along = np.sum(case.equations.direction * offsets * (1.0, case.estimate.cameras[camera].aspect), axis=1)
+    return radius, np.asarray(along / radius)
+
+
+def _radial_column(case: Case, camera: str, power: int) -> Array:
+    """(E,) px per unit of a coefficient more in the lens's polynomial, scaled to be of order one."""
+    one = case.estimate.cameras[camera]
+    growth = one.lens.radial_change(one.offsets(case.equations.pixel), one.phi, unit_px(one), power)
+    return np.asarray(_outward(case, camera)[1] * growth)
+
+
+def _waves(case: Case, camera: str, own: Mask) -> Array:
+    """(E of its own, waves) px per px of displacements along the radius that go up and down."""
+    radius, outward = (column[own, None] for column in _outward(case, camera))
+    return np.asarray(outward * np.cos(np.pi * np.array(_WAVES) * radius / np.max(radius, initial=1e-12)))
+
+
+EFFECTS = (Radius(),)
