@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from accuracy.bound import bound, make_trial
 from accuracy.intervals import CASES, cover, share
+from accuracy.odd_scenes import LENSES as ODD_LENSES
 from accuracy.scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
 from scenes import RADIAL, SCENES
 
@@ -41,8 +42,10 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import intrinsic_keys, moved, natural_sizes
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.structure import make_structure
+from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import Segment
+from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -208,6 +211,54 @@ def test_another_lens_widens_a_valley_on_the_floor_alike_at_every_phi() -> None:
         assert np.linalg.norm(places[1] - places[0], axis=1) == pytest.approx([aside, aside], rel=0.1)
     sd = [calibration.uncertainty.located(pixels).sd_m, spread_of_points(estimate, wider, "overhead", pixels, 0.0).sd_m]
     assert np.all(sd[1] > 3.0 * sd[0])
+
+
+@cache
+def seen_in_a_circle(seed: int) -> tuple[Calibration, Camera]:
+    """A field of which only lines within 380 px of the middle are seen, by defaults; and the true camera."""
+    rng = np.random.default_rng(seed)
+    kind = list(ODD_LENSES)[seed % 3]
+    phi, lens = ODD_LENSES[kind](rng)
+    camera = Camera((1280, 960), phi, (640.0, 480.0), lens)
+    pose = overhead_pose(0.2, -0.3, 2.9 if kind == "kannala-brandt" else 4.5, 9.0, -7.0, yaw_deg=40.0)
+    scene = field_scene(FIELD, {"overhead": camera}, {"overhead": Station("overhead", pose)}, spacing_m=0.1)
+    observations = simulate(scene, Disturbance(0.2, 0.2), seed).observations
+    near = (
+        np.linalg.norm(column.pixels - camera.principal_point, axis=1) < 380.0
+        for column in (observations.points, observations.curves)
+    )
+    return calibrate(observations.part(*near)), camera.at(pose)
+
+
+def around(camera: Camera, radius_px: float) -> Array:
+    """Pixels at a distance from the principal point, inside the image."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    pixels = camera.principal_point + radius_px * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(pixels[np.all((pixels > 0.0) & (pixels < (1279.0, 959.0)), axis=1)])
+
+
+@pytest.mark.parametrize("seed", [3, 5, 11])
+def test_beyond_the_observations_other_lenses_are_what_they_show(seed: int) -> None:
+    """85 px beyond the outermost observation of a lens that is chosen by the data."""
+    calibration, truth = seen_in_a_circle(seed)
+    pixels = around(truth, 465.0)
+    shown = np.isfinite(truth.locate(pixels)[:, 0])
+    points = calibration.uncertainty.located(pixels[shown])
+    off = np.linalg.norm(points.located - truth.locate(pixels[shown]), axis=1)
+    assert np.all(off < 4.0 * points.sd_m)  # .6, 1.8, 2.1 measured; 1.9, 7.4 and 9.6 with the chosen lens alone
+
+
+def test_other_lenses_are_in_the_file(tmp_path: Path) -> None:
+    calibration, truth = seen_in_a_circle(3)
+    posterior = calibration.uncertainty.posterior
+    assert len(posterior.lenses) > 1 and posterior.mixtures[""].lenses
+    calibration.save(tmp_path / "calibration.json")
+    again = Calibration.load(tmp_path / "calibration.json")
+    pixels = around(truth, 465.0)
+    sd_m = calibration.uncertainty.located(pixels).sd_m
+    assert again.uncertainty.located(pixels).sd_m == pytest.approx(sd_m, rel=1e-9)
+    alone = replace(calibration.uncertainty, posterior=replace(posterior, mixtures={}))
+    assert np.mean(sd_m) > np.mean(alone.located(pixels).sd_m)
 
 
 def test_a_prior_on_phi_is_part_of_its_profile() -> None:

@@ -57,8 +57,7 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
     for name, camera in estimate.cameras.items():
         keys = [key for key in posterior.keys if key[:2] == ("camera", name) and key.quantity in camera.lens.names]
         at = posterior.information.columns(keys)
-        # Where a valley of phi is open, what goes with phi is as open: that is no fault of the lens.
-        sd = np.where(np.isinf(posterior.sd), posterior.spread.sd, posterior.sd)[at]
+        sd = posterior.spread.sd[at]  # without what bends: where a valley of phi is open, so is all that goes with it
         lost = [
             key.quantity for key, size in zip(keys, sd / natural_sizes(estimate, keys), strict=True) if size > _LOST
         ]

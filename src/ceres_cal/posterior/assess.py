@@ -189,11 +189,12 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
     # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
     keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
     weights = counted(lenses.weights)
-    wider = posterior.with_alternatives(keys, shifts_to_lenses(lenses, keys, lenses.near), weights.tolist())
+    shifts, every = shifts_to_lenses(lenses, keys, lenses.near), (lenses.near, *lenses.others)
+    wider = posterior.with_alternatives(keys, shifts, weights.tolist(), every)
     mixtures = dict(wider.mixtures)
     for name in posterior.followed:
         mine = posterior.mixtures[name]
         nodes = [moved(estimate, mine.keys, step) for step in mine.steps]
-        shifts = np.array([shifts_to_lenses(lenses, mine.keys[1:], node) for node in nodes])
-        mixtures[name] = mine.shifted_also(weights, over(np.swapaxes(shifts, 0, 1), mine.keys[1:], mine.keys))
+        along = np.array([shifts_to_lenses(lenses, mine.keys[1:], node) for node in nodes])
+        mixtures[name] = mine.shifted_also(weights, over(np.swapaxes(along, 0, 1), mine.keys[1:], mine.keys))
     return replace(wider, mixtures=mixtures)

@@ -17,6 +17,9 @@ from ceres_cal.posterior.bent import Ends
 from ceres_cal.posterior.mixture import Chain, Mixture
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information, Key, over, pose_keys
+from ceres_cal.problem.parameters import Estimate, Station
+from ceres_cal.problem.structure import EXACT
+from ceres_cal.scene.files import CameraFile, PoseFile
 
 
 class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -38,6 +41,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
     phi_px: float = 0.0
     open_below: bool = False
     open_above: bool = False
+    lenses: list[tuple[int, int]] = []
 
     @classmethod
     def of(cls, mixture: Mixture) -> MixtureFile:
@@ -56,6 +60,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
             mixture.phi_px,
             mixture.open_below,
             mixture.open_above,
+            list(mixture.lenses.items()),
         )
 
     def mixture(self, name: str, known: Collection[Key]) -> Mixture:
@@ -76,7 +81,29 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
             raise InputError(f"{where} does not begin with phi of camera {name!r}: calibrate again")
         information = tuple(every[number] for number in self.at)
         numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), information
-        return Mixture(tuple(self.keys), *numbers, chains, self.phi_px, self.open_below, self.open_above)
+        valley = self.phi_px, self.open_below, self.open_above
+        return Mixture(tuple(self.keys), *numbers, chains, *valley, dict(self.lenses))
+
+
+class SeenFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Cameras and stations with one lens of several."""
+
+    cameras: dict[str, CameraFile]
+    stations: dict[str, tuple[str, PoseFile]]
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> SeenFile:
+        """As a file has it."""
+        stations = {name: (one.camera, PoseFile.of(one.cam_from_world)) for name, one in estimate.stations.items()}
+        return cls({name: CameraFile.of(one) for name, one in estimate.cameras.items()}, stations)
+
+    def estimate(self) -> Estimate:
+        """The estimate; InputError where a camera or a pose is none."""
+        cameras = {name: one.camera() for name, one in self.cameras.items()}
+        stations = {name: Station(camera, pose.pose()) for name, (camera, pose) in self.stations.items()}
+        if any(one.camera not in cameras for one in stations.values()):
+            raise InputError("posterior.lenses: a station names a camera that is not there: calibrate again")
+        return Estimate(cameras, stations, {}, EXACT)
 
 
 class ChainFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -154,6 +181,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     stated_keys: list[Key] = []
     stated: list[float] = []
     mixtures: dict[str, MixtureFile] = {}
+    lenses: list[SeenFile] = []
 
     @classmethod
     def of(cls, posterior: Posterior) -> PosteriorFile:
@@ -171,6 +199,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             list(posterior.stated.keys),
             lower_triangle(posterior.stated),
             {name: MixtureFile.of(mixture) for name, mixture in posterior.mixtures.items()},
+            [SeenFile.of(estimate) for estimate in posterior.lenses],
         )
 
     def posterior(self, known: Collection[Key]) -> Posterior:
@@ -191,7 +220,14 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         freedom = np.inf if self.freedom is None else self.freedom
         require_keys(self.stated_keys, self.keys, "posterior.stated_keys")
         stated = information_from(self.stated, self.stated_keys, "posterior.stated")
-        return Posterior(information, placements, freedom, mixtures, by_model or None, self.dependence, stated)
+        lenses = tuple(one.estimate() for one in self.lenses)
+        if any(
+            not (0 < lens < len(lenses) and 0 <= component < len(mixture.weights))
+            for mixture in mixtures.values()
+            for component, lens in mixture.lenses.items()
+        ):
+            raise InputError("posterior.mixtures names lenses that posterior.lenses has not: calibrate again")
+        return Posterior(information, placements, freedom, mixtures, by_model or None, self.dependence, stated, lenses)
 
 
 def require_alike(

@@ -8,8 +8,8 @@ deviations its moments.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +60,7 @@ class Mixture:
         information: (C) about the numbers there; one that it has no key of is held.
         chains: of components along phi. phi_px: by the estimate; 0 where there is no chain.
         open_below, open_above: the valley does not rise to the 95 % bound as far as lenses go.
+        lenses: of components that are another lens, which one: their steps are how the numbers follow it.
     """
 
     keys: tuple[Key, ...]
@@ -70,6 +71,7 @@ class Mixture:
     phi_px: float = 0.0
     open_below: bool = False
     open_above: bool = False
+    lenses: Mapping[int, int] = field(default_factory=dict)
 
     @classmethod
     def of_one(cls, information: Information) -> Mixture:
@@ -136,10 +138,13 @@ class Mixture:
                 known[id(one)] = how(one)
         return replace(self, information=tuple(known[id(one)] for one in self.information))
 
-    def with_alternatives(self, weights: Array, steps: Array, information: Information) -> Mixture:
-        """With further components of these weights (S,) at steps (S, K)."""
+    def with_alternatives(
+        self, weights: Array, steps: Array, information: Information, lenses: Sequence[int] = ()
+    ) -> Mixture:
+        """With further components of these weights (S,) at steps (S, K); other lenses by their numbers."""
         return replace(
             self,
+            lenses={**self.lenses, **{len(self.weights) + count: lens for count, lens in enumerate(lenses)}},
             weights=np.concatenate([(1.0 - weights.sum()) * self.weights, weights]),
             steps=np.concatenate([self.steps, steps]),
             information=(*self.information, *[information] * len(weights)),

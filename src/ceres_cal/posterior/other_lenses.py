@@ -1,8 +1,9 @@
-"""By how much numbers are off if another lens is the right one: of several that predict as well, one was taken.
+"""Other lenses that predict as well as the chosen one, and how its numbers follow them.
 
 Where they agree, the data tell them apart; at the rim and between lines they do not, and what the chosen one says there
-is its own. What another lens shows over the picture is followed by the numbers of the chosen one as closely as they
-can, by least squares over places on the floor and above it, or over rays of a camera that sees no floor.
+is its own. So they are components of the posterior, and maps show what they show, also where nothing was observed. The
+numbers of the chosen one follow each as closely as they can, by least squares over places on the floor and above it, or
+over rays of a camera that sees no floor.
 """
 
 from __future__ import annotations

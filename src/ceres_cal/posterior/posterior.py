@@ -35,6 +35,8 @@ class Posterior:
         mixtures: camera -> what it and its stations may be, where its phi was followed along its profile; "" -> what
             everything else may be, where that is no one normal distribution. Standard deviations, bounds and maps are
             read off these.
+        lenses: the estimate with the chosen lens and those with others that predict as well, from the same
+            observations: what components of the mixtures that are another lens show.
         stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
         by_model: what the model alone says of the shared numbers, were every error independent of the others; None
             where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
@@ -47,6 +49,7 @@ class Posterior:
     by_model: Information | None = None
     dependence: Dependence | None = None
     stated: Information = field(default_factory=Information.nothing)
+    lenses: tuple[Estimate, ...] = ()
 
     @property
     def keys(self) -> tuple[Key, ...]:
@@ -63,21 +66,26 @@ class Posterior:
         found = self.mixtures.get(camera) or self.mixtures.get("")
         return found or Mixture.of_one(self.information)
 
-    def with_alternatives(self, keys: Sequence[Key], shifts: Sequence[Array], weights: Sequence[float]) -> Posterior:
+    def with_alternatives(
+        self, keys: Sequence[Key], shifts: Sequence[Array], weights: Sequence[float], lenses: tuple[Estimate, ...] = ()
+    ) -> Posterior:
         """The posterior where something else may be true: shifts (S, K) of some numbers, with the probability of each.
 
-        They are components of the mixtures, and in the information by the second moments that they add.
+        Where these follow other lenses, the estimate with the chosen one is given, and with each of them. They are
+        components of the mixtures, and in the information by the second moments that they add.
         """
         if not len(shifts):
             return self
         whole, likely = over(np.array(shifts), keys, self.keys), np.asarray(weights, dtype=float)
         limited = self._beside_stated(whole)
-        mixtures = {"": self.mixture().with_alternatives(likely, limited, self.information)}
+        numbers = range(1, len(lenses))
+        mixtures = {"": self.mixture().with_alternatives(likely, limited, self.information, numbers)}
         for name in self.followed:
             mine = self.mixtures[name]
             off = mine.off_valley(over(limited, self.keys, mine.keys))
             mixtures[name] = mine.shifted_also(likely, off[:, None])
-        return self._with_information(np.sqrt(likely)[:, None] * whole, mixtures)
+        there = replace(self, lenses=self.lenses or lenses)
+        return there._with_information(np.sqrt(likely)[:, None] * whole, mixtures)
 
     def widened(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
         """The posterior whose numbers scatter by shifts (S, K) of some of them as well: each goes into the covariance

@@ -62,6 +62,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Shown, camera: str = "
     """
     mixture, width = posterior.mixture(camera), posterior.half_width
     values, covariances = _of_components(mixture, estimate, shown, width)
+    _show_lenses(values, mixture, posterior.lenses, shown)
     lost = np.asarray(np.isnan(values).any(axis=(0, 2)))
     weights, means, known = mixture.refined(np.where(lost[:, None], 0.0, values), covariances)
     variances = np.diagonal(known, axis1=-2, axis2=-1)
@@ -97,6 +98,17 @@ def _of_components(mixture: Mixture, estimate: Estimate, shown: Shown, width: fl
         values.append(off)
         covariances.append(known[id(information)])
     return np.array(values), np.array(covariances)
+
+
+def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], shown: Shown) -> None:
+    """Values (C, N, 2) of components that are another lens: by how much it shows them elsewhere, wherever it shows
+    anything.
+    """
+    if mixture.lenses:
+        near = shown.values(lenses[0])
+        for component, number in mixture.lenses.items():
+            off = shown.values(lenses[number]) - near
+            values[component] = np.where(np.isfinite(off), off, values[component])
 
 
 def _covariance(information: Information, there: Estimate, shown: Shown, width: float) -> Array:
