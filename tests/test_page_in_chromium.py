@@ -133,8 +133,26 @@ def test_the_sample_found_by_itself(window: Browser, tmp_path: Path) -> None:
         assert window.run("page.now.photographs.map(one => one.board)") == [False, True, True]
         assert window.run("page.now.known.level") == "good"
         window.run("document.querySelectorAll('[role=tab]')[1].click()")
-        window.wait_for("page.view.picture")
+        window.wait_for("page.view.picture && page.view.layers[0].lines.length == 15")  # of the board
         keep(window, "6-board")
+        window.run("page.change({exports: ['opencv']})")
+        window.wait_for("page.now.state.exports.length && page.now.found")  # what was found stays
+        press(window, "done")
+        assert (tmp_path / "page/opencv.yml").exists()
+    assert window.complaints == []
+
+    old = tmp_path / "page/calibration.json"
+    step, moved = np.array([[1.0, 0.002, 4.0], [-0.002, 1.0, -3.0]]), tmp_path / "moved.png"
+    image = cv2.warpAffine(read_colour(folder / "0002.jpg"), step, (1280, 960), borderMode=cv2.BORDER_REPLICATE)
+    cv2.imwrite(str(moved), image)
+    with opened(tmp_path / "look", old, moved) as address:
+        shown(window, address)
+        press(window, "check")
+        held, beside = window.run("page.now.said")
+        assert held.startswith("camera: no longer holds: moved by about ")
+        assert 2.0 < float(beside.split(" px")[0].split()[-1]) < 6.0  # median across the lines; the shift is 5 px
+        window.wait_for("page.view.strokes.length > 100")
+        keep(window, "7-moved")
 
 
 def test_four_corners_of_a_photograph_that_is_not_found_by_itself(

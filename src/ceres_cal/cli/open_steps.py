@@ -47,9 +47,6 @@ class PageCommands:
     def target(self, text: str) -> Target:
         return read_target(text, "field")
 
-    def check(self, photograph: Path) -> str:
-        return _answer(Step("check", (str(self.sitting.start), str(photograph)), photograph)).text()
-
     def make(self, state: State, target: Target | None, folder: Path, *, auto: bool, known: Made | None) -> Made:
         """See `page.state.Commands`.
 
@@ -159,7 +156,9 @@ def write_inputs(state: State, sitting: Sitting, folder: Path, *, auto: bool) ->
     """Clicks and masks as files that the commands take."""
     if not auto and len(state.points) >= FEWEST:
         points = {name: (one.x, one.y) for name, one in state.points.items()}
-        write_json(folder / "corners.json", {"format": FORMAT, "version": VERSION, "points": points})
+        curves = [(one.curve, one.x, one.y) for one in state.places]
+        data = {"format": FORMAT, "version": VERSION, "points": points, "curves": curves}
+        write_json(folder / "corners.json", data)
     for path, size in zip(sitting.photographs, sitting.sizes, strict=True):
         regions = [one for one in state.regions if one.photograph == path.name]
         if regions:

@@ -26,6 +26,7 @@ from ceres_cal.report.pictures.files import jpeg_of_at_most
 HOST = "127.0.0.1"
 _MOST_BYTES = 1 << 18  # of a message: a state with all that a hand may show
 _MOST_WINDOWS = 8
+_QUIET_S = 0.5
 _PATIENCE_S = 5.0  # with a window that takes nothing any more
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 _HEADERS = {
@@ -66,6 +67,7 @@ class Server:
         self._work = ThreadPoolExecutor(1, "work")
         self._pictures = ThreadPoolExecutor(1, "pictures")
         self._busy = ""
+        self._weighing: asyncio.Handle = asyncio.get_running_loop().call_soon(lambda: None)
         self._pages = {one.name: one.read_bytes() for one in files("ceres_cal.page").joinpath("web").iterdir()}
         self.port = 0
 
@@ -142,6 +144,8 @@ class Server:
                 await self._send(window, answer)
             elif not why:
                 await self._show()
+                self._weighing.cancel()
+                self._weighing = asyncio.get_running_loop().call_later(_QUIET_S, self._weigh)
         if why:
             await self._send(window, {"is": "refused", "why": why})
 
@@ -172,6 +176,18 @@ class Server:
                 return work()
 
         return await asyncio.get_running_loop().run_in_executor(self._drags, answer_or_reason, locked)
+
+    def _weigh(self) -> None:
+        """What clicks alone tell is said when the hand rests."""
+
+        async def wait() -> None:
+            loop = asyncio.get_running_loop()
+            told, _ = await loop.run_in_executor(self._work, answer_or_reason, self.session.weigh)
+            if told:
+                await self._show()
+
+        if not self._busy:
+            self._waiting = asyncio.create_task(wait())
 
     async def _at_length(self, asked: Do) -> None:
         """Work in the other thread; meanwhile every window says what it is."""

@@ -13,21 +13,32 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.base.files import make_folder
-from ceres_cal.base.words import frame_of
+from ceres_cal.base.words import frame_of, mm
 from ceres_cal.calibration import Calibration
-from ceres_cal.detect.photographs import by_hand
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.photographs import by_hand, check_photographs
 from ceres_cal.detect.photographs.clicks import FEWEST
 from ceres_cal.detect.photographs.facing import distinguishing_feature
+from ceres_cal.detect.photographs.known import is_painted
+from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import EXPORT_FORMATS
+from ceres_cal.moves.comparisons import compare
 from ceres_cal.observations import Observations, combine
-from ceres_cal.page.known import Found, found_of, model_lines, painted_target
 from ceres_cal.page.state import Change, Commands, Drag, Made, Sitting, State, load_state, save_state, target_words
+from ceres_cal.problem.parameters import Options
+from ceres_cal.report.live import known_of, strokes_of
+from ceres_cal.report.pictures.frames import frame_by_name, frames_of, model_of
+from ceres_cal.report.pictures.model import Model
+from ceres_cal.report.quality import quality_of
 from ceres_cal.report.scale import COLORS, MM
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, targets_by_name
 
 KEPT = "page.json"
 _MOST_UNDONE = 200
+_BY_HAND = Options(
+    lens="radial", powers=(3,), noise_scale="stated", free_principal_point=False, free_aspect=False, usual_camera=False
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,9 @@ class Session:
         self.revision = 0
         self.message = ""
         self.written: tuple[str, ...] = ()
+        self.said: tuple[str, ...] = ()
+        self._strokes: dict[str, Any] = {}
+        self._by_hand: dict[str, Any] | None = None
         self._past: list[_Moment] = []
         self._future: list[_Moment] = []
         self._now = _Moment(state)
@@ -75,8 +89,7 @@ class Session:
         if not state.target:
             if self._start is None:
                 return None
-            name = painted_target(self._start)
-            return None if name is None else self._start.targets[name]
+            return next((one for one in self._start.targets.values() if is_painted(one)), None)
         drawn = self._target(state.target)
         return self._target(target_words(state, drawn)) if state.lengths else drawn
 
@@ -109,7 +122,7 @@ class Session:
         target = self._required_target()
         state = drag.of(self.state, target)
         base = self._base(target)
-        self._camera = by_hand.solved(target, _shown(state, target), self._camera or base, base)
+        self._camera = by_hand.solved(target, _shown(state, target), self._camera or base, base, quickly=True)
         if drag.last:
             self._become(state, camera=self._camera)
 
@@ -140,19 +153,14 @@ class Session:
         self.revision += 1
         self.message, self._against = "", {}
         target = self.target(self.state)
-        if target is not None:
-            self._camera = self._by_clicks(target) if self._now.found is None else self._now.base
+        if target is not None and self._now.found is None:
+            base, shown = self._base(target), _shown(self.state, target)
+            settled = by_hand.settled(target, shown, self._camera or base, base)
+            self._camera, self._against, self.message = settled
+        elif target is not None:
+            self._camera = self._now.base
+        self._by_hand = None
         self._keep()
-
-    def _by_clicks(self, target: Target) -> Camera:
-        base, shown = self._base(target), _shown(self.state, target)
-        camera = by_hand.solved(target, shown, self._camera or base, base)
-        off_px, sigma_px = by_hand.off(target, shown, camera)
-        if len(shown.names) >= FEWEST and np.any(off_px > 10.0 * sigma_px):
-            other, self.message = answer_or_reason(lambda: by_hand.anew(target, shown, base.image_size))
-            camera = other or camera
-        robust, self._against = by_hand.judged(target, shown, camera, base)
-        return robust
 
     def _keep(self) -> None:
         """Where that fails all is still in the window, which says so."""
@@ -175,11 +183,12 @@ class Session:
         with tempfile.TemporaryDirectory(prefix="ceres-cal-") as folder:
             made = self.commands.make(moment.state, target, Path(folder), auto=auto, known=None)
             observations = combine([Observations.load(Path(folder) / name) for name in made.observed])
-            found = found_of(observations, Calibration.load(made.calibration))
+            calibration = Calibration.load(made.calibration)
+            found = Found(calibration, observations, known_of(quality_of(calibration, observations)))
         with self.lock:
             if self._now is not moment:
                 raise InputError("it was changed meanwhile: find the lines again")
-            base = found.camera if target is not None else None
+            base = calibration.station() if target is not None else None
             self._remember(replace(moment, base=base, found=found, made=made, auto=auto))
             self._settle()
 
@@ -194,13 +203,45 @@ class Session:
             self.written, self.message = made.typed, ""
             self.revision += 1
 
-    def check(self, photograph: int) -> None:
-        """Whether the camera of an old calibration still stands where it stood, by one photograph."""
-        if self.sitting.start is None or photograph >= len(self.sitting.photographs):
-            raise InputError("there is no old calibration to be checked: open one with the photograph")
-        said = self.commands.check(self.sitting.photographs[photograph])
+    def weigh(self) -> bool:
+        """What the clicks alone tell, under a lens of one coefficient; whether that was asked about, and still is."""
+        moment, revision = self._now, self.revision
+        target = self.target(moment.state)
+        if target is None or moment.found is not None or len(moment.state.points) < FEWEST:
+            return False
+        seen = by_hand.observed(target, _shown(moment.state, target), self.sitting.sizes[0])
+        known = known_of(quality_of(calibrate(seen, _BY_HAND), seen), advised=False)
         with self.lock:
-            self.message = said
+            current = self.revision == revision
+            self._by_hand = known if current else self._by_hand
+        return current
+
+    def check(self, photograph: int) -> None:
+        """Whether the camera of an old calibration still stands where it stood, and by how many pixels it is off where,
+        by one photograph; and how far another calibration is from it.
+        """
+        path, old = self.sitting.photographs[photograph], self._start
+        if old is None:
+            raise InputError("there is no old calibration to be checked: open one with the photograph")
+        answers, seen = check_photographs(old, [path])
+        said = [f"{name}: {one.words}" for name, one in answers.items()]
+        strokes: dict[str, Any] = {}
+        if seen.observations is not None:
+            table = diagnose(old, seen.observations, new_data=True).table
+            off = np.abs(table.distance_px[np.isfinite(table.distance_px)])
+            said.append(
+                f"its lines are {np.median(off):.2f} px beside the paint in the median, {off.max():.2f} px at most"
+            )
+            strokes = strokes_of(table)
+        if self._other is not None and self.sitting.other is not None:
+            apart, name = self._model_of(old, path).apart_px(self._model_of(self._other, path)), self.sitting.other
+            said.append(f"{name} draws them {apart[0]:.2f} px elsewhere in the median, {apart[1]:.2f} px at most")
+            for station, one in compare(old, self._other).items():
+                if one.change is not None:
+                    floor = one.change.maps[0]
+                    said.append(f"{station}: places on the floor differ by {mm(floor.rms_mm)} (rms)")
+        with self.lock:
+            self.said, self._strokes = tuple(said), strokes
             self.revision += 1
 
     # ---- what is shown ----
@@ -242,7 +283,11 @@ class Session:
             "goal": "" if target is None else distinguishing_feature(target, tuple(target.curves)),
             "model": self.model(),
             "against": self._against,
-            "known": None if found is None else found.known,
+            "known": self._by_hand if found is None else found.known,
+            "found": found is not None,
+            "placed": self._placed(),
+            "said": self.said,
+            "checked": self._strokes,
             "looked": self._looked(),
             "message": self.message,
             "written": self.written,
@@ -252,15 +297,41 @@ class Session:
         }
 
     def _looked(self) -> dict[str, Any]:
-        """The calibrations that were named, drawn as they are."""
-        drawn: dict[str, Any] = {}
-        for what, one, path in (
-            ("start", self._start, self.sitting.start),
-            ("other", self._other, self.sitting.other),
-        ):
-            if one is not None and path is not None and self.sitting.photographs:
-                drawn[what] = {"name": path.name, "lines": model_lines(one, self.sitting.photographs[0].stem)}
+        """The calibrations that were named, the second drawn as it is."""
+        named = {"start": self.sitting.start, "other": self.sitting.other}
+        alike = self.sitting.other is not None and self.sitting.other.name == getattr(self.sitting.start, "name", "")
+        drawn: dict[str, Any] = {
+            what: {"name": str(path) if alike else path.name} for what, path in named.items() if path is not None
+        }
+        if self._other is not None:
+            drawn["other"]["lines"] = _lines(self._model_of(self._other, self.sitting.photographs[0]))
         return drawn
+
+    def _model_of(self, calibration: Calibration, photograph: Path) -> Model:
+        station = next(iter(calibration.stations))
+        return model_of(calibration, frame_by_name(calibration, station, frame_of(photograph)))
+
+    def _placed(self) -> dict[str, Any]:
+        """The boards that were found, by frame, as the calibration has them."""
+        found = self._now.found
+        if found is None:
+            return {}
+        frames = (replace(one, shown=tuple(s for s in one.shown if s[1])) for one in frames_of(found.observations))
+        return {one.name: _lines(model_of(found.calibration, one)) for one in frames if one.shown}
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What came of "find the lines"; `known`: what is said of it."""
+
+    calibration: Calibration
+    observations: Observations
+    known: dict[str, Any]
+
+
+def _lines(model: Model) -> list[Any]:
+    """(S, 2) px each."""
+    return [np.round(line.middle[::4], 1).tolist() for line in model.lines]
 
 
 def _shown(state: State, target: Target) -> by_hand.Shown:

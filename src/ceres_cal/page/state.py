@@ -121,9 +121,6 @@ class Commands(Protocol):
                 report and exports, too.
         """
 
-    def check(self, photograph: Path) -> str:
-        """Whether the calibration that was named holds in a photograph."""
-
 
 class Change(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="change"):
     """The state as it is to be; `revision`: of the one that it was made from."""

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices32
+from ceres_cal.base.errors import answer_or_reason
 from ceres_cal.base.transforms import Pose
-from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks, unknown_optics
-from ceres_cal.detect.photographs.refit import ROBUST, PointHints, observations_of, refit_camera
+from ceres_cal.detect.photographs.clicks import FEWEST, Clicks, starts_from_clicks, unknown_optics
+from ceres_cal.detect.photographs.refit import NOTHING, ROBUST, PointHints, observations_of, refit_camera
+from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.scene.camera import Camera
@@ -25,6 +27,7 @@ _AS_SHOWN = Weighting(loss="trivial")
 # How many equations free which intrinsics; fewer leave the lens as it was.
 _FREED = ((8, ("phi",)), (12, ("phi", "a3")), (24, ("phi", "a3", "cx", "cy")), (36, ("phi", "a3", "a2", "cx", "cy")))
 _AGAINST = 4.0  # standard deviations of a hand by which a click contradicts the others
+_FAR = 10.0  # of them: no camera near puts it there
 _ENOUGH = 10  # equations from which on a contradiction can be seen
 
 
@@ -93,11 +96,12 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
     return Camera(image_size, phi, middle, Radial((0.0,) * 4, (2, 3, 4, 5)), 1.0, Pose(rotation, -rotation @ position))
 
 
-def solved(target: Target, shown: Shown, before: Camera, base: Camera) -> Camera:
+def solved(target: Target, shown: Shown, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
     """The camera by all clicks, each as well as a hand hits it; what nobody showed goes along with them.
 
     Args:
-        before: where to start from. base: the camera before anything was shown.
+        before: where to start from. base: the camera before anything was shown. quickly: another start is tried only
+            where this one leads nowhere.
     """
     if not shown.equations:
         return base
@@ -107,7 +111,7 @@ def solved(target: Target, shown: Shown, before: Camera, base: Camera) -> Camera
         there = _fitted(target, shown, start, base, _AS_SHOWN)
         if there is not None and (best is None or _cost(target, shown, there) < _cost(target, shown, best)):
             best = there
-        if best is not None and _cost(target, shown, best) < _AGAINST**2:
+        if best is not None and (quickly or _cost(target, shown, best) < _AGAINST**2):
             break
     return best or before
 
@@ -117,9 +121,27 @@ def _fitted(target: Target, shown: Shown, start: Camera, base: Camera, weighting
     wanted: tuple[str, ...] = next((names for least, names in reversed(_FREED) if shown.equations >= least), ())
     free = tuple(name for name in wanted if name in intrinsic_names(base.lens))
     optics, hints = unknown_optics(base.image_size, base.phi, None), _hints(target, shown, base)
-    observed = observations_of(target, base.image_size, shown.curve, shown.places, shown.place_sigma_px, hints)
+    observed = observations_of(target, base.image_size, *NOTHING, hints)
     fitted = refit_camera(start, observed, free, optics.priors, weighting)
     return None if fitted is None else fitted[0]
+
+
+def settled(target: Target, shown: Shown, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
+    """The camera once nothing is dragged any more, the clicks that contradict the others (see `judged`), and what is
+    wrong with them all.
+    """
+    camera, wrong = solved(target, shown, before, base), ""
+    off_px, sigma_px = off(target, shown, camera)
+    if len(shown.names) >= FEWEST and np.any(off_px > _FAR * sigma_px):
+        other, wrong = answer_or_reason(lambda: anew(target, shown, base.image_size))
+        camera = other or camera
+    return *judged(target, shown, camera, base), wrong
+
+
+def observed(target: Target, shown: Shown, image_size: tuple[int, int]) -> Observations:
+    """What was shown, as observations."""
+    every = shown.index, shown.pixels, shown.sigma_px, shown.curve, shown.places, shown.place_sigma_px
+    return observations_of(target, image_size, *NOTHING, PointHints(*every))
 
 
 def judged(target: Target, shown: Shown, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
@@ -143,7 +165,8 @@ def anew(target: Target, shown: Shown, image_size: tuple[int, int]) -> Camera:
         InputError: fewer than four, or none can be right, and why.
     """
     points = dict(zip(shown.names, map(tuple, shown.pixels.tolist()), strict=True))
-    cameras, _ = starts_from_clicks(Clicks(points), target, image_size)
+    curves = tuple((target.curve_names[n], x, y) for n, (x, y) in zip(shown.curve, shown.places.tolist(), strict=True))
+    cameras, _ = starts_from_clicks(Clicks(points, curves), target, image_size)
     return min(cameras, key=lambda camera: _cost(target, shown, camera))
 
 
@@ -198,6 +221,9 @@ def _hints(target: Target, shown: Shown, base: Camera) -> PointHints:
         np.concatenate([shown.index, rest]),
         np.concatenate([shown.pixels, there]),
         np.concatenate([shown.sigma_px, np.full(len(rest), _HELD_PX)]),
+        shown.curve,
+        shown.places,
+        shown.place_sigma_px,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,17 +20,24 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
+NOTHING: tuple[Indices32, Array, Array] = (np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
+"""Curves, pixels and sigmas of no place."""
 _QUICK = Options(max_iterations=30, threads=1)
 ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
 @dataclass(frozen=True, eq=False)
 class PointHints:
-    """Points that somebody showed: index (P,) among the target's, pixels (P, 2), sigma_px (P,)."""
+    """What somebody showed: points by their index (P,) among the target's, pixels (P, 2), sigma_px (P,), and places
+    (N, 2) px of curves (N,), with sigmas (N,).
+    """
 
     feature: Indices32
     pixels: Array
     sigma_px: Array
+    curve: Indices32 = field(default_factory=lambda: NOTHING[0])
+    places: Array = field(default_factory=lambda: NOTHING[1])
+    place_sigma_px: Array = field(default_factory=lambda: NOTHING[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +47,7 @@ class FreeIntrinsics:
     Attributes:
         names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
             the target, which are free because of that.
-        hints: points that somebody showed, which hold the camera while lines are far off.
+        hints: what somebody showed, which holds the camera while lines are far off.
         keep: whether the starts are known to be near: nothing far off is looked at.
     """
 
@@ -58,11 +65,13 @@ def observations_of(
     sigma_px: Array,
     hints: PointHints | None = None,
 ) -> Observations:
-    """One view of a field in the world: pixels (N, 2) on curves (N,), and points."""
-    count = len(curve)
+    """One view of a field in the world: pixels (N, 2) on curves (N,), and what somebody showed besides."""
     points = NO_POINTS
     if hints is not None:
         points = Points(np.zeros(len(hints.feature), np.int32), hints.feature, hints.pixels, hints.sigma_px)
+        curve, pixels = np.concatenate([curve, hints.curve]), np.concatenate([pixels, hints.places])
+        sigma_px = np.concatenate([sigma_px, hints.place_sigma_px])
+    count = len(curve)
     return Observations(
         {TARGET: target},
         {CAMERA: image_size},

@@ -9,7 +9,7 @@ const SIDES = ["right", "bottom-right", "bottom", "bottom-left", "left", "top-le
 
 let now = null; // all that the server said last
 let socket = null, waiting = false, next = null;
-let selected = null, photograph = 0, withResiduals = false, advised = null;
+let selected = null, photograph = 0, withResiduals = false, advised = null, saw = false;
 const pictures = new Map();
 
 const view = new View($("stage"), $("view"), $("lens"), {
@@ -91,6 +91,10 @@ function receive(message) {
   }
   now = message;
   say(now.message);
+  if (Object.keys(now.checked).length && !saw) { // once: what the photograph was compared for
+    saw = withResiduals = true;
+    $("residuals").setAttribute("aria-pressed", true);
+  }
   refresh();
   answered();
 }
@@ -110,13 +114,17 @@ function refresh() {
   ].map(one => ({ ...one, ...against(one) }));
   const shown = now.photographs[photograph];
   view.regions = now.state.regions.filter(one => one.photograph === shown.name).map(one => one.box);
-  view.strokes = withResiduals ? now.known?.residuals[shown.frame] ?? now.checked?.[shown.frame] ?? [] : [];
+  view.strokes = withResiduals ? now.known?.residuals[shown.frame] ?? now.checked[shown.frame] ?? [] : [];
   view.enlarged = enlargement(view.strokes);
-  view.layers = [now.looked.other && { lines: now.looked.other.lines, colour: "before" }].filter(Boolean);
+  view.layers = [
+    { lines: now.placed[shown.frame] ?? [], colour: "model" },
+    { lines: now.looked.other?.lines ?? [], colour: "before" },
+  ];
+  if (!now.found) advised = null;
   view.shapes = advised ?? [];
   $("undo").disabled = !now.undo || Boolean(now.busy);
   $("redo").disabled = !now.redo || Boolean(now.busy);
-  $("residuals").disabled = !now.known && !now.checked;
+  $("residuals").disabled = !now.known && !Object.keys(now.checked).length;
   $("busy").hidden = !now.busy;
   $("busy-text").textContent = now.busy;
   panel.show(now, selected, photograph);
@@ -179,13 +187,14 @@ function hint() {
   else if (view.tool === "mask") text = "Draw a box over what is not the field.";
   else if (withResiduals && view.strokes.length) text = `Residuals, ${view.enlarged} times enlarged.`;
   else if (!now.target) text = "Choose the field on the right.";
-  else if (now.busy || now.known) text = "";
+  else if (now.busy || now.found) text = "";
   else if (name && !(name in now.state.points)) text = `Click where ${name} is, or drag it there.`;
   else if (shown < 4) text = `Drag four corners or crossings of the model to where they are: ${shown} of 4.`;
   else text = "Drag whatever is off; then find the lines.";
   $("hint").textContent = text;
 }
 function say(text) {
+  $("goal").classList.toggle("wanted", text.includes("--facing"));
   $("message").textContent = text;
   $("message").hidden = !text;
 }

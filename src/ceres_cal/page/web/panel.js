@@ -47,9 +47,9 @@ export class Panel {
     $("goal").textContent = now.state.facing ? now.state.facing.replace("=", ": ") : `Where is ${now.goal}?`;
     $("progress").textContent = !now.target ? "" : shown ? "" : "Or drag four corners of the model to where they are.";
     $("auto").disabled = busy || (!now.target && !now.state.board);
-    $("find").disabled = busy || !(now.state.board || (now.target && (shown >= 4 || (now.looked.start && !shown))));
-    $("done").disabled = busy || !now.known;
-    $("done").title = now.known ? `Writes ${now.folder}/` : "Find the lines first";
+    $("find").disabled = busy || !(now.target ? shown >= 4 || (now.looked.start && !shown && !now.state.places.length) : now.state.board);
+    $("done").disabled = busy || !now.found;
+    $("done").title = now.found ? `Writes ${now.folder}/` : "Find the lines first";
   }
 
   targets(now) {
@@ -115,10 +115,11 @@ export class Panel {
         element("dd", { className: one.verdict.split(" ").pop(), textContent: one.verdict }));
     }
     const parts = [element("p", { className: `verdict ${known.level}`, textContent: known.headline }), numbers];
+    if (!now.found) parts.unshift(element("p", { className: "quiet", textContent: "By what was dragged alone; find the lines to know more:" }));
     if (known.maps.length) parts.push(...this.map(now, known));
     for (const [number, one] of known.advice.entries()) {
       const button = element("button", { className: "advice", title: "Show where in the picture" }, number ? "Then " : "Next: ", one.words,
-        element("small", { textContent: [...one.steps, one.leaves].join("; ") }));
+        element("small", { textContent: [...(one.steps.length <= 3 ? one.steps : []), one.leaves].join("; ") }));
       button.onclick = () => this.act.advise(one.shapes);
       parts.push(button);
     }
@@ -166,8 +167,8 @@ export class Panel {
     const key = element("p", { className: "keyed" }, element("span", {}, element("b", { className: "model" }), start.name));
     if (other) key.append(element("span", {}, element("b", { className: "before" }), other.name));
     $("looking").replaceChildren(element("h2", { textContent: other ? "Two calibrations" : "An old calibration" }), key,
-      ...(now.compared ?? []).map(text => element("p", { className: "quiet", textContent: text })),
-      element("button", { id: "check", textContent: "Has the camera moved?", disabled: Boolean(now.busy) }));
+      ...now.said.map(text => element("p", { className: "quiet", textContent: text })),
+      element("button", { id: "check", textContent: other ? "Compare them by this photograph" : "Has the camera moved?", disabled: Boolean(now.busy) }));
   }
 }
 

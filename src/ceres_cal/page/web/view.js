@@ -172,7 +172,7 @@ export class View {
     }
     this.clicks.forEach((one, number) => this.click(context, one, this.model.feet[number], to));
     for (const shape of this.shapes) this.shape(context, shape, to);
-    if (held && this.pointer && !this.hold) this.label(context, held.name, this.pointer[0] + 14, this.pointer[1] - 12);
+    if (held && this.pointer && !this.hold && !this.clicks.some(one => one.against && one.name === held.name)) this.label(context, held.name, this.pointer[0] + 14, this.pointer[1] - 12);
   }
 
   line(context, line, to, colour, width, dashed = false) {

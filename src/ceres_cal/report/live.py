@@ -1,9 +1,8 @@
-"""What is known of a calibration, as the page shows it: verdict, numbers, maps, advice as places in the picture."""
+"""What is known of a calibration as plain data, for a page that draws it itself: verdict, numbers, maps, advice."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,44 +10,18 @@ import numpy as np
 from ceres_cal.base.errors import answer_or_reason
 from ceres_cal.base.words import at_precision, mm, two_digits
 from ceres_cal.calibration import Calibration
-from ceres_cal.detect.photographs.known import is_painted
+from ceres_cal.diagnostics import ResidualTable
 from ceres_cal.diagnostics.advice import advise
-from ceres_cal.observations import Observations
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.weak import Verdict
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.material import paint_of
 from ceres_cal.report.pictures.advised import places_in_picture
-from ceres_cal.report.pictures.frames import frame_by_name, model_of
-from ceres_cal.report.quality import Quality, quality_of
-from ceres_cal.scene.camera import Camera
+from ceres_cal.report.quality import Quality
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What came of "find the lines": observations, their calibration, and what is said of them.
-
-    Attributes:
-        known: for the page, see `known_of`.
-    """
-
-    observations: Observations
-    calibration: Calibration
-    known: dict[str, Any]
-
-    @property
-    def camera(self) -> Camera:
-        return self.calibration.station()
-
-
-def found_of(observations: Observations, calibration: Calibration) -> Found:
-    """All that is shown of a calibration."""
-    quality = quality_of(calibration, observations)
-    return Found(observations, calibration, known_of(quality))
-
-
-def known_of(quality: Quality) -> dict[str, Any]:
-    """Verdict, numbers, maps and advice, ready to be sent."""
+def known_of(quality: Quality, *, advised: bool = True) -> dict[str, Any]:
+    """Verdict, numbers, maps, residuals by frame, and, unless that takes too long, advice."""
     judged = judge_quality(quality)
     maps = next(iter(quality.maps.values()), ())
     return {
@@ -58,8 +31,8 @@ def known_of(quality: Quality) -> dict[str, Any]:
         "numbers": list(_numbers(quality)),
         "maps": [_map(one) for one in maps],
         "paint": [np.round(line[:, :2], 3).tolist() for line in paint_of(quality.fields)],
-        "advice": _advice(quality.calibration) if maps else [],
-        "residuals": _residuals(quality),
+        "advice": _advice(quality.calibration) if maps and advised else [],
+        "residuals": {} if quality.diagnosis is None else strokes_of(quality.diagnosis.table),
     }
 
 
@@ -69,9 +42,7 @@ def _numbers(quality: Quality) -> Iterator[dict[str, str]]:
         if quantity == "phi" or (kind == "station" and quantity == "height"):
             unit, factor = ("px", 1.0) if quantity == "phi" else ("mm", 1e3)
             yield _number(f"{quantity} of {owner}", verdict, factor, unit)
-        elif (
-            verdict.key.is_structure and kind == "target" and quantity in quality.calibration.targets[owner].dimensions
-        ):
+        elif kind == "dimension":
             yield _number(quantity.removesuffix("_m").replace("_", " "), verdict, 1e3, "mm")
 
 
@@ -89,11 +60,8 @@ def _map(one: FieldMap) -> dict[str, Any]:
     return {"height_mm": round(1e3 * one.height_m), "ends": ends, "rows": values.tolist()}
 
 
-def _residuals(quality: Quality) -> dict[str, list[list[Any]]]:
-    """Strokes by frame: x, y, by how much the model is beside it, and whether it was taken out."""
-    if quality.diagnosis is None:
-        return {}
-    table = quality.diagnosis.table
+def strokes_of(table: ResidualTable) -> dict[str, list[list[Any]]]:
+    """By frame: x, y, by how much the model is beside it, px each, and whether it was taken out."""
     frames: dict[str, list[list[Any]]] = {}
     for number in np.flatnonzero(np.isfinite(table.residual_px[:, 0])).tolist():
         x, y = table.pixel[number].round(2).tolist()
@@ -126,18 +94,3 @@ def _advice(calibration: Calibration) -> list[dict[str, Any]]:
         for promise in (advice.best, advice.then)
         if promise is not None
     ]
-
-
-# ---- looking only ---------------------------------------------------------------------------------------------------
-
-
-def model_lines(calibration: Calibration, photograph: str, height_m: float = 0.0) -> list[Any]:
-    """The lines of a calibration in a photograph of its first station, (S, 2) px each."""
-    station = next(iter(calibration.stations))
-    model = model_of(calibration, frame_by_name(calibration, station, photograph), height_m)
-    return [np.round(line.middle[::4], 1).tolist() for line in model.lines]
-
-
-def painted_target(calibration: Calibration) -> str | None:
-    """Name of the field of a calibration; None where it has none."""
-    return next((name for name, target in calibration.targets.items() if is_painted(target)), None)
