@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,13 +13,14 @@ from hypothesis import strategies as st
 from scenes import camera, side_by_side
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.bent import Ends
-from ceres_cal.posterior.files import PosteriorFile
+from ceres_cal.posterior.files import BendsFile, PosteriorFile, ProfileFile
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information, Key, over
@@ -130,6 +132,30 @@ def test_a_valley_ends_where_the_prior_does() -> None:
     assert np.ptp(posterior.bounds, axis=1)[[0, 2]] == pytest.approx(2.0 * NORMAL_95 * np.array([20.0, 0.5]))
     back = PosteriorFile.of(posterior).posterior(KEYS)
     assert np.array_equal(back.bounds, posterior.bounds) and np.array_equal(back.sd, posterior.sd)
+
+
+def test_files_of_before_are_read() -> None:
+    """Their valley, and one end of each weak direction, are the mixtures that they would be today."""
+    steps = np.column_stack([np.linspace(-30.0, 30.0, 13), np.zeros((13, 4))])
+    rises, across = np.linspace(-3.0, 3.0, 13) ** 2, Information(KEYS[1:], np.eye(4))
+    known = Information(KEYS, np.eye(5))
+    triangle = across.matrix[np.tril_indices(4)].tolist()
+    valley = ProfileFile(list(KEYS), 800.0, steps.tolist(), rises.tolist(), [triangle] * 13, False, False)
+    new = PosteriorFile.of(Posterior(known))
+    before = msgspec.structs.replace(new, profiles={"a": valley}).posterior(KEYS)
+    assert before.followed == ("a",)
+    assert before.bounds[0] == pytest.approx([-10.0 * NORMAL_95, 10.0 * NORMAL_95], rel=0.02)
+    bends = BendsFile(list(KEYS[1:]), [[2.0, 0.0, 0.0, 0.0]], [[6.0, 0.0, 0.0, 0.0]], 2.0)
+    bent = msgspec.structs.replace(new, bends=bends).posterior(KEYS)
+    assert bent.sd == pytest.approx([1.0, np.sqrt(0.25 + 0.75 * 9.0), 1.0, 1.0, 1.0], rel=1e-6)
+    assert not bent.followed and len(bent.mixtures[""].weights) > 10
+    for wrong in (
+        {"profiles": {"b": valley}},
+        {"profiles": {"a": msgspec.structs.replace(valley, rises=[0.0])}},
+        {"bends": msgspec.structs.replace(bends, ends=[])},
+    ):
+        with pytest.raises(InputError, match="calibrate again"):
+            msgspec.structs.replace(new, **wrong).posterior(KEYS)
 
 
 @given(st.integers(0, 2**31))
