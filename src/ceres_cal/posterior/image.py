@@ -17,7 +17,7 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.reading import Shown, read
+from ceres_cal.posterior.reading import Functional, read
 from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
 from ceres_cal.problem.quantities import PixelSlopes, pixel_slopes
@@ -107,7 +107,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     x, y = image_grid(own.image_size)
     pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
     picture = Picture(own, pixels)
-    shown = Shown(
+    shown = Functional(
         lambda there: picture.shift(there.cameras[camera].at(Pose.identity())),
         lambda there, keys: picture_slopes(picture.of(there.cameras[camera]), keys, camera),
     )

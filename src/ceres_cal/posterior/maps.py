@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.reading import Shown, read
+from ceres_cal.posterior.reading import Functional, read
 from ceres_cal.problem.information import STATION_QUANTITIES, Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
 from ceres_cal.problem.quantities import pixel_slopes
@@ -86,9 +86,9 @@ def spread_of_points(
     return PointSpread(located, located + known.low, located + known.high, known.radius_95, known.sd)
 
 
-def located_by(station: str, pixels: Array, height_m: float) -> Shown:
+def located_by(station: str, pixels: Array, height_m: float) -> Functional:
     """The places at a height that pixels (N, 2) of a station show."""
-    return Shown(
+    return Functional(
         lambda there: there.camera_at(station).locate(pixels, height_m),
         lambda there, keys: locate_slopes(there, keys, station, pixels, height_m),
     )

@@ -26,8 +26,8 @@ _LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley wide
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """Something that an estimate shows: N pairs of numbers, and how they move.
+class Functional:
+    """Something that is read off an estimate: N pairs of numbers, and how they move.
 
     Attributes:
         values: by an estimate, (N, 2); NaN where nothing is shown. slopes: by it and some keys (K), (N, 2, K).
@@ -54,7 +54,7 @@ class Reading:
     sd: Array
 
 
-def read(posterior: Posterior, estimate: Estimate, shown: Shown, camera: str = "") -> Reading:
+def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: str = "") -> Reading:
     """What is known of something shown.
 
     Args:
@@ -83,7 +83,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Shown, camera: str = "
     return Reading(low, high, covariance, radius, sd)
 
 
-def _of_components(mixture: Mixture, estimate: Estimate, shown: Shown, width: float) -> tuple[Array, Array]:
+def _of_components(mixture: Mixture, estimate: Estimate, shown: Functional, width: float) -> tuple[Array, Array]:
     """(C, N, 2) values from those of the estimate, and (C, N, 2, 2) covariances."""
     here, known = shown.values(estimate), dict[int, Array]()
     values, covariances = [], []
@@ -100,7 +100,7 @@ def _of_components(mixture: Mixture, estimate: Estimate, shown: Shown, width: fl
     return np.array(values), np.array(covariances)
 
 
-def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], shown: Shown) -> None:
+def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], shown: Functional) -> None:
     """Values (C, N, 2) of components that are another lens: by how much it shows them elsewhere, wherever it shows
     anything.
     """
@@ -111,7 +111,7 @@ def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], sh
             values[component] = np.where(np.isfinite(off), off, values[component])
 
 
-def _covariance(information: Information, there: Estimate, shown: Shown, width: float) -> Array:
+def _covariance(information: Information, there: Estimate, shown: Functional, width: float) -> Array:
     """(N, 2, 2) within a component; where it is a node of a valley, with what bends across it.
 
     Args:

@@ -22,7 +22,7 @@ from ceres_cal.posterior.maps import (
     visible_pixels,
 )
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.reading import Reading, Shown, read
+from ceres_cal.posterior.reading import Functional, Reading, read
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import moved, natural_sizes
@@ -58,7 +58,7 @@ def rig_pairs(estimate: Estimate, posterior: Posterior) -> tuple[RigPair, ...]:
 
 def _pair(estimate: Estimate, posterior: Posterior, first: str, second: str) -> RigPair:
     baseline, angle = _numbers(estimate, first, second).tolist()
-    between = Shown(
+    between = Functional(
         lambda there: _numbers(there, first, second)[None],
         lambda there, keys: _slopes(there, keys, first, second)[None],
     )
@@ -119,7 +119,7 @@ def predicted(
         pixels.append(visible_pixels(estimate, station, places, height_m))
     visible = np.isfinite(pixels[0][:, 0]) & np.isfinite(pixels[1][:, 0])
     first, second = (located_by(name, own[visible], height_m) for name, own in zip(pair, pixels, strict=True))
-    seam = Shown(
+    seam = Functional(
         lambda there: first.values(there) - second.values(there),
         lambda there, keys: first.slopes(there, keys) - second.slopes(there, keys),
     )
