@@ -45,6 +45,7 @@ _LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less mak
 # Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
 # of a valley along phi that frontal views leave open.
 _VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
+_LEAST_SHARE = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +150,9 @@ class Comparison:
             with suppress(CalibrationError):  # quiet: a lens that cannot be solved for says nothing of the numbers
                 others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
                 found = replace(found, others=others, weights=weights)
-        return found
+        # What they say by chance is less by as much as there are more observations than took part.
+        share = max(self.share, _LEAST_SHARE)
+        return replace(found, weights=tuple(share * one for one in found.weights))
 
     @property
     def outcome(self) -> Chosen:
