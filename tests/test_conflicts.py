@@ -281,7 +281,7 @@ def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> No
 @given(st.integers(0, 2**31))
 @settings(max_examples=20)
 def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
-    """Two shifts d and e: C + d d^T + e e^T."""
+    """Two shifts d and e with probabilities p and q: C + p d d^T + q e e^T."""
     from ceres_cal.posterior.posterior import Posterior
 
     rng = np.random.default_rng(seed)
@@ -289,9 +289,10 @@ def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     rows = rng.standard_normal((6, 3))
     shifts = tuple(10.0 * rng.standard_normal((2, 3)))
     before = Posterior(Information(keys, rows.T @ rows))
-    after = before.in_doubt(keys[::-1], [shift[::-1] for shift in shifts])
-    expected = before.covariance + sum(np.outer(shift, shift) for shift in shifts)
+    after = before.with_alternatives(keys[::-1], [shift[::-1] for shift in shifts], [0.3, 0.2])
+    expected = before.covariance + sum(w * np.outer(d, d) for w, d in zip((0.3, 0.2), shifts, strict=True))
     assert after.covariance == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    assert after.sd == pytest.approx(np.sqrt(np.diagonal(expected)), rel=1e-6)
 
 
 # ---- what is usual --------------------------------------------------------------------------------------------------

@@ -153,9 +153,10 @@ def test_everybody_reads_the_wider_one(correlated: tuple[Calibration, Observatio
     calibration, _ = correlated
     known, posterior = calibration.uncertainty, calibration.uncertainty.posterior
     assert posterior.by_model is not None and np.median(posterior.factors) > 1.4
-    narrow = replace(known, posterior=replace(posterior, information=posterior.by_model, by_model=None))
-    assert known.map_sd_mm().mean_mm > 1.3 * narrow.map_sd_mm().mean_mm
-    straight, narrow = (replace(one, posterior=replace(one.posterior, bends=None)) for one in (known, narrow))
+    straight = replace(known, posterior=replace(posterior, mixtures={}))
+    alone = replace(posterior, information=posterior.by_model, by_model=None, mixtures={})
+    narrow = replace(known, posterior=alone)
+    assert straight.map_sd_mm().mean_mm > 1.3 * narrow.map_sd_mm().mean_mm
     verdict = straight.verdict("camera", "overhead", "phi")
     assert verdict.sd == pytest.approx(verdict.factor * narrow.verdict("camera", "overhead", "phi").sd)
     again = refit(calibration, half_a_field(partial(along_lines, length_m=0.5), 1))

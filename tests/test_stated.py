@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,15 +13,16 @@ from hypothesis import strategies as st
 from scenes import camera, side_by_side
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.posterior.bent import Bends
-from ceres_cal.posterior.files import PosteriorFile
+from ceres_cal.posterior.bent import Ends
+from ceres_cal.posterior.files import BendsFile, PosteriorFile, ProfileFile
+from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.profile import PhiProfile
 from ceres_cal.problem.information import Information, Key, over
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.scene.targets import ssl_field
@@ -53,9 +55,19 @@ def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
     """However far the shifts are; what was stated of nothing is as wide as the shifts have it."""
     seen, stated, rng = known(seed)
     size = rng.standard_normal(len(KEYS)) * own_sd(stated).min() * 10.0 ** rng.uniform(-2.0, 5.0)
-    posterior = Posterior(seen + stated, stated=stated).in_doubt(KEYS, list(size * rng.standard_normal((3, len(KEYS)))))
-    assert np.all(posterior.spread.sd <= ROUNDING * own_sd(stated))
-    assert np.all(np.abs(posterior.bounds) <= NORMAL_95 * ROUNDING * own_sd(stated)[:, None])
+    shifts = list(size * rng.standard_normal((3, len(KEYS))))
+    told = Posterior(seen + stated, stated=stated)
+    wider = (told.widened(KEYS, shifts), told.with_alternatives(KEYS, shifts, [0.3, 0.2, 0.1]))
+    for posterior in wider:
+        assert np.all(posterior.spread.sd <= ROUNDING * own_sd(stated))
+        each, limit = (
+            posterior.mixture(),
+            np.where(np.isinf(told.spread.sd), np.inf, np.fmax(own_sd(stated), told.spread.sd)),
+        )
+        assert np.all(each.sd <= ROUNDING * limit) and np.all(each.variances <= ROUNDING * limit**2)
+        assert np.all(np.abs(each.steps) <= ROUNDING * limit)
+        assert np.all(posterior.sd <= ROUNDING * own_sd(stated))
+        assert np.all(np.abs(posterior.bounds) <= NORMAL_95 * ROUNDING * own_sd(stated)[:, None])
 
 
 @given(st.integers(0, 2**31), st.floats(-2.0, 4.0))
@@ -82,24 +94,68 @@ def test_ends_are_no_farther_than_stated(seed: int) -> None:
     rows = rng.standard_normal((8, len(KEYS))) / units
     seen, stated = Information(KEYS, rows.T @ rows), Information.of_sigmas({KEYS[1]: float(0.1 * units[1])})
     excesses = 3.0 * units * rng.standard_normal((3, len(KEYS)))
-    raw = Bends(KEYS, np.zeros_like(excesses), 2.0 * excesses, 2.0)
-    assert raw.beside(seen + stated, Information.nothing(KEYS)) is raw
-    bends = raw.beside(seen + stated, stated.over(KEYS))
-    variance = (seen + stated).spread.sd ** 2 + np.sum(bends.excesses**2, axis=0)
+    both, none = np.concatenate([excesses, -excesses]), np.zeros((0, len(KEYS)))
+    raw = Ends(KEYS, np.zeros_like(both), 2.0 * both, 2.0, seen + stated, none, none[:, 0])
+    assert raw.beside(Information.nothing(KEYS)) is raw
+    ends = raw.beside(stated.over(KEYS))
+    variance = (seen + stated).spread.sd ** 2 + np.sum(ends.excesses**2, axis=0)
     expected = (seen.widened(raw.excesses) + stated).spread.sd
     assert np.sqrt(variance) == pytest.approx(expected, rel=1e-5)
     assert np.sqrt(variance[1]) <= ROUNDING * 0.1 * units[1]
 
 
+@given(st.integers(0, 2**31))
+@settings(max_examples=30)
+def test_straight_curves_are_the_normal_distribution(seed: int) -> None:
+    """Components along weak directions that do not bend have its moments, and nearly its bounds."""
+    rng = np.random.default_rng(seed)
+    units, count = 10.0 ** rng.uniform(-3.0, 3.0, len(KEYS)), int(rng.integers(1, 5))
+    rows = rng.standard_normal((8, len(KEYS))) / units
+    known = Information(KEYS, rows.T @ rows)
+    values, vectors = np.linalg.eigh(known.spread.covariance / units[:, None] / units)
+    axes = 2.0 * (vectors * np.sqrt(values)).T[:count] * units
+    both, none = np.concatenate([axes, -axes]), np.zeros((0, len(KEYS)))
+    mixture = Ends(KEYS, both, both, 2.0, known, none, none[:, 0]).mixture(known)
+    assert mixture.sd == pytest.approx(known.spread.sd, rel=1e-5)
+    assert np.abs(mixture.bounds(NORMAL_95)) == pytest.approx(
+        NORMAL_95 * np.column_stack([known.spread.sd] * 2),
+        rel=0.15,  # 0.11 measured, of 4 directions
+    )
+
+
 def test_a_valley_ends_where_the_prior_does() -> None:
     steps = np.column_stack([np.linspace(-300.0, 300.0, 13), np.zeros((13, 4))])
     across = tuple(Information(KEYS[1:], np.eye(4)) for _ in steps)
-    valley = PhiProfile("a", KEYS, 800.0, steps, np.zeros(13), across)
+    valley = Mixture.along_phi(KEYS, 800.0, steps, np.zeros(13), across, (False, False))
     stated = Information.of_sigmas({KEYS[0]: 20.0, KEYS[2]: 0.5})
-    posterior = Posterior(Information(KEYS, np.eye(5)) + stated, profiles={"a": valley}, stated=stated)
+    posterior = Posterior(Information(KEYS, np.eye(5)) + stated, mixtures={"a": valley}, stated=stated)
     assert np.ptp(posterior.bounds, axis=1)[[0, 2]] == pytest.approx(2.0 * NORMAL_95 * np.array([20.0, 0.5]))
     back = PosteriorFile.of(posterior).posterior(KEYS)
     assert np.array_equal(back.bounds, posterior.bounds) and np.array_equal(back.sd, posterior.sd)
+
+
+def test_files_of_before_are_read() -> None:
+    """Their valley, and one end of each weak direction, are the mixtures that they would be today."""
+    steps = np.column_stack([np.linspace(-30.0, 30.0, 13), np.zeros((13, 4))])
+    rises, across = np.linspace(-3.0, 3.0, 13) ** 2, Information(KEYS[1:], np.eye(4))
+    known = Information(KEYS, np.eye(5))
+    triangle = across.matrix[np.tril_indices(4)].tolist()
+    valley = ProfileFile(list(KEYS), 800.0, steps.tolist(), rises.tolist(), [triangle] * 13, False, False)
+    new = PosteriorFile.of(Posterior(known))
+    before = msgspec.structs.replace(new, profiles={"a": valley}).posterior(KEYS)
+    assert before.followed == ("a",)
+    assert before.bounds[0] == pytest.approx([-10.0 * NORMAL_95, 10.0 * NORMAL_95], rel=0.02)
+    bends = BendsFile(list(KEYS[1:]), [[2.0, 0.0, 0.0, 0.0]], [[6.0, 0.0, 0.0, 0.0]], 2.0)
+    bent = msgspec.structs.replace(new, bends=bends).posterior(KEYS)
+    assert bent.sd == pytest.approx([1.0, np.sqrt(0.25 + 0.75 * 9.0), 1.0, 1.0, 1.0], rel=1e-6)
+    assert not bent.followed and len(bent.mixtures[""].weights) > 10
+    for wrong in (
+        {"profiles": {"b": valley}},
+        {"profiles": {"a": msgspec.structs.replace(valley, rises=[0.0])}},
+        {"bends": msgspec.structs.replace(bends, ends=[])},
+    ):
+        with pytest.raises(InputError, match="calibrate again"):
+            msgspec.structs.replace(new, **wrong).posterior(KEYS)
 
 
 @given(st.integers(0, 2**31))
@@ -181,7 +237,7 @@ def test_no_sd_exceeds_its_own_priors(name: str) -> None:
     observations, options = CASES[name]
     calibration = calibrate(observations, options)
     assert farthest_over(calibration, options.priors) <= ROUNDING
-    assert bool(calibration.posterior and calibration.posterior.profiles) == ("valley" in name)
+    assert bool(calibration.posterior and calibration.posterior.followed) == ("valley" in name)
     assert bool(calibration.conflicts) == ("conflict" in name)
 
 
@@ -198,5 +254,5 @@ def test_two_cameras_from_straight_above() -> None:
     calibration = calibrate(observations, Options(lens=AUTO, priors=(height,)))
     verdicts = [calibration.uncertainty.verdict("station", name, "height") for name in ("left", "right")]
     assert verdicts[0].sd <= 0.01 * ROUNDING and verdicts[1].verdict != "known"
-    assert calibration.posterior is not None and list(calibration.posterior.profiles) == ["right"]
+    assert calibration.posterior is not None and calibration.posterior.followed == ("right",)
     assert all(calibration.uncertainty.map_px(name).radius_95_px.shape for name in ("left", "right"))

@@ -21,9 +21,36 @@ NORMAL_95_ONE_SIDED = 1.645
 _PARTS, _REACH = 40, 6.0  # of a mean over a normal variable: steps to either side, and how far in sigmas
 _FEW, _FAR = 12, 1e3  # degrees of freedom; a value
 _TINY = 1e-300
+_FARTHEST = 40.0  # standard deviations beyond which a tail is no number
 _MOST_TERMS = 20_000
 _LEAST_TERM = 1e-16  # of a series' sum so far: what comes after is lost in rounding
 _lgamma = np.vectorize(math.lgamma, otypes=[float])
+
+
+# Of Chebyshev's expansion of the complementary error function (Press et al., Numerical Recipes, section 6.2): relative
+# errors below 1.2e-7 everywhere.
+_CHEBYSHEV = (
+    0.17087277,
+    -0.82215223,
+    1.48851587,
+    -1.13520398,
+    0.27886807,
+    -0.18628806,
+    0.09678418,
+    0.37409196,
+    1.00002368,
+)
+
+
+def normal_cdf(x: ArrayLike) -> Array:
+    """Probability that a standard normal variable is smaller, to seven digits."""
+    z = np.clip(np.asarray(x, dtype=float), -_FARTHEST, _FARTHEST) / -math.sqrt(2.0)
+    t = 1.0 / (1.0 + 0.5 * np.abs(z))
+    series = np.zeros_like(z)
+    for coefficient in _CHEBYSHEV:
+        series = t * (series + coefficient)
+    above = 0.5 * t * np.exp(np.minimum(-z * z - 1.26551223 + series, 0.0))
+    return np.asarray(np.where(z >= 0.0, above, 1.0 - above))
 
 
 def upper_tail(value: float, degrees: int, freedom: float = math.inf) -> float:

@@ -284,9 +284,9 @@ def solved_from(
         end, posterior = _assess(end, observations, problem, again)
         if again is None:
             require_lens_told(end.solution.estimate, posterior)
-        posterior = with_doubts(posterior, end, conflicts, explanations, others)
-        posterior = posterior.in_doubt(beside.keys, beside.shifts) if beside else posterior
+        posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
+        posterior = with_doubts(posterior, end, conflicts, explanations, others)
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
         warnings = (
             *warnings,

@@ -45,7 +45,7 @@ _LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less mak
 # Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
 # of a valley along phi that frontal views leave open.
 _VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
-_LEAST_SHARE = 0.25  # of the observations: where fewer took part, what other lenses say by chance makes no difference
+_LEAST_SHARE = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +136,9 @@ class Comparison:
 
     @cached_property
     def others(self) -> OtherLenses:
-        """What other lenses would say; nothing beside one without a formula, or of many more observations."""
+        """What other lenses would say; nothing beside one without a formula."""
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
-        if self.chosen.form.blank.roughness or self.share < _LEAST_SHARE:
+        if self.chosen.form.blank.roughness:
             return found
         try:
             found = replace(found, near=self.seen.solved_near(self.chosen))
@@ -151,7 +151,8 @@ class Comparison:
                 others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
                 found = replace(found, others=others, weights=weights)
         # What they say by chance is less by as much as there are more observations than took part.
-        return replace(found, weights=tuple(self.share * one for one in found.weights))
+        share = max(self.share, _LEAST_SHARE)
+        return replace(found, weights=tuple(share * one for one in found.weights))
 
     @property
     def outcome(self) -> Chosen:

@@ -56,7 +56,8 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
     """Raise DegenerateError where coefficients of a lens may be anything at all."""
     for name, camera in estimate.cameras.items():
         keys = [key for key in posterior.keys if key[:2] == ("camera", name) and key.quantity in camera.lens.names]
-        sd = posterior.sd[posterior.information.columns(keys)]
+        at = posterior.information.columns(keys)
+        sd = posterior.spread.sd[at]  # without what bends: where a valley of phi is open, so is all that goes with it
         lost = [
             key.quantity for key, size in zip(keys, sd / natural_sizes(estimate, keys), strict=True) if size > _LOST
         ]
@@ -70,7 +71,7 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
 def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
     """Warnings of cameras whose phi the observations leave open."""
     known = Uncertainty(end.solution.estimate, posterior, {})
-    for name in posterior.profiles:
+    for name in posterior.followed:
         verdict = known.verdict("camera", name, "phi")
         if verdict.verdict == "unknown":
             yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,11 +15,12 @@ import numpy as np
 from ceres_cal.base.numerical import numerical
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.observations import Observations
-from ceres_cal.posterior.bent import bends
+from ceres_cal.posterior.bent import ends_of
+from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
-from ceres_cal.posterior.profile import Node, PhiProfile, profile, valley
+from ceres_cal.posterior.profile import Node, profile, valley
 from ceres_cal.problem.bundle import Solution
-from ceres_cal.problem.information import Information
+from ceres_cal.problem.information import Information, over
 from ceres_cal.problem.parameters import Estimate, unit_px
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference, moved
@@ -28,7 +28,7 @@ from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.robust.competing import Explanation
 from ceres_cal.robust.conflicts import Conflicts
-from ceres_cal.robust.other_minima import shifts_to
+from ceres_cal.robust.other_minima import minima_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 # Relative sigma of phi above which the quadratic picture is left. Nothing changes from half to double.
 _BENT = 0.05
+_MOST_DOUBT = 0.8  # probability of all that may be otherwise, each by itself
 
 
 @numerical("the uncertainty")
@@ -80,27 +81,28 @@ def assess(
     if astray is not problem:
         reduced = information(problem, estimate)
         posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
-    profiles = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
-    return estimate, _with_bends(replace(posterior, profiles=profiles), problem, estimate)
+    mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
+    return estimate, _with_bends(replace(posterior, mixtures=mixtures), problem, estimate)
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
     """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say."""
-    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    followed = {posterior.mixtures[name].keys[0] for name in posterior.followed}
     held = [key for key in posterior.keys if key not in followed]
     by_model = posterior.by_model or posterior.information
-    for name in posterior.profiles:
+    for name in posterior.followed:
         problem = problem.holding(name, 0)
     known = posterior.information.given(held)
-    bent = bends(problem, estimate, known, by_model.given(held), posterior.half_width)
-    if bent is None:
+    ends = ends_of(problem, estimate, known, by_model.given(held), posterior.half_width)
+    if ends is None:
         return posterior
-    profiles = {
-        name: replace(profile, across=tuple(posterior.wider(one, bent.widened) for one in profile.across))
-        for name, profile in posterior.profiles.items()
+    mixtures = {
+        name: mixture.with_information(lambda across: posterior.wider(across, ends.widened))
+        for name, mixture in posterior.mixtures.items()
     }
-    bent = bent.beside(known, posterior.stated.over(posterior.keys).marginal(held))
-    return replace(posterior, profiles=profiles, bends=bent)
+    own = ends.beside(posterior.stated.over(posterior.keys).marginal(held)).mixture(posterior.information)
+    bent = replace(posterior, mixtures={**mixtures, "": own})
+    return bent.with_alternatives(held, list(ends.minima), (ends.odds / (1.0 + ends.odds.sum())).tolist())
 
 
 def _inflation(posterior: Posterior, camera: str) -> float:
@@ -111,7 +113,7 @@ def _inflation(posterior: Posterior, camera: str) -> float:
     return float(widths_over(*spreads)[posterior.column("camera", camera, "phi")] ** 2)
 
 
-def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> PhiProfile:
+def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> Mixture:
     """The valley as seen from the estimate, across it as wide as the data scatter with phi held."""
     stated_sd = dict(zip(posterior.keys, posterior.stated_sd.tolist(), strict=True))
     along = profile(camera, nodes, estimate, posterior.half_width, stated_sd)
@@ -124,7 +126,7 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
     def scattered(seen: Information) -> Information:
         return Information(seen.keys, seen.matrix / factors[:, None] / factors)
 
-    return replace(along, across=tuple(posterior.wider(one, scattered) for one in along.across))
+    return along.with_information(lambda across: posterior.wider(across, scattered))
 
 
 def _is_lens(camera: Camera) -> bool:
@@ -155,14 +157,17 @@ def with_doubts(
         explanations: of which the less probable one counts as far as it is probable. others: minima beside the end.
     """
     estimate = end.solution.estimate
-    posterior = posterior.in_doubt(conflicts.keys, conflicts.shifts)
+    disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as any of what contradicts it
+    posterior = posterior.with_alternatives(conflicts.keys, conflicts.shifts, [disputed] * len(conflicts.shifts))
     doubtful = [one for one in explanations if one.is_doubtful]
-    shifts = [one.doubt**0.5 * difference(one.other, estimate, posterior.keys) for one in doubtful]
-    posterior = posterior.in_doubt(posterior.keys, shifts)
-    if posterior.profiles:  # a valley that is followed has its other places in it
+    shifts = [difference(one.other, estimate, posterior.keys) for one in doubtful]
+    likely = np.array([one.doubt for one in doubtful])
+    likely /= max(1.0, likely.sum() / _MOST_DOUBT)
+    posterior = posterior.with_alternatives(posterior.keys, shifts, likely.tolist())
+    if posterior.followed:  # a valley that is followed has its other places in it
         return posterior
     known = posterior.by_model or posterior.information
-    return posterior.in_doubt(posterior.keys, shifts_to(others, estimate, known, posterior.half_width))
+    return posterior.with_alternatives(posterior.keys, *minima_of(others, estimate, known, posterior.half_width))
 
 
 def with_roughness(posterior: Posterior, end: RobustSolution, observations: Observations) -> Posterior:
@@ -171,26 +176,25 @@ def with_roughness(posterior: Posterior, end: RobustSolution, observations: Obse
         return posterior
     from ceres_cal.posterior.roughness import shifts_by_roughness
 
-    return posterior.in_doubt(*shifts_by_roughness(end, observations))
+    return posterior.widened(*shifts_by_roughness(end, observations))
 
 
 def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:
     """Wider by what other lenses would say, each as far as it is probable; across a valley along phi at each node."""
     if not lenses.others:
         return posterior
-    from ceres_cal.posterior.other_lenses import shifts_to_lenses
+    from ceres_cal.posterior.other_lenses import counted, shifts_to_lenses
 
-    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    followed = {posterior.mixtures[name].keys[0] for name in posterior.followed}
     # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
     keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
-    wider = posterior.in_doubt(keys, shifts_to_lenses(lenses, keys, lenses.near))
-    profiles = dict(posterior.profiles)
-    for name, other in profiles.items():
-        nodes = [moved(estimate, other.keys, step) for step in other.steps]
-        shifts = [np.array(shifts_to_lenses(lenses, other.keys[1:], node)) for node in nodes]
-        across = [
-            posterior.wider(known, partial(Information.widened, shifts=here))
-            for known, here in zip(other.across, shifts, strict=True)
-        ]
-        profiles[name] = replace(other, across=tuple(across))
-    return replace(wider, profiles=profiles)
+    weights = counted(lenses.weights)
+    shifts, every = shifts_to_lenses(lenses, keys, lenses.near), (lenses.near, *lenses.others)
+    wider = posterior.with_alternatives(keys, shifts, weights.tolist(), every)
+    mixtures = dict(wider.mixtures)
+    for name in posterior.followed:
+        mine = posterior.mixtures[name]
+        nodes = [moved(estimate, mine.keys, step) for step in mine.steps]
+        along = np.array([shifts_to_lenses(lenses, mine.keys[1:], node) for node in nodes])
+        mixtures[name] = mine.shifted_also(weights, over(np.swapaxes(along, 0, 1), mine.keys[1:], mine.keys))
+    return replace(wider, mixtures=mixtures)

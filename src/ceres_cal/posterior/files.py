@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 from functools import cache
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,14 +13,108 @@ import numpy as np
 from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.effects.dependence import Dependence
-from ceres_cal.posterior.bent import Bends
+from ceres_cal.posterior.bent import Ends
+from ceres_cal.posterior.mixture import Chain, Mixture
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.profile import PhiProfile
-from ceres_cal.problem.information import Information, Key, pose_keys
+from ceres_cal.problem.information import Information, Key, over, pose_keys
+from ceres_cal.problem.parameters import Estimate, Station
+from ceres_cal.problem.structure import EXACT
+from ceres_cal.scene.files import CameraFile, PoseFile
+
+
+class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """A mixture of normal distributions in a calibration's file: see `Mixture`.
+
+    Attributes:
+        weights, steps, at: of each component its probability, its place from the estimate, and which information.
+        information: lower triangles, of keys less those that are held. chains: of each the first component, and the
+            signed roots of those along phi.
+    """
+
+    keys: list[Key]
+    weights: list[float]
+    steps: list[list[float]]
+    at: list[int]
+    information: list[list[float]]
+    held: list[Key] = []
+    chains: list[ChainFile] = []
+    phi_px: float = 0.0
+    open_below: bool = False
+    open_above: bool = False
+    lenses: list[tuple[int, int]] = []
+
+    @classmethod
+    def of(cls, mixture: Mixture) -> MixtureFile:
+        """As a file has it."""
+        different = {id(one): one for one in mixture.information}
+        number = {name: count for count, name in enumerate(different)}
+        known = next(iter(different.values())).keys
+        return cls(
+            list(mixture.keys),
+            mixture.weights.tolist(),
+            mixture.steps.tolist(),
+            [number[id(one)] for one in mixture.information],
+            [lower_triangle(one.over(known)) for one in different.values()],
+            [key for key in mixture.keys if key not in known],
+            [ChainFile(int(chain.at[0]), chain.roots.tolist()) for chain in mixture.chains],
+            mixture.phi_px,
+            mixture.open_below,
+            mixture.open_above,
+            list(mixture.lenses.items()),
+        )
+
+    def mixture(self, name: str, known: Collection[Key]) -> Mixture:
+        """The mixture; InputError where its numbers do not fit each other, or those known."""
+        where = f"posterior.mixtures.{name}"
+        require_keys(self.keys, known, where)
+        free = [key for key in self.keys if key not in set(self.held)]
+        every = [information_from(row, free, f"{where}.information") for row in self.information]
+        require_alike(where, self.keys, self.steps, (self.weights, self.at))
+        if not all(0 <= number < len(every) for number in self.at) or not self.weights:
+            raise InputError(f"{where}.at names no information: calibrate again")
+        chains = tuple(
+            Chain(np.arange(one.first, one.first + len(one.roots)), np.array(one.roots)) for one in self.chains
+        )
+        if any(len(chain.roots) < 2 or not 0 <= chain.at[0] <= chain.at[-1] < len(self.at) for chain in chains):
+            raise InputError(f"{where}.chains do not fit its components: calibrate again")
+        if chains and self.keys[0][:3] != ("camera", name, "phi"):
+            raise InputError(f"{where} does not begin with phi of camera {name!r}: calibrate again")
+        information = tuple(every[number] for number in self.at)
+        numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), information
+        valley = self.phi_px, self.open_below, self.open_above
+        return Mixture(tuple(self.keys), *numbers, chains, *valley, dict(self.lenses))
+
+
+class SeenFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Cameras and stations with one lens of several."""
+
+    cameras: dict[str, CameraFile]
+    stations: dict[str, tuple[str, PoseFile]]
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> SeenFile:
+        """As a file has it."""
+        stations = {name: (one.camera, PoseFile.of(one.cam_from_world)) for name, one in estimate.stations.items()}
+        return cls({name: CameraFile.of(one) for name, one in estimate.cameras.items()}, stations)
+
+    def estimate(self) -> Estimate:
+        """The estimate; InputError where a camera or a pose is none."""
+        cameras = {name: one.camera() for name, one in self.cameras.items()}
+        stations = {name: Station(camera, pose.pose()) for name, (camera, pose) in self.stations.items()}
+        if any(one.camera not in cameras for one in stations.values()):
+            raise InputError("posterior.lenses: a station names a camera that is not there: calibrate again")
+        return Estimate(cameras, stations, {}, EXACT)
+
+
+class ChainFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Components along phi in a calibration's file: see `Chain`."""
+
+    first: int
+    roots: list[float]
 
 
 class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A valley in a calibration's file; at each of its nodes the steps and the lower triangle of the information."""
+    """A valley as files of before have it: at each node the steps and the lower triangle of the information."""
 
     keys: list[Key]
     phi_px: float
@@ -29,47 +124,47 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
     open_below: bool
     open_above: bool
 
-    @classmethod
-    def of(cls, profile: PhiProfile) -> ProfileFile:
-        """As a file has it."""
-        steps, rises = profile.steps.tolist(), profile.rises.tolist()
-        across = [lower_triangle(information) for information in profile.across]
-        return cls(list(profile.keys), profile.phi_px, steps, rises, across, profile.open_below, profile.open_above)
-
-    def profile(self, camera: str, known: Collection[Key]) -> PhiProfile:
+    def mixture(self, camera: str, known: Collection[Key]) -> Mixture:
         """The valley along phi of a camera; InputError where its numbers do not fit each other, or those known."""
         where = f"posterior.profiles.{camera}"
         require_keys(self.keys, known, where)
         if not self.keys or self.keys[0][:3] != ("camera", camera, "phi"):
             raise InputError(f"{where} does not begin with phi of camera {camera!r}: calibrate again")
-        counts = {len(self.steps), len(self.rises), len(self.information)}
-        if len(counts) != 1 or any(len(row) != len(self.keys) for row in self.steps):
-            raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
-        steps, rises = np.array(self.steps), np.array(self.rises)
+        require_alike(where, self.keys, self.steps, (self.rises, self.information))
+        if len(self.steps) < 2:
+            raise InputError(f"{where} has no valley: calibrate again")
         across = tuple(information_from(row, self.keys[1:], f"{where}.information") for row in self.information)
-        return PhiProfile(camera, tuple(self.keys), self.phi_px, steps, rises, across, self.open_below, self.open_above)
+        is_open = self.open_below, self.open_above
+        steps, rises = np.array(self.steps), np.array(self.rises)
+        return Mixture.along_phi(tuple(self.keys), self.phi_px, steps, rises, across, is_open)
 
 
 class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
-    """What leaves the quadratic picture, in a calibration's file: see `Bends`."""
+    """What leaves the quadratic picture, as files of before have it: one end of each weak direction."""
 
     keys: list[Key]
     steps: list[list[float]]
     ends: list[list[float]]
     half_width: float
 
-    @classmethod
-    def of(cls, bends: Bends) -> BendsFile:
-        """As a file has it."""
-        return cls(list(bends.keys), bends.steps.tolist(), bends.ends.tolist(), bends.half_width)
-
-    def bends(self, known: Collection[Key]) -> Bends:
-        """The bends; InputError where their numbers do not fit each other, or those that are known."""
-        rows = [*self.steps, *self.ends]
-        if len(self.steps) != len(self.ends) or any(len(row) != len(self.keys) for row in rows):
-            raise InputError("posterior.bends: steps, ends and keys do not fit each other: calibrate again")
-        require_keys(self.keys, known, "posterior.bends")
-        return Bends(tuple(self.keys), np.array(self.steps), np.array(self.ends), self.half_width)
+    def mixture(self, information: Information) -> Mixture | None:
+        """Its components; InputError where its numbers do not fit each other, or those that are known."""
+        require_alike("posterior.bends", self.keys, self.steps, (self.ends,))
+        require_alike("posterior.bends", self.keys, self.ends, ())
+        require_keys(self.keys, information.keys, "posterior.bends")
+        steps, ends = np.array(self.steps), np.array(self.ends)
+        bent = np.any(steps != 0.0, axis=1)
+        mixture, own = None, information.marginal(self.keys)
+        if bent.any():
+            near, far = (np.concatenate([part[bent], -part[bent]]) for part in (steps, ends))
+            none = np.zeros((0, len(self.keys)))
+            curves = Ends(tuple(self.keys), near, far, self.half_width, own, none, none[:, 0])
+            mixture = curves.mixture(information)
+        minima = over(ends[~bent], self.keys, information.keys)
+        if len(minima):
+            likely = np.full(len(minima), 1.0 / (len(minima) + 1.0))
+            mixture = (mixture or Mixture.of_one(information)).with_alternatives(likely, minima, information)
+        return mixture
 
 
 class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -79,12 +174,14 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     information: list[float]
     placements: dict[str, list[float]]
     freedom: float | None
-    profiles: dict[str, ProfileFile]
+    profiles: dict[str, ProfileFile] = {}
     by_model: list[float] | None = None
     dependence: Dependence | None = None
     bends: BendsFile | None = None
     stated_keys: list[Key] = []
     stated: list[float] = []
+    mixtures: dict[str, MixtureFile] = {}
+    lenses: list[SeenFile] = []
 
     @classmethod
     def of(cls, posterior: Posterior) -> PosteriorFile:
@@ -95,12 +192,14 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             lower_triangle(posterior.information),
             {name: lower_triangle(information) for name, information in posterior.placements.items()},
             degrees if np.isfinite(degrees) else None,
-            {name: ProfileFile.of(profile) for name, profile in posterior.profiles.items()},
+            {},
             None if posterior.by_model is None else lower_triangle(posterior.by_model),
             posterior.dependence,
-            None if posterior.bends is None else BendsFile.of(posterior.bends),
+            None,
             list(posterior.stated.keys),
             lower_triangle(posterior.stated),
+            {name: MixtureFile.of(mixture) for name, mixture in posterior.mixtures.items()},
+            [SeenFile.of(estimate) for estimate in posterior.lenses],
         )
 
     def posterior(self, known: Collection[Key]) -> Posterior:
@@ -113,13 +212,30 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             for name, row in self.placements.items()
         }
         information = information_from(self.information, self.keys, "posterior.information")
-        profiles = {name: entry.profile(name, self.keys) for name, entry in self.profiles.items()}
+        mixtures = {name: entry.mixture(name, self.keys) for name, entry in self.profiles.items()}
+        if self.bends is not None and (bent := self.bends.mixture(information)) is not None:
+            mixtures[""] = bent
+        mixtures |= {name: entry.mixture(name, self.keys) for name, entry in self.mixtures.items()}
         by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
         freedom = np.inf if self.freedom is None else self.freedom
-        bends = None if self.bends is None else self.bends.bends(self.keys)
         require_keys(self.stated_keys, self.keys, "posterior.stated_keys")
         stated = information_from(self.stated, self.stated_keys, "posterior.stated")
-        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends, stated)
+        lenses = tuple(one.estimate() for one in self.lenses)
+        if any(
+            not (0 < lens < len(lenses) and 0 <= component < len(mixture.weights))
+            for mixture in mixtures.values()
+            for component, lens in mixture.lenses.items()
+        ):
+            raise InputError("posterior.mixtures names lenses that posterior.lenses has not: calibrate again")
+        return Posterior(information, placements, freedom, mixtures, by_model or None, self.dependence, stated, lenses)
+
+
+def require_alike(
+    where: str, keys: Sequence[Key], rows: Sequence[Sequence[float]], others: Sequence[Sequence[Any]]
+) -> None:
+    """Raise InputError where rows are not as long as there are keys, or others not as many."""
+    if any(len(row) != len(keys) for row in rows) or any(len(other) != len(rows) for other in others):
+        raise InputError(f"{where}: its numbers do not fit each other: calibrate again")
 
 
 def lower_triangle(information: Information) -> list[float]:

@@ -8,7 +8,6 @@ pose adds is in the maps over the field. The noise of the pixel that is asked ab
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,14 +15,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
-from ceres_cal.posterior.maps import radius_95
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.profile import PhiProfile
+from ceres_cal.posterior.reading import Functional, read
 from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
-from ceres_cal.problem.quantities import PixelSlopes, moved, pixel_slopes
+from ceres_cal.problem.quantities import PixelSlopes, pixel_slopes
 from ceres_cal.scene.camera import Camera
 
 _STEPS = 32  # along the longer side
@@ -58,6 +55,10 @@ class Picture:
     @cached_property
     def _by(self) -> PixelSlopes:
         return pixel_slopes(self.camera, self._rays)
+
+    def of(self, camera: Camera) -> Picture:
+        """What another one shows at the same pixels."""
+        return Picture(camera.at(Pose.identity()), self.pixels)
 
     @property
     def shown(self) -> Mask:
@@ -106,10 +107,11 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     x, y = image_grid(own.image_size)
     pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
     picture = Picture(own, pixels)
-    if camera in posterior.profiles:
-        radius = _by_profile(picture, estimate, posterior, camera)
-    else:
-        radius = _by_covariance(picture, estimate, posterior, camera)
+    shown = Functional(
+        lambda there: picture.shift(there.cameras[camera].at(Pose.identity())),
+        lambda there, keys: picture_slopes(picture.of(there.cameras[camera]), keys, camera),
+    )
+    radius = read(posterior, estimate, shown, camera).radius_95
     return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
 
 
@@ -117,39 +119,3 @@ def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
     """(N, 2, K) px per unit of each of the keys: 0 of what is not this camera's."""
     own = [key for key in keys if key[:2] == ("camera", camera)]
     return over(picture.slopes([key.quantity for key in own]), own, keys)
-
-
-def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
-    """(N,) px, with what leaves the quadratic picture."""
-    slopes = picture_slopes(picture, posterior.keys, camera)
-    covariance, width = posterior.spread.through(slopes), posterior.half_width
-    bends = posterior.bends
-    if bends is not None:
-        taken = over(bends.steps, bends.keys, posterior.keys)
-        for step, end in zip(taken, bends.ends, strict=True):
-            off = np.full(picture.pixels.shape, np.inf)
-            with suppress(InputError):  # reads: "unknown" at these places of the map
-                there = moved(estimate, bends.keys, end).cameras[camera].at(Pose.identity())
-                off = np.nan_to_num(picture.shift(there) - slopes @ step, nan=np.inf)
-            lost = np.isinf(off).any(axis=1)
-            off[lost] = 0.0
-            covariance += off[:, :, None] * off[:, None, :] / width**2
-            covariance[lost] = np.diag([np.inf, np.inf])
-    return np.asarray(radius_95(covariance) * width / NORMAL_95)
-
-
-def _by_profile(picture: Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
-    """(N,) px along the valley: where each of its nodes shows what this camera shows, and how sure it is of that."""
-    profile: PhiProfile = posterior.profiles[camera]
-    shifts, sds = [], []
-    for step, across in zip(profile.steps, profile.across, strict=True):
-        there = moved(estimate, profile.keys, step)
-        shifts.append(picture.shift(there.cameras[camera].at(Pose.identity())).ravel())
-        node = Picture(there.cameras[camera].at(Pose.identity()), picture.pixels)
-        variance = across.spread.through(picture_slopes(node, across.keys, camera))
-        sds.append(np.sqrt(np.diagonal(variance, axis1=1, axis2=2)).ravel())
-    values = np.array(shifts)
-    lost = np.isnan(values).any(axis=0)
-    low, high = profile.bounds(np.nan_to_num(values), np.array(sds), posterior.half_width)
-    reach = np.where(lost, np.inf, np.maximum(np.abs(low), np.abs(high)))
-    return np.asarray(np.hypot(*reach.reshape(-1, 2).T))

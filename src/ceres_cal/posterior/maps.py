@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
-from ceres_cal.posterior.bent import weak_axes
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.profile import FARTHER
-from ceres_cal.problem.information import STATION_QUANTITIES, Key, over
+from ceres_cal.posterior.reading import Functional, read
+from ceres_cal.problem.information import STATION_QUANTITIES, Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
-from ceres_cal.problem.quantities import moved, pixel_slopes
+from ceres_cal.problem.quantities import pixel_slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +28,7 @@ class PointSpread:
     Attributes:
         located: (N, 2) m, by the estimate.
         low, high: (N, 2) m, 95 % bounds of x and of y, each by itself; infinite where unknown.
-        radius_95_m: (N,) 95 % of the errors are shorter. sd_m: (N,) root mean square length of the error; where phi
-            is known by its profile alone, the radius over NORMAL_95.
+        radius_95_m: (N,) 95 % of the errors are shorter. sd_m: (N,) root mean square length of the error.
     """
 
     located: Array
@@ -75,19 +71,6 @@ def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels:
     return slopes
 
 
-def radius_95(covariance: Array) -> Array:
-    """(N,) radius of the circle that holds 95 % of errors with covariances (N, 2, 2).
-
-    The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
-    """
-    a, b, c = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
-    with np.errstate(invalid="ignore"):
-        mean, variance = a + b, 2.0 * (a**2 + b**2 + 2.0 * np.nan_to_num(c) ** 2)
-        cubed = variance / (9.0 * mean**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
-        radius = np.sqrt(mean * (1.0 - cubed + NORMAL_95_ONE_SIDED * np.sqrt(cubed)) ** 3)
-    return np.where(np.isinf(mean), np.inf, np.where(mean > 0.0, radius, 0.0))
-
-
 def spread_of_points(
     estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float
 ) -> PointSpread:
@@ -96,80 +79,19 @@ def spread_of_points(
     Raises:
         InputError: see `station_keys`.
     """
-    keys = station_keys(estimate, posterior, station)
-    if estimate.stations[station].camera in posterior.profiles:
-        return _by_profile(estimate, posterior, station, pixels, height_m)
+    station_keys(estimate, posterior, station)
     located = estimate.camera_at(station).locate(pixels, height_m)
-    slopes = locate_slopes(estimate, keys, station, pixels, height_m)
-    covariance = posterior.spread.through(over(slopes, keys, posterior.keys))
-    if (bends := posterior.bends) is not None:
-        steps, ends = (over(values, bends.keys, keys) for values in (bends.steps, bends.ends))
-        bend = _bend(estimate, keys, (steps, ends), (station, pixels, height_m), slopes)
-        covariance += bend / posterior.half_width**2
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    reach = posterior.half_width * np.sqrt(variance)
-    radius = radius_95(covariance) * posterior.half_width / NORMAL_95
-    return PointSpread(located, located - reach, located + reach, radius, np.sqrt(np.sum(variance, axis=1)))
+    places = located_by(station, pixels, height_m)
+    known = read(posterior, estimate, places, estimate.stations[station].camera)
+    return PointSpread(located, located + known.low, located + known.high, known.radius_95, known.sd)
 
 
-def _bend(
-    estimate: Estimate,
-    keys: Sequence[Key],
-    steps: tuple[Array, Array],
-    asked: tuple[str, Array, float],
-    slopes: Array,
-) -> Array:
-    """(N, 2, 2) squares of how much farther off places are than their slopes (N, 2, K) say, summed over directions;
-    infinite where a place is lost on the way.
-
-    Args:
-        steps: (B, K) what the slopes take, and where the numbers really go. asked: station, pixels (N, 2), height in m.
-    """
-    station, pixels, height_m = asked
-    located = estimate.camera_at(station).locate(pixels, height_m)
-    total = np.zeros((len(pixels), 2, 2))
-    for step, end in zip(*steps, strict=True):
-        off = np.full((len(pixels), 2), np.nan)
-        with suppress(InputError):  # reads: "unknown" at these places of the map
-            off = moved(estimate, keys, end).camera_at(station).locate(pixels, height_m) - located - slopes @ step
-        total += off[:, :, None] * off[:, None, :]
-    lost = np.isnan(total).any(axis=(1, 2))
-    total[lost] = np.nan
-    total[lost, 0, 0] = total[lost, 1, 1] = np.inf
-    return total
-
-
-def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float) -> PointSpread:
-    """The same along the valley: where each of its nodes puts the points, and how sure it is of that."""
-    profile, width = posterior.profiles[estimate.stations[station].camera], posterior.half_width
-    located = estimate.camera_at(station).locate(pixels, height_m)
-    offsets, covariances = [], []
-    for step, across in zip(profile.steps, profile.across, strict=True):
-        there = moved(estimate, profile.keys, step)
-        offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
-        slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
-        axes = width * weak_axes(across, there, across.keys).T
-        steps = np.concatenate([axes, -axes])
-        bend = 0.5 * _bend(there, across.keys, (steps, steps), (station, pixels, height_m), slopes)
-        covariances.append(across.spread.through(slopes) + bend / width**2)
-    values, known = np.array(offsets), np.array(covariances)
-    nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some node of the valley nothing is seen there
-    sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))
-    shape = (len(values), -1)
-    below, above = profile.bounds(values.reshape(shape), sds.reshape(shape), width)
-    low = np.where(nowhere[:, None], -np.inf, below.reshape(-1, 2))
-    high = np.where(nowhere[:, None], np.inf, above.reshape(-1, 2))
-    circles = np.array([radius_95(part) for part in known]) / NORMAL_95
-    unknown = ~np.isfinite(circles).all(axis=0)  # from some node of the valley
-
-    def radius_at(width: float) -> Array:
-        weights, widths = profile.reaches(width)
-        away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
-        return np.asarray(np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0))
-
-    radius = np.maximum(radius_at(width), 0.5 * radius_at(FARTHER))  # of what is normal, 0.65
-    radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
-    return PointSpread(located, located + low, located + high, radius, radius / NORMAL_95)
+def located_by(station: str, pixels: Array, height_m: float) -> Functional:
+    """The places at a height that pixels (N, 2) of a station show."""
+    return Functional(
+        lambda there: there.camera_at(station).locate(pixels, height_m),
+        lambda there, keys: locate_slopes(there, keys, station, pixels, height_m),
+    )
 
 
 @dataclass(frozen=True, eq=False)

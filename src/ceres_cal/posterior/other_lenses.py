@@ -1,8 +1,9 @@
-"""By how much numbers are off if another lens is the right one: of several that predict as well, one was taken.
+"""Other lenses that predict as well as the chosen one, and how its numbers follow them.
 
 Where they agree, the data tell them apart; at the rim and between lines they do not, and what the chosen one says there
-is its own. What another lens shows over the picture is followed by the numbers of the chosen one as closely as they
-can, by least squares over places on the floor and above it, or over rays of a camera that sees no floor.
+is its own. So they are components of the posterior, and maps show what they show, also where nothing was observed. The
+numbers of the chosen one follow each as closely as they can, by least squares over places on the floor and above it, or
+over rays of a camera that sees no floor.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ _FOLLOWED = 1e-4  # of the largest singular value: directions that show less are
 # Of the weights. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
 # a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
 _COUNTED = 0.5
+_MOST = 0.8  # of all of them together
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +81,14 @@ class OtherLenses:
         return {}
 
 
+def counted(weights: Sequence[float]) -> Array:
+    """(L,) probabilities of other lenses as far as they count, together less than all."""
+    each = _COUNTED * np.asarray(weights, dtype=float)
+    return np.asarray(each / max(1.0, float(each.sum()) / _MOST))
+
+
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> list[Array]:
-    """(K,) of numbers of an estimate, which follow each of the others, times the root of how much it counts.
+    """(K,) of numbers of an estimate, which follow each of the others.
 
     Args:
         there: with the chosen lens, at its best or elsewhere in a valley along phi.
@@ -91,11 +99,11 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     slopes, offsets = zip(*every, strict=True)
     slope = np.concatenate([one.reshape(-1, len(keys)) for one in slopes])
     sizes, shifts = natural_sizes(there, keys), []
-    for number, weight in enumerate(lenses.weights):
+    for number in range(len(lenses.others)):
         offset = np.concatenate([one[number].ravel() for one in offsets])
         known = np.isfinite(slope).all(axis=1) & np.isfinite(offset)
         step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=_FOLLOWED)[0]
-        shifts.append((_COUNTED * weight) ** 0.5 * step * sizes)
+        shifts.append(step * sizes)
     return shifts
 
 

@@ -13,8 +13,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter
-from ceres_cal.posterior.bent import Bends
-from ceres_cal.posterior.profile import PhiProfile
+from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.information import Information, Key, over, pose_keys, sigma_limits
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.quantities import layout_of
@@ -30,43 +29,100 @@ class Posterior:
     painted amiss, is not in it.
 
     Attributes:
-        information: about the P numbers that are shared.
+        information: about the P numbers that are shared: the normal distribution that a refit, a check and advice take.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
-        profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
+        mixtures: camera -> what it and its stations may be, where its phi was followed along its profile; "" -> what
+            everything else may be, where that is no one normal distribution. Standard deviations, bounds and maps are
+            read off these.
+        lenses: the estimate with the chosen lens and those with others that predict as well, from the same
+            observations: what components of the mixtures that are another lens show.
         stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
         by_model: what the model alone says of the shared numbers, were every error independent of the others; None
             where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
-        bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
     """
 
     information: Information
     placements: Mapping[str, Information] = field(default_factory=dict)
     degrees_of_freedom: float = np.inf
-    profiles: Mapping[str, PhiProfile] = field(default_factory=dict)
+    mixtures: Mapping[str, Mixture] = field(default_factory=dict)
     by_model: Information | None = None
     dependence: Dependence | None = None
-    bends: Bends | None = None
     stated: Information = field(default_factory=Information.nothing)
+    lenses: tuple[Estimate, ...] = ()
 
     @property
     def keys(self) -> tuple[Key, ...]:
         """(P) the numbers that are shared."""
         return self.information.keys
 
-    def in_doubt(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
-        """The posterior that holds what is in dispute: each shift d (K,) of some numbers, when something is left out,
-        goes into the covariance of what the observations say as d d^T, so that they state no number better than to
-        what it would move.
+    @property
+    def followed(self) -> tuple[str, ...]:
+        """Cameras whose phi was followed along its profile."""
+        return tuple(name for name, mixture in self.mixtures.items() if mixture.is_followed)
+
+    def mixture(self, camera: str = "") -> Mixture:
+        """What a camera and its stations may be, or everything together, but for cameras whose phi was followed."""
+        found = self.mixtures.get(camera) or self.mixtures.get("")
+        return found or Mixture.of_one(self.information)
+
+    def with_alternatives(
+        self, keys: Sequence[Key], shifts: Sequence[Array], weights: Sequence[float], lenses: tuple[Estimate, ...] = ()
+    ) -> Posterior:
+        """The posterior where something else may be true: shifts (S, K) of some numbers, with the probability of each.
+
+        Where these follow other lenses, the estimate with the chosen one is given, and with each of them. They are
+        components of the mixtures, and in the information by the second moments that they add.
+        """
+        if not len(shifts):
+            return self
+        whole, likely = over(np.array(shifts), keys, self.keys), np.asarray(weights, dtype=float)
+        limited = self._beside_stated(whole)
+        numbers = range(1, len(lenses))
+        mixtures = {"": self.mixture().with_alternatives(likely, limited, self.information, numbers)}
+        for name in self.followed:
+            mine = self.mixtures[name]
+            off = mine.off_valley(over(limited, self.keys, mine.keys))
+            mixtures[name] = mine.shifted_also(likely, off[:, None])
+        there = replace(self, lenses=self.lenses or lenses)
+        return there._with_information(np.sqrt(likely)[:, None] * whole, mixtures)
+
+    def widened(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
+        """The posterior whose numbers scatter by shifts (S, K) of some of them as well: each goes into the covariance
+        of what the observations say, of every component, as d d^T.
         """
         if not len(shifts):
             return self
         whole = over(np.array(shifts), keys, self.keys)
-        information = self.wider(self.information, lambda seen: seen.widened(whole))
+
+        def wider(one: Information) -> Information:
+            return self.wider(one, lambda seen: seen.widened(over(whole, self.keys, seen.keys)))
+
+        mixtures = {name: mixture.with_information(wider) for name, mixture in self.mixtures.items()}
+        return self._with_information(whole, mixtures)
+
+    def _with_information(self, shifts: Array, mixtures: Mapping[str, Mixture]) -> Posterior:
+        information = self.wider(self.information, lambda seen: seen.widened(shifts))
         placements = self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
-        return replace(self, information=information, placements=placements)
+        return replace(self, information=information, placements=placements, mixtures=mixtures)
+
+    def _beside_stated(self, shifts: Array) -> Array:
+        """(S, P) shifts as far as what was stated lets them be.
+
+        With L what the observations say, P what was stated and C = (L + P)^-1, the covariance of L + P with L widened
+        by d is C + g g^T, where g = C L d / (1 + d^T L C P d)^1/2: never more than P^-1.
+        """
+        if not np.any(self.stated.matrix):
+            return shifts
+        stated = self.stated.over(self.keys)
+        moved = shifts @ self.information.less(stated).matrix @ self.information.inverse
+        left = np.einsum("sp,pq,sq->s", moved, stated.matrix, shifts)
+        moved = moved / np.sqrt(1.0 + np.maximum(left, 0.0))[:, None]
+        with np.errstate(invalid="ignore"):  # of what is stated nearly alone, all of it is rounding
+            room = np.sqrt(np.maximum(np.nan_to_num(self.stated_sd**2 - self.spread.sd**2, nan=np.inf), 0.0))
+        return np.asarray(np.clip(moved, -room, room))
 
     def wider(self, information: Information, how: Callable[[Information], Information]) -> Information:
         """Information about some of the numbers, with what observations say of them made wider, beside what was stated
@@ -98,10 +154,17 @@ class Posterior:
     @cached_property
     def sd(self) -> Array:
         """(P,) standard deviations in the units of the keys, infinite where unknown."""
-        variance = self.spread.sd**2
-        if self.bends is not None:
-            variance += over(np.sum(self.bends.excesses**2, axis=0), self.bends.keys, self.keys)
-        return np.minimum(np.sqrt(variance), self.stated_sd)
+        sd = self.spread.sd.copy()
+        for mixture in self._read:
+            sd[self.information.columns(mixture.keys)] = mixture.sd
+        return np.minimum(sd, self.stated_sd)
+
+    @property
+    def _read(self) -> Iterator[Mixture]:
+        """Mixtures, those of cameras whose phi was followed last."""
+        if "" in self.mixtures:
+            yield self.mixtures[""]
+        yield from (self.mixtures[name] for name in self.followed)
 
     @cached_property
     def factors(self) -> Array:
@@ -127,12 +190,9 @@ class Posterior:
 
     def bounds_at(self, width: float) -> Array:
         """(P, 2) the same so many standard deviations up, at most three."""
-        bounds = width * self.sd[:, None] * (-1.0, 1.0)
-        for profile in self.profiles.values():
-            across = [information.spread.sd for information in profile.across]
-            sds = np.column_stack([np.zeros(len(across)), across])
-            at = self.information.columns(profile.keys)
-            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, width))
+        bounds = width * self.spread.sd[:, None] * (-1.0, 1.0)
+        for mixture in self._read:
+            bounds[self.information.columns(mixture.keys)] = mixture.bounds(width)
         limit = width * self.stated_sd[:, None]
         return np.clip(bounds, -limit, limit)
 

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, SolutionError
+from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, unit_px
@@ -27,20 +26,9 @@ from ceres_cal.problem.reduced import information
 # Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
 # changes from half to double.
 _FAR = 9.0
-FARTHER = 3.0
-"""Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
-and radii, not only what lies within 95 %."""
 _STEPS = (0.02, 0.35)  # of log phi
 _MOST_RISE = 1.5  # from one node to the next
 _MOST_NODES = 60
-_FINE = 16  # steps interpolated between two nodes
-_TWICE = (np.log(2.0), np.log(4.0))
-# Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
-# from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
-_BOUNDED = 1.0
-# Ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0, 1 of what goes on for ever.
-# Nothing changes from 0.6 to 0.86.
-_SHRINKING = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,77 +44,6 @@ class Node:
     estimate: Estimate
     cost: float
     information: Information
-
-
-@dataclass(frozen=True, eq=False)
-class PhiProfile:
-    """The valley of least cost along phi of one camera.
-
-    Attributes:
-        camera: whose phi. keys: (K) phi first, then the camera's other numbers and those of its stations.
-        phi_px: where the estimate has it.
-        steps: (N, K) from the estimate to each node, in the order of phi. rises: (N,) of twice the cost, from the
-            lowest node.
-        across: (N) information about all of the keys but phi, there, every other number integrated out.
-        open_below, open_above: the rise stays within the 95 % bound as far as PHI_RANGE goes.
-    """
-
-    camera: str
-    keys: tuple[Key, ...]
-    phi_px: float
-    steps: Array
-    rises: Array
-    across: tuple[Information, ...]
-    open_below: bool = False
-    open_above: bool = False
-
-    @property
-    def phi(self) -> Array:
-        """(N,) px."""
-        return np.asarray(self.phi_px + self.steps[:, 0])
-
-    def reaches(self, half_width: float) -> tuple[Array, Array]:
-        """Fine steps along the valley within the 95 % bound: weights (M, N) that interpolate what is known at the N
-        nodes, and how many standard deviations across the valley each leaves, (M,).
-        """
-        phi, root = self.steps[:, 0], np.sqrt(self.rises)
-        fine = np.concatenate([np.linspace(a, b, _FINE, endpoint=False) for a, b in pairwise(phi)])
-        fine = np.append(fine, phi[-1])
-        weights = np.array([np.interp(fine, phi, row) for row in np.eye(len(phi))]).T
-        left = half_width**2 - (weights @ root) ** 2
-        inside = left >= 0.0
-        return weights[inside], np.sqrt(left[inside])
-
-    def bounds(self, values: Array, sds: Array, half_width: float) -> tuple[Array, Array]:
-        """95 % bounds (m,) below and above of numbers that are `values` (N, m) along the valley, with standard
-        deviations `sds` (N, m) across it; infinite on a side where the valley is open and they grow on.
-        """
-        weights, widths = self.reaches(half_width)
-        known = np.isfinite(sds)
-        spread = widths[:, None] * (weights @ np.where(known, sds, 0.0))
-        spread[weights @ ~known > 0.0] = np.inf  # no 0 times infinity
-        middle = weights @ values
-        low, high = np.min(middle - spread, axis=0), np.max(middle + spread, axis=0)
-        for is_open, end in ((self.open_below, 0), (self.open_above, -1)):
-            if is_open:
-                limit = self._limit(values, sds[end], end)
-                low = np.minimum(low, limit - widths[end] * sds[end])
-                high = np.maximum(high, limit + widths[end] * sds[end])
-        return low, high
-
-    def _limit(self, values: Array, sds: Array, end: int) -> Array:
-        """(m,) where numbers go beyond an open end: on by a geometric series, each term for another factor two of phi,
-        to infinity where the last two terms do not shrink.
-        """
-        away = np.abs(np.log(self.phi / self.phi[end]))
-        order = np.argsort(away)
-        halves = [np.array([np.interp(d, away[order], column[order]) for column in values.T]) for d in _TWICE]
-        last, before = values[end] - halves[0], halves[0] - halves[1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.abs(last / before)
-            limit = values[end] + last * ratio / (1.0 - ratio)
-        going = np.where(np.abs(last) > _BOUNDED * sds, np.copysign(np.inf, last), values[end] + last)
-        return np.asarray(np.where(ratio < _SHRINKING, limit, going))
 
 
 def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float = 1.0) -> tuple[Node, ...]:
@@ -162,7 +79,7 @@ def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float =
 
 def profile(
     camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float, stated_sd: Mapping[Key, float]
-) -> PhiProfile:
+) -> Mixture:
     """The valley as seen from the estimate.
 
     Args:
@@ -178,16 +95,9 @@ def profile(
     steps = np.array([difference(node.estimate, estimate, keys) for node in nodes])
     stated = (steps / [stated_sd.get(key, np.inf) for key in keys]) ** 2
     rises = np.maximum(costs - base, np.max(stated, axis=1))
-    return PhiProfile(
-        camera,
-        keys,
-        estimate.cameras[camera].phi,
-        steps,
-        rises,
-        tuple(_across(node.information, keys) for node in nodes),
-        bool(rises[0] < half_width**2),
-        bool(rises[-1] < half_width**2),
-    )
+    across = [_across(node.information, keys) for node in nodes]
+    is_open = bool(rises[0] < half_width**2), bool(rises[-1] < half_width**2)
+    return Mixture.along_phi(keys, phi, steps, rises, across, is_open)
 
 
 def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> Node | None:

@@ -5,26 +5,25 @@ How two cameras stand to each other: baseline and angle, with standard deviation
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, distinct
-from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.posterior.maps import (
     FieldGrid,
     FieldMap,
     field_map,
-    locate_slopes,
-    radius_95,
+    located_by,
     station_keys,
     visible_pixels,
 )
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import over
+from ceres_cal.posterior.reading import Functional, Reading, read
+from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import moved, natural_sizes
 from ceres_cal.scene.camera import Camera
@@ -58,21 +57,24 @@ def rig_pairs(estimate: Estimate, posterior: Posterior) -> tuple[RigPair, ...]:
 
 
 def _pair(estimate: Estimate, posterior: Posterior, first: str, second: str) -> RigPair:
-    at = [column for column, key in enumerate(posterior.keys) if key[:2] in (("station", first), ("station", second))]
-    keys = [posterior.keys[column] for column in at]
-    steps = _STEP * natural_sizes(estimate, keys)
-    jacobian = np.zeros((2, len(posterior.keys)))
-    for column, number, step in zip(at, range(len(keys)), steps, strict=True):
-        along = step * (np.arange(len(keys)) == number)
-        there = [_numbers(moved(estimate, keys, sign * along), first, second) for sign in (1.0, -1.0)]
-        jacobian[:, column] = (there[0] - there[1]) / (2.0 * step)
-    variance = np.diagonal(posterior.spread.through(jacobian))
-    if posterior.bends is not None:
-        ends = over(posterior.bends.excesses, posterior.bends.keys, posterior.keys) @ jacobian.T
-        variance = variance + np.sum(ends**2, axis=0)
-    sd = np.sqrt(variance)
     baseline, angle = _numbers(estimate, first, second).tolist()
-    return RigPair((first, second), baseline, float(sd[0]), angle, float(sd[1]))
+    between = Functional(
+        lambda there: _numbers(there, first, second)[None],
+        lambda there, keys: _slopes(there, keys, first, second)[None],
+    )
+    variance = np.diagonal(read(posterior, estimate, between).covariance[0])
+    sd = np.sqrt(variance).tolist()
+    return RigPair((first, second), baseline, sd[0], angle, sd[1])
+
+
+def _slopes(estimate: Estimate, keys: Sequence[Key], first: str, second: str) -> Array:
+    """(2, K) of baseline and angle by each of the keys."""
+    slopes = np.zeros((2, len(keys)))
+    for column, (key, step) in enumerate(zip(keys, _STEP * natural_sizes(estimate, keys), strict=True)):
+        if key[:2] in (("station", first), ("station", second)):
+            there = [_numbers(moved(estimate, [key], np.array([sign * step])), first, second) for sign in (1.0, -1.0)]
+            slopes[:, column] = (there[0] - there[1]) / (2.0 * step)
+    return slopes
 
 
 def _numbers(estimate: Estimate, first: str, second: str) -> Array:
@@ -96,27 +98,32 @@ def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], gr
     Raises:
         InputError: see `maps.station_keys`.
     """
-    if {estimate.stations[s].camera for s in pair if s in estimate.stations} & set(posterior.profiles):
+    if {estimate.stations[s].camera for s in pair if s in estimate.stations} & set(posterior.followed):
         a, b = (field_map(estimate, posterior, station, grid) for station in pair)
         sd_mm, radius_mm = np.hypot(a.sd_mm, b.sd_mm), np.hypot(a.radius_95_mm, b.radius_95_mm)
     else:
-        covariance = predicted(estimate, posterior, pair, grid.places, grid.height_m)
-        sd_mm = 1e3 * np.sqrt(np.trace(covariance, axis1=1, axis2=2)).reshape(grid.shape)
-        radius_mm = 1e3 * (radius_95(covariance) * posterior.half_width / NORMAL_95).reshape(grid.shape)
+        known, visible = predicted(estimate, posterior, pair, grid.places, grid.height_m)
+        sd_mm, radius_mm = np.full((2, len(visible)), np.nan)
+        sd_mm[visible], radius_mm[visible] = 1e3 * known.sd, 1e3 * known.radius_95
+    sd_mm, radius_mm = sd_mm.reshape(grid.shape), radius_mm.reshape(grid.shape)
     return FieldMap(grid.height_m, grid.x_m, grid.y_m, " - ".join(pair), sd_mm, radius_mm)
 
 
-def predicted(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], places: Array, height_m: float) -> Array:
-    """Covariances (N, 2, 2) m^2 of first less second about places (N, 2) m; NaN where not both see them."""
-    covariances, slopes = np.full((len(places), 2, 2), np.nan), np.zeros((len(places), 2, len(posterior.keys)))
-    visible = np.ones(len(places), dtype=bool)
-    for station, sign in zip(pair, (1.0, -1.0), strict=True):
-        keys = station_keys(estimate, posterior, station)
-        pixels = visible_pixels(estimate, station, places, height_m)
-        visible &= np.isfinite(pixels[:, 0])
-        slopes += sign * over(locate_slopes(estimate, keys, station, pixels, height_m), keys, posterior.keys)
-    covariances[visible] = posterior.spread.through(slopes[visible])
-    return covariances
+def predicted(
+    estimate: Estimate, posterior: Posterior, pair: tuple[str, str], places: Array, height_m: float
+) -> tuple[Reading, Mask]:
+    """What is known of first less second about those places (N, 2) m that both see, and which (N,) these are."""
+    pixels = []
+    for station in pair:
+        station_keys(estimate, posterior, station)
+        pixels.append(visible_pixels(estimate, station, places, height_m))
+    visible = np.isfinite(pixels[0][:, 0]) & np.isfinite(pixels[1][:, 0])
+    first, second = (located_by(name, own[visible], height_m) for name, own in zip(pair, pixels, strict=True))
+    seam = Functional(
+        lambda there: first.values(there) - second.values(there),
+        lambda there, keys: first.slopes(there, keys) - second.slopes(there, keys),
+    )
+    return read(posterior, estimate, seam), visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,10 +189,11 @@ def disagreement(
     a, b = (dict(_sightings(observations, estimate, station, scales)) for station in pair)
     common = [thing for thing in a if thing in b]
     places = np.array([a[thing].place for thing in common]).reshape(-1, 3)
-    covariances = np.empty((len(common), 2, 2))
+    covariances = np.full((len(common), 2, 2), np.nan)
     for height_m in distinct(places[:, 2]):
         here = places[:, 2] == height_m
-        covariances[here] = predicted(estimate, posterior, pair, places[here, :2], float(height_m))
+        reading, visible = predicted(estimate, posterior, pair, places[here, :2], float(height_m))
+        covariances[np.flatnonzero(here)[visible]] = reading.covariance
     gaps = [_gap(a[thing], b[thing], covariance) for thing, covariance in zip(common, covariances, strict=True)]
     known = [number for number, (_, expected) in enumerate(gaps) if np.isfinite(expected)]
     off, expected = 1e3 * np.array([gaps[number] for number in known]).reshape(-1, 2).T

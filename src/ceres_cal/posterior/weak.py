@@ -10,8 +10,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.spread import are_known
 from ceres_cal.base.words import two_digits
+from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.profile import FARTHER
 from ceres_cal.problem.information import PLACEMENT_QUANTITIES, Key, sigma_limits
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes, values_of
@@ -35,9 +35,9 @@ class Verdict:
 
     Attributes:
         key: the number. value: in the key's unit; of a turn 0, which is where the pose is.
-        sd: by the quadratic picture, infinite where unknown; where phi is followed along its profile, half the distance
-            of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural size,
-            infinite also for phi and height where the valley is open.
+        sd: root mean square of what may be, infinite where unknown; where phi is followed along its profile, half the
+            distance of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural
+            size, infinite also for phi and height where the valley is open.
         verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": its sd is the one that was stated,
             and everything else contradicts it. by_profile: whether the bounds are the profile's.
         factor: standard deviation as the data scatter over that by the model alone.
@@ -77,18 +77,20 @@ def verdicts(estimate: Estimate, posterior: Posterior, conflicts: Sequence[Confl
     disputed = {(one.owner, one.quantity, one.unit) for one in conflicts if one.kind not in _GIVES_WAY}
     bounds, values = posterior.bounds, values_of(estimate, posterior.keys)
     half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
-    if posterior.profiles:  # a valley that widens farther out is no better known than there
+    if posterior.followed:  # a valley that widens farther out is no better known than there
         half = np.maximum(half, np.ptp(posterior.bounds_at(FARTHER), axis=1) / (2.0 * FARTHER))
-    relative = half / natural_sizes(estimate, posterior.keys)
+    sizes, open_half = natural_sizes(estimate, posterior.keys), half.copy()
     low, high = values + bounds[:, 0], values + bounds[:, 1]
     followed = np.zeros(len(values), dtype=bool)
-    for profile in posterior.profiles.values():
-        at = posterior.information.columns(profile.keys)
+    for name in posterior.followed:
+        mixture = posterior.mixtures[name]
+        at = posterior.information.columns(mixture.keys)
         followed[at] = True
-        if profile.open_below or profile.open_above:  # an open valley has no width, whatever it is compared with
+        if mixture.open_below or mixture.open_above:  # an open valley has no width, whatever it is compared with
             along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
-            relative[along], low[along] = np.inf, np.maximum(low[along], 0.0)
+            open_half[along], low[along] = np.inf, np.maximum(low[along], 0.0)
     sd = np.where(followed, half, posterior.sd)
+    relative = np.where(followed, open_half, posterior.sd) / sizes
     columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
     return tuple(
         Verdict(key, value, sigma, bottom, top, share, _word(key, share, key[1:] in disputed), by_profile, factor)

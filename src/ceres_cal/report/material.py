@@ -82,7 +82,7 @@ class Material(Quality):
 
     def _finer(self, one: FieldMap) -> FieldMap:
         uncertainty = self.calibration.uncertainty
-        if self.observations.stations[one.station] in uncertainty.posterior.profiles:  # each place takes long there
+        if self.observations.stations[one.station] in uncertainty.posterior.followed:  # each place takes long there
             return one
         x, y = (np.linspace(axis[0], axis[-1], _FINER * (len(axis) - 1) + 1) for axis in (one.x_m, one.y_m))
         return uncertainty.map_sd_mm(one.station, one.height_m, x, y)

@@ -17,18 +17,19 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey
-from ceres_cal.problem.bundle import Progress, solve
+from ceres_cal.problem.bundle import Progress, Solution, solve
 from ceres_cal.problem.engines import Engine, InProcess, OnWorkers
 from ceres_cal.problem.noise import SAME, Inliers, NoiseScales, Redundancy, noise_of, relative_lengths
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.reduced import information
+from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.shared_cost import SharedObservations, of_world
 from ceres_cal.problem.shares import Share, ShareRequest, cut
 from ceres_cal.problem.sums import Histogram, Looked, Used
 from ceres_cal.robust.competing import Explanation
 from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust.rounds import Rounds
 
 # Observations of the part, and views of it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200
@@ -36,7 +37,6 @@ _PART, _FEWEST_VIEWS = 300_000, 200
 _TO_THE_LAST = 1e-17
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
 _MOST_ROUNDS = 8
-_AT_REST = 1e-2  # relative change of a noise scale that is no change, as in `robust`
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +201,32 @@ class _BulkResiduals:
         return self.looked.points + own[0], self.looked.curves + own[1]
 
 
-class _SumRounds:
-    """The rounds of all observations: judged, solved for, until the same ones take part."""
+@dataclass(frozen=True, eq=False)
+class _SumRound:
+    """Where one round over all observations ended.
+
+    Attributes:
+        problem: as it was solved last. solution: of it. seen: residuals there. noise: as it was judged by them.
+    """
+
+    problem: Problem
+    solution: Solution
+    seen: _BulkResiduals
+    noise: NoiseScales
+    rounds: int
+    reduced: ReducedInformation | None = None
+
+    def judged_like(self, before: _SumRound, no_change: float) -> bool:
+        """Whether no scale changed, and about as many take part."""
+        scales = zip(self.noise[:2], before.noise[:2], strict=True)
+        rows = zip(self.seen.inside(self.noise), before.seen.inside(before.noise), strict=True)
+        return all(abs(now - then) <= no_change * then for now, then in scales) and all(
+            abs(now - then) <= SAME * then**0.5 for now, then in rows
+        )
+
+
+class _SumRounds(Rounds[_SumRound]):
+    """The rounds over sums, of shares that are anywhere."""
 
     def __init__(
         self, bulk: Bulk, engine: Engine, part: Subset, problem: Problem, end: RobustSolution,
@@ -216,7 +240,7 @@ class _SumRounds:
         masks[0][self._core.point_rows] = masks[1][self._core.curve_rows] = True
         self._placed, self._before = masks, end
         self._along: tuple[tuple[str, Estimate], ...] = ()
-        self._seen = self._look(end.solution.estimate, _bounds(end), end.problem.weighting)
+        self._unknowns = problem.unknowns(end.solution.estimate)
 
     def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _BulkResiduals:
         name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
@@ -228,10 +252,9 @@ class _SumRounds:
             points, curves = np.where(gone[0], np.inf, points), np.where(gone[1], np.inf, curves)
         return _BulkResiduals(name, estimate, looked, (points, curves), self._placed)
 
-    def _judged(self, noise: NoiseScales) -> Problem:
+    def _judged(self, seen: _BulkResiduals, noise: NoiseScales) -> Problem:
         """The problem of what takes part, judged at the last estimate."""
-        seen, options = self._seen, self._problem.options
-        points, curves = noise.bounds
+        options, (points, curves) = self._problem.options, noise.bounds
         inside = seen.lengths[0] <= points, seen.lengths[1] <= curves
         equations = 2 * seen.looked.points.within(points).count + seen.looked.curves.within(curves).count
         judged_at = seen.name, of_world(seen.estimate)
@@ -246,43 +269,42 @@ class _SumRounds:
             elsewhere=judged,
         )
 
+    def next(self, state: _SumRound) -> _SumRound:
+        """One more solve of what was judged to take part, judged."""
+        problem = self._judged(state.seen, state.noise)
+        solution = solve(problem, state.seen.estimate, self._progress, precision=_TO_THE_LAST)
+        seen = self._look(solution.estimate, state.noise.bounds, problem.weighting)
+        noise = seen.noise(Redundancy.by_count(problem.equations, self._unknowns), self._problem)
+        return _SumRound(problem, solution, seen, noise, state.rounds + 1)
+
+    def with_leverages(self, state: _SumRound) -> _SumRound:
+        """The state judged by the leverages, with what all observations say there."""
+        elsewhere = state.problem.elsewhere
+        assert isinstance(elsewhere, SharedObservations)
+        here = replace(elsewhere, feet_along=self._along)  # else shares would seek those of before again
+        reduced = information(replace(state.problem, elsewhere=here), state.solution.estimate)
+        points, curves = state.seen.inside(state.noise)
+        shares = (1.0 - own / max(n, 1) for own, n in zip(reduced.leverages, (2 * points, curves), strict=True))
+        return replace(state, noise=state.seen.noise(Redundancy(*shares), self._problem), reduced=reduced)
+
     def end(self) -> RobustSolution:
         """The end of the rounds, with what all observations say there."""
-        unknowns = self._problem.unknowns(self._seen.estimate)
-        rounds, solution = 0, self._before.solution
-        noise = self._noise(Redundancy.by_count(sum(self._seen.looked.equations), unknowns))
-        while rounds < _MOST_ROUNDS:
-            problem = self._judged(noise)
-            solution, rounds = solve(problem, self._seen.estimate, self._progress, precision=_TO_THE_LAST), rounds + 1
-            inside = self._seen.inside(noise)
-            self._seen = self._look(solution.estimate, noise.bounds, problem.weighting)
-            redundancy = Redundancy.by_count(problem.equations, unknowns)
-            before, noise = noise, self._noise(redundancy)
-            if _alike(noise, before) and _same_rows(self._seen.inside(noise), inside):
-                break
-        assert isinstance(problem.elsewhere, SharedObservations)
-        here = replace(problem.elsewhere, feet_along=self._along)  # else shares would seek those of before again
-        reduced = information(replace(problem, elsewhere=here), solution.estimate)
-        counts = self._seen.inside(noise)
-        points, curves = (
-            1.0 - own / max(n, 1) for own, n in zip(reduced.leverages, (2 * counts[0], counts[1]), strict=True)
+        before = self._before
+        seen = self._look(before.solution.estimate, _bounds(before), before.problem.weighting)
+        noise = seen.noise(Redundancy.by_count(sum(seen.looked.equations), self._unknowns), self._problem)
+        state = self.to_rest(_SumRound(self._problem, before.solution, seen, noise, 0), _MOST_ROUNDS)
+        state = state if state.reduced is not None else self.with_leverages(state)
+        self._seen, self._noise = state.seen, state.noise
+        inliers = Inliers.by_noise(*state.seen.lengths, state.noise)
+        sights = self._problem.used(inliers.points, inliers.curves).sights
+        problem = replace(state.problem, sights=sights, feet=self._there.feet, elsewhere=None)
+        return RobustSolution(
+            problem, state.solution, inliers, self._there, before.rounds + state.rounds, state.reduced
         )
-        self.noise = self._noise(Redundancy(points, curves))
-        inliers = Inliers.by_noise(*self._seen.lengths, self.noise)
-        problem = replace(
-            problem,
-            sights=self._problem.used(inliers.points, inliers.curves).sights,
-            feet=self._there.feet,
-            elsewhere=None,
-        )
-        return RobustSolution(problem, solution, inliers, self._there, self._before.rounds + rounds, reduced)
-
-    def _noise(self, redundancy: Redundancy) -> NoiseScales:
-        return self._seen.noise(redundancy, self._problem)
 
     def used(self) -> Used:
         """What takes part at the end, of the world."""
-        judged = self._judged(self.noise)
+        judged = self._judged(self._seen, self._noise)
         assert isinstance(judged.elsewhere, SharedObservations)
         used = self._engine.ask(Share.used, judged.elsewhere.asked(judged, self._seen.estimate)) + self._used_here()
         (p, c), (far_p, far_c) = used.rows, used.sigmas
@@ -297,7 +319,7 @@ class _SumRounds:
             columns,
             self._seen.lengths,
             self._placed,
-            self.noise.bounds,
+            self._noise.bounds,
             self._there.lengths,
             self._part.rows,
             strict=True,
@@ -314,13 +336,3 @@ def _bounds(end: RobustSolution) -> tuple[float, float]:
     """Lengths in stated sigmas from which on observations are outliers, about."""
     sigmas = end.problem.options.reject_sigma
     return sigmas * end.inliers.point_scale, sigmas * end.inliers.curve_scale
-
-
-def _alike(noise: NoiseScales, before: NoiseScales) -> bool:
-    """Whether no scale changed."""
-    return all(abs(now - then) <= _AT_REST * then for now, then in zip(noise[:2], before[:2], strict=True))
-
-
-def _same_rows(now: tuple[int, int], before: tuple[int, int]) -> bool:
-    """Whether about as many take part."""
-    return all(abs(one - other) <= SAME * other**0.5 for one, other in zip(now, before, strict=True))

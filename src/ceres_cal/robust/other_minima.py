@@ -19,7 +19,7 @@ from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import difference
+from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.robust.robust import RobustSolution
 
 _FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
@@ -28,6 +28,7 @@ _MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hund
 # Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
 _OTHER = 0.25
 _APART = 0.05  # of the height: places that are no farther apart are one valley, which the standard deviations show
+_ALIKE = 0.01  # of natural sizes: two solves that ended no farther apart are one minimum
 _LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
 
 
@@ -53,24 +54,33 @@ def least_of_few(
     return end, tuple(replace(one, cost=one.cost - least.cost) for one in others)
 
 
-def shifts_to(
+def minima_of(
     others: Sequence[Solution], estimate: Estimate, information: Information, half_width: float
-) -> list[Array]:
-    """(K,) from the estimate to each other minimum that costs no more than 95 % intervals reach.
+) -> tuple[list[Array], list[float]]:
+    """(K,) from the estimate to each other minimum that costs no more than 95 % intervals reach, and their
+    probabilities.
 
     Args:
         others: with what they cost beyond the estimate. information: by the model, about the K numbers.
         half_width: standard deviations from the middle to an end of an interval.
     """
-    shifts = [(one, difference(one.estimate, estimate, information.keys)) for one in others]
-    return [d for one, d in shifts if 2.0 * one.cost < min(half_width**2, _OTHER * float(d @ information.matrix @ d))]
+    sizes = natural_sizes(estimate, information.keys)
+    shifts: list[Array] = []
+    odds: list[float] = []
+    for one in sorted(others, key=lambda other: other.cost):
+        shift = difference(one.estimate, estimate, information.keys)
+        least = min(half_width**2, _OTHER * float(shift @ information.matrix @ shift))
+        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > _ALIKE for d in shifts):
+            shifts.append(shift)
+            odds.append(float(np.exp(-max(one.cost, 0.0))))
+    return shifts, [each / (1.0 + sum(odds)) for each in odds]
 
 
 def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[str]:
     """A warning for each station that may stand elsewhere, with the likeliest other place.
 
     Args:
-        others, half_width: see `shifts_to`.
+        others, half_width: see `minima_of`.
     """
     for name, station in estimate.stations.items():
         here = station.cam_from_world.position

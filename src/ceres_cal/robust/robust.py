@@ -20,11 +20,8 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Residuals, residuals, residuals_alone
 from ceres_cal.robust.poses import with_lost_boards_posed, without_mirrored_poses
+from ceres_cal.robust.rounds import AT_REST, AT_REST_AGAIN, MOST_ROUNDS, Rounds
 
-_MOST_ROUNDS = 15
-# Relative change of a noise scale that is no change. From half to double the answer moves by under 1 % of its error;
-# a refit must give the same answer to the same question, and nothing changes from half to double there.
-_AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Of a camera: with them it is known well enough to place all others; fewer cost another round, more cost time.
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
@@ -66,6 +63,10 @@ class RobustSolution:
     rounds: int
     reduced: ReducedInformation | None = None
 
+    def judged_like(self, before: RobustSolution, no_change: float) -> bool:
+        """Whether nothing worth another solve changed since another round."""
+        return self.inliers.same_as(before.inliers, no_change)
+
     def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
         """The same with another estimate. `problem`: of all the observations."""
         there = residuals(observations, problem.sights, estimate, self.residuals.feet)
@@ -79,7 +80,7 @@ def solve_robustly(
     estimate: Estimate,
     usual: tuple[float, float] | None = None,
     progress: Callable[[Progress], None] | None = None,
-    most_rounds: int = _MOST_ROUNDS,
+    most_rounds: int = MOST_ROUNDS,
     *,
     is_near: bool = False,
 ) -> RobustSolution:
@@ -108,8 +109,8 @@ def judge_at(problem: Problem, observations: Observations, estimate: Estimate) -
     return rounds.by_leverages(rounds.at(estimate))
 
 
-class _RowRounds:
-    """What the rounds of one robust solve have in common."""
+class _RowRounds(Rounds[RobustSolution]):
+    """The rounds over rows that are at hand."""
 
     def __init__(
         self,
@@ -123,32 +124,11 @@ class _RowRounds:
         self._moving = 0.0
         self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
         self._last: tuple[Inliers, Sights] | None = None
-        self._no_change = _AT_REST if usual is None else _AT_REST_AGAIN
+        self.no_change = AT_REST if usual is None else AT_REST_AGAIN
         self._rough_end, self._end = _ROUGH, _TO_THE_END
         lens = problem.options.blank_lens
         if lens.roughness and not any(problem.knows_lens(name, lens) for name in problem.layout.free):
             self._rough_end, self._end = _ROUGH_WITHOUT_FORMULA, _LEFT_OF_SMOOTH / max(problem.equations, 1)
-
-    def to_rest(
-        self, state: RobustSolution, most_rounds: int = _MOST_ROUNDS, *, is_near: bool = False
-    ) -> RobustSolution:
-        """Round after round, until nothing changes."""
-        undecided = frozenset(state.problem.sights.keys)
-        before: Inliers | None = None
-        while state.rounds < most_rounds:
-            at_rest = before is not None and state.inliers.same_as(before, self._no_change)
-            if not at_rest and before is not None:
-                undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
-            if at_rest or before is None:
-                state, changed, undecided = self.mended(state, undecided)
-                if before is None and not is_near:
-                    state = self.refined(state)
-                if at_rest and not changed:
-                    state = self.with_leverages(state)
-                    if state.reduced is not None:
-                        break
-            before, state = state.inliers, self.next(state)
-        return state
 
     def first(self, estimate: Estimate) -> RobustSolution:
         """The rough solve from a start."""
@@ -251,7 +231,7 @@ class _RowRounds:
         moves by how smooth lenses are; else judged by them, for another round.
         """
         anew, reduced = self._anew(state)
-        if self._moving > _STILL or not anew.same_as(state.inliers, self._no_change):
+        if self._moving > _STILL or not anew.same_as(state.inliers, self.no_change):
             return self._with(anew, state.solution, state.residuals, state.rounds)
         problem = replace(state.problem, smoothness=self._problem.smoothness)
         inliers = replace(state.inliers, degrees_of_freedom=anew.degrees_of_freedom)
@@ -274,7 +254,7 @@ class _RowRounds:
         """Where a solve, of these inliers, ended, and the problem that the inliers there make."""
         there = residuals(self._observations, self._problem.sights, solution.estimate, before.feet)
         anew = self._judge(solution, there)
-        if inliers is not None and anew.same_as(inliers, self._no_change):
+        if inliers is not None and anew.same_as(inliers, self.no_change):
             anew = anew.with_rows_of(inliers)
         return self._with(anew, solution, there, rounds)
 

@@ -11,8 +11,8 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import Spread
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
+from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.profile import PhiProfile
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import moved
@@ -60,9 +60,10 @@ class Outlook:
         return Errors(self.today.worst_mm, self.today.mean_mm)
 
     @property
-    def profile(self) -> PhiProfile | None:
+    def valley(self) -> Mixture | None:
         """The valley along phi that today's map follows, where it does."""
-        return self.posterior.profiles.get(self.estimate.stations[self.today.station].camera)
+        found = self.posterior.mixture(self.estimate.stations[self.today.station].camera)
+        return found if found.is_followed else None
 
     def after(self, added: Information) -> Errors:
         """The errors with information added, by the quadratic picture at the estimate.
@@ -70,7 +71,7 @@ class Outlook:
         Where phi was followed along its profile and would have to be still, see `shrunk`.
         """
         known = self._known(added)
-        bent = self.profile is not None and self._phi_sd(self.estimate, known) > BENT
+        bent = self.valley is not None and self._phi_sd(self.estimate, known) > BENT
         return self.shrunk(added) if bent else _errors(known, self.slopes)
 
     def shrunk(self, added: Information) -> Errors:
@@ -103,10 +104,10 @@ class Outlook:
     @cached_property
     def possible(self) -> tuple[tuple[int, Estimate], ...]:
         """Some nodes of the valley within its 95 % bounds, by number; none where phi is not followed."""
-        if self.profile is None:
+        if self.valley is None:
             return ()
-        keys, steps = self.profile.keys, self.profile.steps
-        within = np.flatnonzero(self.profile.rises <= self.posterior.half_width**2)
+        keys, steps, (at, roots) = self.valley.keys, self.valley.steps, self.valley.chains[0]
+        within = at[np.abs(roots) <= self.posterior.half_width]
         some = within[np.unique(np.linspace(0, len(within) - 1, _NODES).round().astype(int))]
         return tuple((int(node), moved(self.estimate, keys, steps[node])) for node in some)
 
@@ -117,23 +118,25 @@ class Outlook:
         There the observations of today tell everything but phi as the valley has it, and phi by the parabola that fits
         the valley best. Where nothing would be seen of what is added, all of it is infinite.
         """
-        profile = self.profile
-        assert profile is not None
-        tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
-        bend = max(float(np.polyfit(np.log(profile.phi), profile.rises, 2)[0]), 0.0) if len(profile.phi) > 2 else 0.0
+        valley = self.valley
+        assert valley is not None
+        at, roots = valley.chains[0]
+        phi, steps = valley.phi[at], valley.steps[at]
+        tangents = np.gradient(steps[:, 1:], steps[:, 0], axis=0)
+        bend = max(float(np.polyfit(np.log(phi), roots**2, 2)[0]), 0.0) if len(phi) > 2 else 0.0
         for node, there in self.possible:
-            added = information_at(there).given(profile.keys)
+            added = information_at(there).given(valley.keys)
             if not np.any(added.matrix):
-                yield float(profile.phi[node]), np.inf, Errors(np.inf, np.inf)
+                yield float(phi[node]), np.inf, Errors(np.inf, np.inf)
                 continue
-            across, along = profile.across[node].matrix, tangents[node]
+            across, along = valley.information[node].matrix, tangents[node]
             coupling = -across @ along
-            phi = along @ across @ along + bend / profile.phi[node] ** 2
-            matrix = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
-            whole = Information(profile.keys, matrix) + added
+            of_phi = along @ across @ along + bend / phi[node] ** 2
+            matrix = np.block([[np.atleast_2d(of_phi), coupling[None]], [coupling[:, None], across]])
+            whole = Information(valley.keys, matrix) + added
             known = _part(whole.spread, whole.columns(self.keys))
             errors = _errors(known, _slopes(there, self.today, self.keys))
-            yield float(profile.phi[node]), self._phi_sd(there, known), errors
+            yield float(phi[node]), self._phi_sd(there, known), errors
 
 
 def _part(known: Spread, at: Indices) -> Spread:

@@ -165,7 +165,8 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
     keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
     stated = posterior.stated.over(posterior.keys).marginal(keys)
-    return replace(posterior, information=posterior.information.marginal(keys), bends=None, stated=stated)
+    mixtures = {name: posterior.mixtures[name] for name in posterior.followed}
+    return replace(posterior, information=posterior.information.marginal(keys), mixtures=mixtures, stated=stated)
 
 
 def _weighting(fit: Fit) -> Weighting:
@@ -192,7 +193,7 @@ def _promise(measurement: Measurement, added: Information, ground: Ground, outlo
     Where the camera would not see what is measured does not count: who measures will see.
     """
     after = outlook.after(added)
-    if outlook.profile is None:
+    if outlook.valley is None:
         return Promise(measurement, after)
     valley = tuple(outlook.along_valley(lambda there: _information_there(measurement, ground, there, outlook)))
     known = [sd for _, sd, _ in valley if np.isfinite(sd)]

@@ -1,0 +1,323 @@
+"""A posterior as a mixture of normal distributions: weight, place and information of each component.
+
+One component is enough where the cost is a parabola and nothing else may be true. Along a valley of phi there is one at
+each node, in the order of phi; what lies between two nodes is interpolated. Curves through the ends of weak directions,
+other explanations, other minima and other lenses are components, too. Bounds are quantiles of the mixture, standard
+deviations its moments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED, normal_cdf
+from ceres_cal.problem.information import Information, Key, over
+
+FARTHER = 3.0
+"""Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
+and radii, not only what lies within 95 %."""
+_FINE = 0.125  # standard deviations from one interpolated place to the next
+# Share of a flat prior on log phi in how the weight lies along a valley; the rest is the signed root of the rise, which
+# is normal whatever the valley is measured in. Where the valley is flat the root says nothing.
+_FLAT = 0.1
+_OVERLAP = 0.5  # standard deviation of each interpolated place, of the way to the next: so there are no steps
+_TWICE = (np.log(2.0), np.log(4.0))
+# Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
+# from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
+_BOUNDED = 1.0
+# Ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0, 1 of what goes on for ever.
+# Nothing changes from 0.6 to 0.86.
+_SHRINKING = 0.75
+_HALVINGS = 28  # of an interval that holds a quantile: to 1e-7 standard deviations
+_REACH = 8.0  # standard deviations beyond which no quantile lies
+
+
+class Chain(NamedTuple):
+    """Components along phi of one camera, in its order.
+
+    Attributes:
+        at: (N,) which components. roots: (N,) signed roots of twice the rise of the cost there: how far up either side
+            of the valley, in standard deviations.
+    """
+
+    at: Indices
+    roots: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """What some numbers may be.
+
+    Attributes:
+        keys: (K) the numbers, phi first where it was followed. weights: (C,) probabilities.
+        steps: (C, K) from the estimate to the middle of each component.
+        information: (C) about the numbers there; one that it has no key of is held.
+        chains: of components along phi. phi_px: by the estimate; 0 where there is no chain.
+        open_below, open_above: the valley does not rise to the 95 % bound as far as lenses go.
+        lenses: of components that are another lens, which one: their steps are how the numbers follow it.
+    """
+
+    keys: tuple[Key, ...]
+    weights: Array
+    steps: Array
+    information: tuple[Information, ...]
+    chains: tuple[Chain, ...] = ()
+    phi_px: float = 0.0
+    open_below: bool = False
+    open_above: bool = False
+    lenses: Mapping[int, int] = field(default_factory=dict)
+
+    @classmethod
+    def of_one(cls, information: Information) -> Mixture:
+        """The normal distribution about the estimate."""
+        return cls(information.keys, np.ones(1), np.zeros((1, len(information.keys))), (information,))
+
+    @classmethod
+    def along_phi(
+        cls, keys: tuple[Key, ...], phi_px: float, steps: Array, rises: Array, across: Sequence[Information],
+        is_open: tuple[bool, bool],
+    ) -> Mixture:  # fmt: skip
+        """A valley: at each node twice the rise of the cost, and the information about all keys but phi."""
+        side = np.where(np.arange(len(steps)) < np.argmin(rises), -1.0, 1.0)
+        chain = Chain(np.arange(len(steps)), side * np.sqrt(np.asarray(rises)))
+        mixture = cls(keys, np.zeros(len(steps)), np.asarray(steps), tuple(across), (chain,), phi_px, *is_open)
+        weights, between, _ = mixture._between(chain)
+        each = weights @ between
+        return replace(mixture, weights=each / each.sum())
+
+    @property
+    def phi(self) -> Array:
+        """(C,) px, where it was followed."""
+        return np.asarray(self.phi_px + self.steps[:, 0])
+
+    @property
+    def is_normal(self) -> bool:
+        """Whether it is one normal distribution about the estimate."""
+        return len(self.weights) == 1
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether phi was followed along its profile."""
+        return bool(self.chains)
+
+    @cached_property
+    def variances(self) -> Array:
+        """(C, K) within each component; 0 of what is held there, infinite where unknown."""
+        known: dict[int, Array] = {}
+        for one in self.information:
+            if id(one) not in known:
+                known[id(one)] = over(one.spread.sd**2, one.keys, self.keys)
+        return np.array([known[id(one)] for one in self.information])
+
+    @cached_property
+    def sd(self) -> Array:
+        """(K,) root mean squares about the estimate; along a valley no more than its bounds have, which a thin tail
+        beyond them does not move.
+        """
+        read = self.refined(self.steps, self.variances)
+        if not self.is_followed:
+            return moments(*read)
+        reach = [np.max(np.abs(quantiles(*read, width)), axis=0) / width for width in (NORMAL_95, FARTHER)]
+        return np.asarray(np.minimum(moments(*read), np.max(reach, axis=0)))
+
+    def bounds(self, half_width: float) -> Array:
+        """(K, 2) beyond which, on either side, as much of it lies as of a normal variable beyond so many sigmas."""
+        return np.column_stack(quantiles(*self.refined(self.steps, self.variances), half_width))
+
+    def with_information(self, how: Callable[[Information], Information]) -> Mixture:
+        """With other information in each component."""
+        known: dict[int, Information] = {}
+        for one in self.information:
+            if id(one) not in known:
+                known[id(one)] = how(one)
+        return replace(self, information=tuple(known[id(one)] for one in self.information))
+
+    def with_alternatives(
+        self, weights: Array, steps: Array, information: Information, lenses: Sequence[int] = ()
+    ) -> Mixture:
+        """With further components of these weights (S,) at steps (S, K); other lenses by their numbers."""
+        return replace(
+            self,
+            lenses={**self.lenses, **{len(self.weights) + count: lens for count, lens in enumerate(lenses)}},
+            weights=np.concatenate([(1.0 - weights.sum()) * self.weights, weights]),
+            steps=np.concatenate([self.steps, steps]),
+            information=(*self.information, *[information] * len(weights)),
+        )
+
+    def shifted_also(self, weights: Array, shifts: Array) -> Mixture:
+        """With all of it once more for each of the weights (S,), shifted by (S, C, K) or (S, 1, K)."""
+        every, count = [1.0 - weights.sum(), *weights], len(self.weights)
+        steps = np.concatenate([self.steps, *(self.steps + shift for shift in shifts)])
+        chains = tuple(
+            Chain(chain.at + copy * count, chain.roots) for copy in range(len(every)) for chain in self.chains
+        )
+        of_all = np.concatenate([weight * self.weights for weight in every])
+        return replace(self, weights=of_all, steps=steps, information=self.information * len(every), chains=chains)
+
+    def off_valley(self, shifts: Array) -> Array:
+        """(S, K) of shifts (S, K) what is beside the first chain, phi held: along it they change nothing."""
+        steps = self.steps[self.chains[0].at]
+        along = np.array([[np.interp(d[0], steps[:, 0], column) for column in steps.T] for d in shifts])
+        return np.asarray((shifts - along.reshape(shifts.shape)) * (np.arange(len(self.keys)) > 0))
+
+    # ---- between the nodes of a valley ------------------------------------------------------------------------------
+
+    def refined(self, values: Array, variances: Array) -> tuple[Array, Array, Array]:
+        """Weights (F,), values (F, ...) and variances (F, ...) with those between the nodes of chains, and beyond open
+        ends: infinite where these grow on.
+
+        Args:
+            values: (C, ...) of the components. variances: (C, ...) as many, or matrices of the last axis.
+        """
+        if not self.chains:
+            return self.weights, values, variances
+        alone = np.setdiff1d(np.arange(len(self.weights)), np.concatenate([chain.at for chain in self.chains]))
+        parts = [(self.weights[alone], values[alone], variances[alone])]
+        parts += [part for chain in self.chains for part in self._along(chain, values, variances)]
+        weights, means, widths = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return weights, means, widths
+
+    def _along(self, chain: Chain, values: Array, variances: Array) -> Iterator[tuple[Array, Array, Array]]:
+        """Parts of what `refined` gives."""
+        whole = float(self.weights[chain.at].sum())
+        weights, between, across = self._between(chain)
+        share = whole / weights.sum()
+        own, widths = values[chain.at], variances[chain.at]
+        ends = ((self.open_below, 0), (self.open_above, -1))
+        kept = np.array([not ends[0][0], *[True] * (len(weights) - 2), not ends[1][0]])
+        jump = _OVERLAP * _mixed(across[kept], own)
+        jumps = jump[..., :, None] * jump[..., None, :] if widths.ndim > own.ndim else jump**2
+        yield share * weights[kept], _mixed(between[kept], own), _mixed(between[kept], widths) + jumps
+        for is_open, end in ends:
+            if is_open:
+                sds = np.sqrt(np.diagonal(widths[end], axis1=-2, axis2=-1) if widths.ndim > own.ndim else widths[end])
+                yield share * weights[[end]], self._limit(chain, own, sds, end)[None], widths[[end]]
+
+    def _between(self, chain: Chain) -> tuple[Array, Array, Array]:
+        """Weights (F,) of places along the valley, its ends first and last; of which nodes (F, N) each is, and by how
+        much of them (F, N) the next one differs.
+        """
+        roots, log_phi = chain.roots, np.log(self.phi[chain.at])
+        counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / _FINE), 2).astype(int)
+        node = np.repeat(np.arange(len(counts)), counts)
+        part = np.concatenate([(np.arange(n) + 0.5) / n for n in counts])
+        places = np.zeros((len(node), len(roots)))
+        places[np.arange(len(node)), node], places[np.arange(len(node)), node + 1] = 1.0 - part, part
+        long = (1.0 - _FLAT) * np.abs(np.diff(roots)) + _FLAT * np.abs(np.diff(log_phi))
+        weights = np.exp(-0.5 * (places @ roots) ** 2) * (long / counts)[node]
+        ends = np.sqrt(2.0 * np.pi) * normal_cdf(-np.abs(roots[[0, -1]]))
+        each, none = np.eye(len(roots)), np.zeros((1, len(roots)))
+        across = (each[node + 1] - each[node]) / counts[node][:, None]
+        weights, places = np.concatenate([ends[:1], weights, ends[1:]]), np.concatenate([each[:1], places, each[-1:]])
+        return weights, places, np.concatenate([none, across, none])
+
+    def _limit(self, chain: Chain, values: Array, sds: Array, end: int) -> Array:
+        """Where numbers (N, ...) go beyond an open end: on by a geometric series, each term for another factor two of
+        phi, to infinity where the last two terms do not shrink.
+        """
+        phi = self.phi[chain.at]
+        away = np.abs(np.log(phi / phi[end]))
+        order = np.argsort(away)
+        flat = values.reshape(len(values), -1)
+        halves = [np.array([np.interp(d, away[order], column[order]) for column in flat.T]) for d in _TWICE]
+        last, before = flat[end] - halves[0], halves[0] - halves[1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.abs(last / before)
+            limit = flat[end] + last * ratio / (1.0 - ratio)
+        going = np.where(np.abs(last) > _BOUNDED * sds.ravel(), np.copysign(np.inf, last), flat[end] + last)
+        return np.asarray(np.where(ratio < _SHRINKING, limit, going)).reshape(values.shape[1:])
+
+
+def _mixed(between: Array, values: Array) -> Array:
+    """(F, ...) of values (N, ...); infinite where one of them that is looked at is."""
+    flat = values.reshape(len(values), -1)
+    finite = np.isfinite(flat)
+    mixed = between @ np.where(finite, flat, 0.0)
+    if not finite.all():
+        mixed[between @ ~finite > 0.0] = np.inf
+    return np.asarray(mixed).reshape(len(between), *values.shape[1:])
+
+
+# ---- readings of a mixture ------------------------------------------------------------------------------------------
+
+
+def moments(weights: Array, means: Array, variances: Array) -> Array:
+    """(...) root mean squares about the estimate, of means and variances (F, ...)."""
+    return np.asarray(np.sqrt(np.tensordot(weights, variances + means**2, axes=1)))
+
+
+def quantiles(weights: Array, means: Array, variances: Array, half_width: float) -> tuple[Array, Array]:
+    """(...) below and above which as much of a mixture lies, of means and variances (F, ...), as of a normal variable
+    beyond so many sigmas.
+    """
+    unknown = np.isinf(variances).any(axis=0)
+    sds = np.sqrt(np.where(unknown, 1.0, variances))
+    low, high = (_quantile(weights, sign * means, sds, half_width) for sign in (-1.0, 1.0))
+    return np.where(unknown, -np.inf, -low), np.where(unknown, np.inf, high)
+
+
+def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Array:
+    """(...) what as much of the mixture lies above."""
+    if len(weights) == 1:
+        return np.asarray(means[0] + half_width * sds[0])
+    finite, tail = np.isfinite(means), float(normal_cdf(-half_width))
+    low = np.min(np.where(finite, means - _REACH * sds, np.inf), axis=0)
+    high = np.max(np.where(finite, means + _REACH * sds, -np.inf), axis=0)
+    beyond = np.tensordot(weights, (means == np.inf).astype(float), axes=1) > tail
+    sds = np.maximum(sds, np.finfo(float).tiny)
+
+    def above(x: Array) -> Array:
+        with np.errstate(over="ignore"):
+            return np.tensordot(weights, normal_cdf((means - x) / sds), axes=1)
+
+    return np.where(beyond, np.inf, _root(above, low, high, tail))
+
+
+def _root(above: Callable[[Array], Array], low: Array, high: Array, tail: float) -> Array:
+    """(...) where a falling function is so much, between two places."""
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        over_it = above(middle) > tail
+        low, high = np.where(over_it, middle, low), np.where(over_it, high, middle)
+    return np.asarray(0.5 * (low + high))
+
+
+def normal_quantile(tail: float) -> float:
+    """Standard deviations that so much of a normal variable lies above."""
+    return float(_root(lambda x: normal_cdf(-x), np.zeros(()), np.full((), _REACH), tail))
+
+
+def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) -> Array:
+    """(N,) radius of the circle about the estimate beyond which so much of a mixture lies, of means (F, N, 2) and
+    covariances (F, N, 2, 2).
+
+    The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        square = np.trace(covariances, axis1=-2, axis2=-1) + np.sum(means**2, axis=-1)
+        finite = np.nan_to_num(covariances, nan=0.0)
+        variance = 2.0 * np.sum(finite**2, axis=(-2, -1)) + 4.0 * np.einsum("fni,fnij,fnj->fn", means, finite, means)
+        cubed = variance / (9.0 * square**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
+    unknown = np.isinf(covariances).any(axis=(0, 2, 3))
+    sized = np.isfinite(square) & np.isfinite(variance) & (square > 0.0)
+    exact = square == 0.0
+    square, cubed = np.where(sized, square, 1.0), np.where(sized, np.maximum(cubed, 1e-30), 1e-30)
+    away = NORMAL_95_ONE_SIDED if tail == 0.05 else normal_quantile(tail)
+    each = np.sqrt(square * (1.0 - cubed + away * np.sqrt(cubed)) ** 3)
+    each = np.where(sized, each, np.where(exact, 0.0, np.inf))
+    if len(weights) == 1:
+        return np.asarray(np.where(unknown, np.inf, each[0]))
+    nowhere = np.tensordot(weights, np.isinf(each).astype(float), axes=1) > tail
+
+    def above(radius: Array) -> Array:
+        share = normal_cdf((1.0 - cubed - np.cbrt(radius**2 / square)) / np.sqrt(cubed))
+        return np.tensordot(weights, np.where(sized, share, np.isinf(each)), axes=1)
+
+    largest = np.max(np.where(np.isfinite(each), each, 0.0), axis=0)
+    return np.asarray(np.where(unknown | nowhere, np.inf, _root(above, np.zeros_like(largest), largest, tail)))
