@@ -13,6 +13,9 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 
+_STATED = {"x": "position_m", "y": "position_m", "height": "height_m", "phi": "phi"}
+"""What an open number may be stated as."""
+
 
 def chained_poses(
     observations: Observations,
@@ -72,10 +75,12 @@ def _require_all(
             continue
         sight = sights[number]
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
-        names = ", ".join(open_numbers.get(number, ()))
-        what = f"its pose: {names} of the camera stay open" if names else "its pose"
-        raise DegenerateError(
-            f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(distinct(sight.track_index))} curves) cannot fix {what}: give at least four points, "
-            "not on one line, or straight lines in two directions, two of each, or remove the view"
-        )
+        said = f"{len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations (on "
+        said += f"{len(distinct(sight.track_index))} curves) cannot fix its pose"
+        if names := open_numbers.get(number, ()):
+            stated = [_STATED[name] for name in names if name in _STATED]
+            state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""
+            what = f"{', '.join(names)} of the camera stay open: add a point or a line beside these{state}"
+        else:
+            what = "give at least four points, not on one line, or straight lines in two directions, two of each"
+        raise DegenerateError(f"frame {frames} ({key}): {said}: {what}, or remove the view")
