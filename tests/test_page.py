@@ -9,6 +9,7 @@ import struct
 import sys
 import zlib
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from ceres_cal.detect.photographs import Clicks, by_hand, load_clicks
 from ceres_cal.detect.photographs.clicks import starts_from_clicks
 from ceres_cal.page.server import serve
 from ceres_cal.page.session import KEPT, Session, opened
-from ceres_cal.page.state import Change, Click, Drag, Place, Region, Sitting, State, load_state
+from ceres_cal.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import targets_by_name
 
@@ -190,7 +191,7 @@ def test_what_clicks_alone_tell(tmp_path: Path) -> None:
     assert session.everything()["known"] is None and session.weigh()
     known = session.everything()["known"]
     assert [one["name"] for one in known["numbers"]] == ["phi of camera", "height of station"]
-    assert known["level"] in ("care", "no") and known["advice"] == [] and len(known["maps"]) == 2
+    assert known["level"] in ("care", "no") and "advice" not in known and len(known["maps"]) == 2
     session.drag(drag("TopLeftCorner", 100.0, 90.0))
     assert session.everything()["known"] is None  # of other clicks
 
@@ -332,6 +333,21 @@ def test_a_full_disk_is_said_and_nothing_is_lost(tmp_path: Path, monkeypatch: py
     monkeypatch.undo()
     session.drag(drag("TopRightCorner", 901.0, 90.0))
     assert session.message == "" and load_state(tmp_path / KEPT) == session.state
+
+
+def test_done_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first file that finds no room is named; there is none of which half is written."""
+    points = {name: Click(100.0 + 10.0 * n, 90.0, 3.0) for n, name in enumerate(CORNERS)}
+    session = session_of(tmp_path, State(target="ssl-b", points=points))
+    session._now = replace(session._now, made=Made((), {"field.json": b"{}"}, tmp_path / "calibration.json"))
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match=r"corners\.json: cannot be written: No space left on device"):
+        session.done()
+    assert [path.name for path in tmp_path.iterdir()] == [KEPT] and session.written == ()
 
 
 def test_an_unforeseen_error_is_said_and_the_page_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

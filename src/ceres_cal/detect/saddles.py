@@ -40,6 +40,8 @@ _SMOOTHING_PX = 0.7
 _RADIUS_PX = (3.0, 20.0)
 # A corner that moved further, as a part of that distance, followed something else. Nothing changes from 0.33 to 0.67.
 _LOST = 0.5
+_ROUGH = 0.6  # of the reach, in the first fit
+_WHOLE = 32.0  # px, by which no picture is shrunk
 # A contrast below this part of the usual one shows something else: a sticker, a finger. Nothing changes from half to
 # double.
 _FAINT = 0.2
@@ -90,11 +92,12 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
 
 def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH) -> Saddles:
     """The saddles near the wanted places (rows, columns) of a grid; the others say where edges run."""
-    level, discs = image.astype(np.float32), (reach, wanted)
+    corner, level = _around(image, grid)
+    seen, discs, first = grid - corner, (reach, wanted), (_ROUGH * reach, wanted)
     smooth = _smoothed(level)
-    fitted = _fit_grid(smooth, grid, grid, discs, curved=False)  # where the edges bend is known only after it
+    fitted = _fit_grid(smooth, seen, seen, first, curved=False)  # where the edges bend is known only after it
     shrink = _shrink(fitted, grid, reach)
-    start, seen = _started(fitted, grid, wanted), grid
+    start = _started(fitted, seen, wanted)
     if shrink > 1:
         smooth = _smoothed(_shrunk(level, shrink))
         start, seen = ((places + 0.5) / shrink - 0.5 for places in (start, seen))
@@ -102,7 +105,22 @@ def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH
     fitted = _fit_grid(smooth, start, seen, discs, curved=True)
     contrast = fitted[..., _CONTRAST]
     misfit = fitted[..., _LEFT] / np.maximum(np.abs(contrast), 1e-9)
-    return Saddles((fitted[..., :2] + 0.5) * shrink - 0.5, contrast, misfit)
+    return Saddles((fitted[..., :2] + 0.5) * shrink - 0.5 + corner, contrast, misfit)
+
+
+def _around(image: AnyArray, grid: Array) -> tuple[Array, AnyArray]:
+    """The part of a picture that discs around a grid can reach, and x and y of its first pixel."""
+    steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1) for axis in (0, 1)])
+    margin = np.max(np.abs(steps[np.isfinite(steps)]), initial=_RADIUS_PX[1]) + _RADIUS_PX[1]
+    known = grid[np.isfinite(grid).all(axis=-1)]
+    if not len(known):
+        return np.zeros(2), image.astype(np.float32)
+    low = np.maximum((known.min(axis=0) - margin) // _WHOLE * _WHOLE, 0.0)
+    high = np.maximum(known.max(axis=0) + margin, low)
+    (x, y), (right, below) = (
+        ends.clip(0.0, np.array(image.shape[::-1]) - 1.0).astype(int).tolist() for ends in (low, high)
+    )
+    return np.array([x, y], dtype=float), image[y : below + 1, x : right + 1].astype(np.float32)
 
 
 def _smoothed(level: AnyArray) -> AnyArray:
@@ -167,13 +185,12 @@ def _distances(grid: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], A
 
 def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
     """Unit tangent (.., 2), curvature (1 / px) and distance to the next corner (px) of the lines along `axis`."""
-    line = np.moveaxis(grid, axis, 0)
+    line = grid.swapaxes(0, axis)
     gap = np.full((1, *line.shape[1:]), np.nan)
-    ahead = np.concatenate([np.diff(line, axis=0), gap])
-    behind = np.concatenate([gap, np.diff(line, axis=0)])
-    alone_ahead, alone_behind = np.isnan(behind), np.isnan(ahead)
-    chord = np.where(alone_ahead, ahead, np.where(alone_behind, behind, 0.5 * (ahead + behind)))
-    length = np.linalg.norm(chord, axis=-1)
+    steps = np.diff(line, axis=0)
+    ahead, behind = np.concatenate([steps, gap]), np.concatenate([gap, steps])
+    chord = np.where(np.isnan(behind), ahead, np.where(np.isnan(ahead), behind, 0.5 * (ahead + behind)))
+    length = np.hypot(chord[..., 0], chord[..., 1])
     with np.errstate(divide="ignore", invalid="ignore"):  # where two are foreseen at one place
         tangent = chord / length[..., None]
         bend = _cross(tangent, ahead - behind) / length**2
@@ -181,8 +198,9 @@ def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
     after, before = np.concatenate([bend[1:], gap[..., 0]]), np.concatenate([gap[..., 0], bend[:-1]])
     for other in (after, before, np.zeros_like(bend)):
         bend = np.where(np.isnan(bend), other, bend)
-    step = np.fmin(np.linalg.norm(ahead, axis=-1), np.linalg.norm(behind, axis=-1))
-    return np.moveaxis(tangent, 0, axis), np.moveaxis(bend, 0, axis), np.moveaxis(step, 0, axis)
+    size = np.hypot(steps[..., 0], steps[..., 1])
+    step = np.fmin(np.concatenate([size, gap[..., 0]]), np.concatenate([gap[..., 0], size]))
+    return tangent.swapaxes(0, axis), bend.swapaxes(0, axis), step.swapaxes(0, axis)
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -182,12 +182,12 @@ class Server:
 
         async def wait() -> None:
             loop = asyncio.get_running_loop()
-            told, _ = await loop.run_in_executor(self._work, answer_or_reason, self.session.weigh)
+            told, _ = await loop.run_in_executor(self._pictures, answer_or_reason, self.session.weigh)
             if told:
                 await self._show()
 
         if not self._busy:
-            self._waiting = asyncio.create_task(wait())
+            self._thinking = asyncio.create_task(wait())
 
     async def _at_length(self, asked: Do) -> None:
         """Work in the other thread; meanwhile every window says what it is."""
@@ -199,6 +199,7 @@ class Server:
             self._busy = ""
             self.session.message = why or self.session.message
             await self._show()
+            self._weigh()
 
         await self._show()
         self._waiting = asyncio.create_task(wait())

@@ -26,7 +26,7 @@ from ceres_cal.moves.comparisons import compare
 from ceres_cal.observations import Observations, combine
 from ceres_cal.page.state import Change, Commands, Drag, Made, Sitting, State, load_state, save_state, target_words
 from ceres_cal.problem.parameters import Options
-from ceres_cal.report.live import known_of, strokes_of
+from ceres_cal.report.live import advice_of, known_of, strokes_of
 from ceres_cal.report.pictures.frames import frame_by_name, frames_of, model_of
 from ceres_cal.report.pictures.model import Model
 from ceres_cal.report.quality import quality_of
@@ -204,16 +204,23 @@ class Session:
             self.revision += 1
 
     def weigh(self) -> bool:
-        """What the clicks alone tell, under a lens of one coefficient; whether that was asked about, and still is."""
-        moment, revision = self._now, self.revision
-        target = self.target(moment.state)
-        if target is None or moment.found is not None or len(moment.state.points) < FEWEST:
+        """What takes a second and nobody waits for: advice where the lines were found; before that, what clicks tell
+        alone, under a lens of one coefficient. Whether there is anything new to be shown.
+        """
+        moment, revision, target = self._now, self.revision, self.target(self.state)
+        if moment.found is not None:
+            known = moment.found.known
+            if "advice" in known or not known["maps"]:
+                return False
+            known["advice"] = advice_of(moment.found.calibration)
+            return self._now is moment
+        if target is None or len(moment.state.points) < FEWEST:
             return False
         seen = by_hand.observed(target, _shown(moment.state, target), self.sitting.sizes[0])
-        known = known_of(quality_of(calibrate(seen, _BY_HAND), seen), advised=False)
+        told = known_of(quality_of(calibrate(seen, _BY_HAND), seen))
         with self.lock:
             current = self.revision == revision
-            self._by_hand = known if current else self._by_hand
+            self._by_hand = told if current else self._by_hand
         return current
 
     def check(self, photograph: int) -> None:

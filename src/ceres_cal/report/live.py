@@ -20,8 +20,8 @@ from ceres_cal.report.pictures.advised import places_in_picture
 from ceres_cal.report.quality import Quality
 
 
-def known_of(quality: Quality, *, advised: bool = True) -> dict[str, Any]:
-    """Verdict, numbers, maps, residuals by frame, and, unless that takes too long, advice."""
+def known_of(quality: Quality) -> dict[str, Any]:
+    """Verdict, numbers, maps, and residuals by frame."""
     judged = judge_quality(quality)
     maps = next(iter(quality.maps.values()), ())
     return {
@@ -31,7 +31,6 @@ def known_of(quality: Quality, *, advised: bool = True) -> dict[str, Any]:
         "numbers": list(_numbers(quality)),
         "maps": [_map(one) for one in maps],
         "paint": [np.round(line[:, :2], 3).tolist() for line in paint_of(quality.fields)],
-        "advice": _advice(quality.calibration) if maps and advised else [],
         "residuals": {} if quality.diagnosis is None else strokes_of(quality.diagnosis.table),
     }
 
@@ -74,7 +73,7 @@ def strokes_of(table: ResidualTable) -> dict[str, list[list[Any]]]:
 # ---- what to add next -----------------------------------------------------------------------------------------------
 
 
-def _advice(calibration: Calibration) -> list[dict[str, Any]]:
+def advice_of(calibration: Calibration) -> list[dict[str, Any]]:
     """The best measurement, and the next: what to do, what it leaves, and where in the picture that is."""
     advice, _ = answer_or_reason(lambda: advise(calibration))
     if advice is None:  # the verdict says that the numbers are not known

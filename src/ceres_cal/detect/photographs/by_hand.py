@@ -107,7 +107,7 @@ def solved(target: Target, shown: Shown, before: Camera, base: Camera, *, quickl
         return base
     best: Camera | None = None
     base = _turned(target, shown, base)
-    for start in (before, base):
+    for start in (before, base) if shown.equations >= _FREED[0][0] else (base, before):
         there = _fitted(target, shown, start, base, _AS_SHOWN)
         if there is not None and (best is None or _cost(target, shown, there) < _cost(target, shown, best)):
             best = there

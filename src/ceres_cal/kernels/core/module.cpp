@@ -4,10 +4,10 @@
 #include <windows.h>
 #endif
 
-#include "alignment.hpp"
 #include "arguments.hpp"
-#include "rows.hpp"
+#include "planes.hpp"
 #include "saddles.hpp"
+#include "sums.hpp"
 
 namespace ceres_cal {
 namespace {

@@ -10,7 +10,8 @@ const SIDES = ["right", "bottom-right", "bottom", "bottom-left", "left", "top-le
 let now = null; // all that the server said last
 let socket = null, waiting = false, next = null;
 let selected = null, photograph = 0, withResiduals = false, advised = null, saw = false;
-const pictures = new Map();
+let sent = 0, asked = null;
+const pictures = new Map(), latencies = [];
 
 const view = new View($("stage"), $("view"), $("lens"), {
   select(name) { selected = name; refresh(); },
@@ -31,7 +32,11 @@ const view = new View($("stage"), $("view"), $("lens"), {
     change({ regions: [...now.state.regions, { photograph: now.photographs[photograph].name, box }] });
     tool(null);
   },
-  painted() { window.paints = (window.paints ?? 0) + 1; },
+  painted() {
+    if (asked === null) return;
+    latencies.push(performance.now() - asked); // from a drag to the model that follows it, drawn
+    asked = null;
+  },
 });
 
 const panel = new Panel({
@@ -57,7 +62,7 @@ function press(what) { send({ do: "now", what, photograph }); }
 // One drag is on its way at a time; of those meanwhile the last one counts.
 function dragged(message) {
   if (waiting) next = message;
-  else { waiting = true; window.sent = performance.now(); send(message); }
+  else { waiting = true; sent = performance.now(); send(message); }
   local(message);
 }
 function answered() {
@@ -80,7 +85,7 @@ function local(message) {
 function receive(message) {
   if (message.is === "model") {
     view.model = message;
-    (window.latencies ??= []).push(performance.now() - window.sent);
+    asked = sent;
     view.draw();
     return answered();
   }
@@ -270,4 +275,4 @@ addEventListener("keydown", event => {
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => refresh());
 
 connect();
-window.page = { view, get now() { return now; }, press, change }; // for the tests, and for whoever is curious
+window.page = { view, get now() { return now; }, press, change, latencies }; // for the tests, and for whoever is curious

@@ -117,7 +117,7 @@ export class Panel {
     const parts = [element("p", { className: `verdict ${known.level}`, textContent: known.headline }), numbers];
     if (!now.found) parts.unshift(element("p", { className: "quiet", textContent: "By what was dragged alone; find the lines to know more:" }));
     if (known.maps.length) parts.push(...this.map(now, known));
-    for (const [number, one] of known.advice.entries()) {
+    for (const [number, one] of (known.advice ?? []).entries()) {
       const button = element("button", { className: "advice", title: "Show where in the picture" }, number ? "Then " : "Next: ", one.words,
         element("small", { textContent: [...(one.steps.length <= 3 ? one.steps : []), one.leaves].join("; ") }));
       button.onclick = () => this.act.advise(one.shapes);
