@@ -5,22 +5,31 @@ line and the circle (and the centre line), a quarter's over lines of its corner,
 height. "drawn": 2 to 8 features of a field before a camera whose phi is known or not. Counted are refusals of scenes
 that a rank by finite differences of the exact scene calls solvable, and calibrations of which a number that is called
 "known" is over 5 standard deviations off. "labels": two points or two curves of one of ten fields under each other's
-names. Exits with 1 where there are any.
+names. "advice": four points and 24 line points, and then whatever `advise` proposes besides, three poles among it.
+"clicks": four corners of each photograph of ../shared clicked 8 px off, and six of a football pitch seen from its
+stands. Exits with 1 where there are any.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations
 
 import numpy as np
+from photos.real_data import real_place
+from photos.shared import CLICK_PX, Known, known_photographs, spread
 from runner import Row, over, script
 
+from accuracy.advice import followed
 from accuracy.odd_scenes import MOST_SIGMAS, farthest
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.diagnostics.advice import advise
 from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
@@ -28,7 +37,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, nearest_on_curve
 from ceres_cal.scene.lens import Brown, Radial
-from ceres_cal.scene.targets import ssl_field, targets_by_name
+from ceres_cal.scene.targets import Target, ssl_field, targets_by_name
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
 
 _FIELD = ssl_field("A")
@@ -44,15 +53,22 @@ _HELD = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scene: the message of a refusal, or by how many standard deviations what is known is off."""
+    """What became of one scene: the message of a refusal, or by how many standard deviations what is known is off, and
+    which of phi and height are called known.
+    """
 
     refused: str = ""
     sigmas: float = 0.0
     which: str = ""
+    known: tuple[str, ...] = ()
 
 
 def middle(runs: int) -> Iterator[Row]:
-    yield from _rows("middle", list(over(_middle, range(runs))))
+    found = list(over(_middle, range(runs)))
+    yield from _rows("middle", found)
+    free = [one for seed, one in enumerate(found) if not _is_stated(seed)]
+    what = f"no height stated: phi and height said to be open, of {len(free)}"
+    yield Row("middle", what, sum(not one.refused and not one.known for one in free), least=len(free))
 
 
 def quarter(runs: int) -> Iterator[Row]:
@@ -96,6 +112,103 @@ def _exchanged(seed: int) -> bool:
     return all(map(np.array_equal, found, (columns.feature, right.points.feature, right.curves.feature)))
 
 
+def advice(runs: int) -> Iterator[Row]:
+    every = [one for some in over(_advised, range(runs)) for one in some]
+    refused = [why for _, why in every if why]
+    yield Row("advice", f"refused, of {len(every)} that were proposed", len(refused), most=0, note="".join(refused[:1]))
+    poles = [why for what, why in every if what == "pole x 3"]
+    yield Row("advice", f"refused, of {len(poles)} with three poles", sum(map(bool, poles)), most=0)
+
+
+def _advised(seed: int) -> list[tuple[str, str]]:
+    """What is proposed for four points and 24 line points, and why that is refused, "" where it is not."""
+    rng = np.random.default_rng([seed, 25])
+    camera = Camera(_SIZE, rng.uniform(700.0, 900.0), (639.5, 511.5), Radial((-5e-5, 6e-7)))
+    tilts = rng.uniform(-12.0, 12.0, 2)
+    place = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(5.0, 6.5)
+    scene = field_scene(_FIELD, {"c": camera}, {"c": Station("c", overhead_pose(*place, tilts[0], tilts[1]))})
+    every = simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), seed).observations
+    points, curves = np.zeros(len(every.points), bool), np.zeros(len(every.curves), bool)
+    points[rng.permutation(len(points))[:4]] = True
+    curves[rng.permutation(len(curves))[:24]] = True
+    few = replace(every, points=taken(every.points, points), curves=taken(every.curves, curves))
+    options = Options(lens="radial")
+    try:
+        calibration = calibrate(few, options)
+    except CalibrationError as error:
+        return [("four points and 24 line points", str(error))]
+    found = [("four points and 24 line points", "")]
+    for promise in advise(calibration).promises:
+        one = promise.measurement
+        try:
+            followed(one, calibration, few, scene, seed)
+            found.append((f"{one.kind} x {len(one.steps)}", ""))
+        except CalibrationError as error:
+            found.append((f"{one.kind} x {len(one.steps)}", f"{one.words}: {error}"))
+    return found
+
+
+def clicks(runs: int) -> Iterator[Row]:
+    photographs = [
+        one for one in _photographs() if len(_corners(one)) >= 4 and one.truth.get("what") != "mirrored picture"
+    ]
+    if photographs:
+        some = [(photographs[k % len(photographs)], k) for k in range(runs)]
+        refused = [why for why in over(_clicked, *zip(*some, strict=True)) if why]
+        what = f"refused, of {runs} clicks of {len(photographs)} photographs"
+        yield Row("clicks", what, len(refused), most=0, note="".join(refused[:1]))
+    refused = [why for why in over(_pitch, range(runs)) if why]
+    yield Row("clicks", f"refused, of {runs} of a pitch", len(refused), most=0, note="".join(refused[:1]))
+
+
+@cache
+def _photographs() -> list[Known]:
+    shared = real_place().parent
+    every = [one for name in ("photos", "photos3") for one in known_photographs(shared / name)]
+    return [one for one in every if not one.is_wrong]
+
+
+def _corners(shown: Known) -> Mapping[str, Sequence[float]]:
+    target, corners = targets_by_name()[shown.truth["asked_as"]], shown.truth.get("corners_px", {})
+    return {name: pixel for name, pixel in corners.items() if name in target.point_index}
+
+
+def _clicked(shown: Known, seed: int) -> str:
+    """Why four right clicks on a photograph are refused, "" where they are not."""
+    corners, target = _corners(shown), targets_by_name()[shown.truth["asked_as"]]
+    four = {name: corners[name] for name in max(combinations(corners, 4), key=lambda four: spread(corners, four))}
+    why = _refusal(np.random.default_rng([seed, 26]), four, target, tuple(shown.truth["image_size"]))
+    return f"{shown.name}: {why}" if why else ""
+
+
+def _pitch(seed: int) -> str:
+    """The same of six right clicks on a football pitch."""
+    rng, pitch = np.random.default_rng([seed, 27]), targets_by_name()["football"]
+    camera = Camera((1920, 1080), rng.uniform(1200.0, 2500.0), (959.5, 539.5), Brown((0.0,) * 5))
+    stands, to = np.array([rng.uniform(-20.0, 20.0), -60.0, 15.0]), np.array([rng.uniform(-30.0, 30.0), -10.0, 0.0])
+    ahead = (to - stands) / np.linalg.norm(to - stands)
+    aside = np.cross(ahead, [0.0, 0.0, 1.0]) / np.linalg.norm(ahead[:2])
+    rotation = np.array([aside, np.cross(ahead, aside), ahead])
+    there = camera.at(Pose(rotation, -rotation @ stands))
+    pixels = dict(zip(pitch.point_names, there.project(pitch.point_array), strict=True))
+    shown = [name for name, pixel in pixels.items() if np.all((pixel > 0.0) & (pixel < camera.image_size))]
+    if len(shown) < 6:
+        return ""
+    six = {name: tuple(pixels[name].tolist()) for name in rng.permutation(shown)[:6].tolist()}
+    return _refusal(rng, six, pitch, camera.image_size)
+
+
+def _refusal(
+    rng: np.random.Generator, pixels: Mapping[str, Sequence[float]], target: Target, size: tuple[int, int]
+) -> str:
+    off = {name: tuple(np.array(pixel) + rng.normal(0.0, CLICK_PX, 2)) for name, pixel in pixels.items()}
+    try:
+        starts_from_clicks(Clicks(off), target, size)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
 def _rows(case: str, found: Sequence[Outcome]) -> Iterator[Row]:
     refused = [one.refused for one in found if one.refused]
     yield Row(case, f"refused, of {len(found)}", len(refused), most=0, note=refused[0][:60] if refused else "")
@@ -103,16 +216,20 @@ def _rows(case: str, found: Sequence[Outcome]) -> Iterator[Row]:
     yield Row(case, 'a number called "known" over 5 sd off', len(wrong), most=0, note=wrong[0].which if wrong else "")
 
 
+def _is_stated(seed: int) -> bool:
+    return seed % 4 > 1
+
+
 def _middle(seed: int) -> Outcome:
     rng = np.random.default_rng([seed, 21])
     position = (rng.uniform(-0.5, 0.5), rng.uniform(1.6, 2.4), rng.uniform(4.5, 6.0))
-    return _hall(rng, _MIDDLE[: 3 + seed % 2], position, stated=seed % 4 > 1)
+    return _hall(rng, _MIDDLE[: 3 + seed % 2], position, stated=_is_stated(seed))
 
 
 def _quarter(seed: int) -> Outcome:
     rng = np.random.default_rng([seed, 22])
     position = (rng.uniform(-3.5, -2.5), rng.uniform(1.8, 2.6), rng.uniform(4.5, 6.0))
-    return _hall(rng, _QUARTER, position, stated=seed % 4 > 1)
+    return _hall(rng, _QUARTER, position, stated=_is_stated(seed))
 
 
 def _hall(
@@ -158,7 +275,8 @@ def _outcome(scene: Scene, observations: Observations, options: Options) -> Outc
     except CalibrationError as error:
         return Outcome(refused=str(error))
     sigmas, which, _ = farthest(calibration, scene)
-    return Outcome("", sigmas, which)
+    known = [one.key.quantity for one in calibration.uncertainty.verdicts if one.verdict == "known"]
+    return Outcome("", sigmas, which, tuple(name for name in known if name in ("phi", "height")))
 
 
 def _thinned(observations: Observations) -> Observations:
@@ -215,5 +333,14 @@ def _project(camera: Camera, pose: Pose, places: Array) -> Array:
 
 
 main = script(
-    {"middle": middle, "quarter": quarter, "drawn": drawn, "labels": labels}, __doc__, (144, "scenes of each case")
+    {
+        "middle": middle,
+        "quarter": quarter,
+        "drawn": drawn,
+        "labels": labels,
+        "advice": advice,
+        "clicks": clicks,
+    },
+    __doc__,
+    (144, "scenes of each case"),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -59,12 +59,12 @@ class Known:
         rng = np.random.default_rng([5, sum(map(ord, self.name))])
         corners = self.truth["corners_px"]
         names = max(
-            combinations([name for name in CORNERS if name in corners], 4), key=lambda four: _spread(corners, four)
+            combinations([name for name in CORNERS if name in corners], 4), key=lambda four: spread(corners, four)
         )
         return Clicks({name: tuple(np.array(corners[name]) + rng.normal(0.0, CLICK_PX, 2)) for name in names})
 
 
-def _spread(corners: dict[str, list[float]], names: Sequence[str]) -> float:
+def spread(corners: Mapping[str, Sequence[float]], names: Sequence[str]) -> float:
     """The least area of three of these points, px^2."""
     areas = [
         np.linalg.det(np.column_stack([[corners[name] for name in three], np.ones(3)]))

@@ -21,7 +21,7 @@ from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.start.initialise import LensProfile, edge_over
+from ceres_cal.start.lens_profile import LensProfile, edge_over
 
 MOST_ROUNDS = 8  # of a robust solve
 _FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart

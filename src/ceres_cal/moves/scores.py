@@ -22,7 +22,8 @@ from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.problem.structure import EXACT, Structure, make_structure
-from ceres_cal.start.initialise import Start, chained_poses
+from ceres_cal.start.chaining import chained_poses
+from ceres_cal.start.initialise import Start
 
 
 @numerical("the score")

@@ -55,11 +55,6 @@ class RadialProfile:
         return RadialProfile((first + bend, *rest), self.unit_px)
 
 
-def null_vector(matrix: ArrayLike) -> Array:
-    """Unit vector that a symmetric positive semidefinite matrix shrinks most."""
-    return np.asarray(np.linalg.eigh(np.asarray(matrix, dtype=float))[1][:, 0])
-
-
 def _normaliser(points: Array) -> Array:
     """(3, 3) T that moves 2D points to their centroid and scales them to a mean distance of sqrt 2."""
     centre = points.mean(axis=0)
@@ -337,7 +332,7 @@ def profile_from_lines(lines: Array, offsets: Array, unit_px: float, terms: int)
     squared = np.sum(p * p, axis=1)
     factors = np.column_stack([p, *(squared**k for k in range(terms + 1))])
     rows = (factors[:, :, None] * lines[:, None, :]).reshape(len(lines), -1)
-    products = null_vector(rows.T @ rows)[6:].reshape(terms + 1, 3)
+    products = np.linalg.eigh(rows.T @ rows)[1][6:, 0].reshape(terms + 1, 3)
     left = np.linalg.svd(products)[0][:, 0]
     return tuple(float(c / left[0]) for c in left[1:]) if abs(left[0]) > 1e-9 else (0.0,) * terms
 

@@ -6,24 +6,24 @@ into stations and placements. Nothing here is the answer: the bundle is.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, distinct
-from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.numerical import numerical
-from ceres_cal.base.transforms import Pose, Poses, chained, inverted
+from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.parameters import Estimate, Options, Station, anchored_stations, unit_px
+from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Lens
+from ceres_cal.start.chaining import chained_poses
 from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
+from ceres_cal.start.lens_profile import RADII, LensProfile, edge_over
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 from ceres_cal.start.world import Placed, beforehand, placed
 
@@ -31,12 +31,9 @@ USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
 of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
 _ENOUGH_VIEWS = 50  # for phi
-_MARGIN = 1.15  # of what a start takes for the edge of the picture: its profile is least sure there
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
-_RADII = np.linspace(0.02, 1.0, 50)  # of the observed ones, at which lenses are compared
 _LEAST_SD = 1e-3  # of phi, as a share: a start is no better
-_GRAZING = 0.02  # cosine of the angle at which a ray has no ideal radius any more
 
 
 @dataclass(frozen=True)
@@ -188,7 +185,7 @@ def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> 
 
 def _with_lens(blank: Camera, sights: Sights, profile: RadialProfile, phi: float, options: Options) -> Camera:
     """The camera with the lens that comes nearest to a profile."""
-    r = _RADII * sights.reach_px
+    r = RADII * sights.reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
     seen = LensProfile(r, np.arctan2(r, phi * w))
     beyond = edge_over(blank, sights.reach_px)
@@ -208,11 +205,6 @@ def _held_profile(blank: Camera, sights: Sights, options: Options) -> RadialProf
     w = seen.radii_px / (phi * np.tan(seen.angles))
     powers = np.column_stack([squared, squared**2, squared**3])
     return RadialProfile(tuple(np.linalg.lstsq(powers, w - 1.0, rcond=1e-12)[0].tolist()), unit)
-
-
-def edge_over(camera: Camera, reach_px: float) -> float:
-    """How many times as far out as its observations reach a camera's lens is asked about."""
-    return _MARGIN * max(1.0, camera.corner_radius / reach_px)
 
 
 def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
@@ -302,121 +294,3 @@ def _prior_cost(prior: Prior, phi: Array, sights: Sights, homographies: Homograp
         heights.append(float(np.mean(-np.sum(poses[:, :, 2] * poses[:, :, 3], axis=1))))
     spread = max(prior.sigma[-1], 0.01 * abs(prior.value[-1]))  # a start's height is no better than that
     return np.asarray(((np.array(heights) - prior.value[-1]) / spread) ** 2)
-
-
-@dataclass(frozen=True, eq=False)
-class LensProfile:
-    """What a lens does: the angles (n,), rad, to the axis of what it shows at radii (n,), px, as far as was seen."""
-
-    radii_px: Array
-    angles: Array
-
-    @classmethod
-    def of(cls, camera: Camera, reach_px: float) -> LensProfile:
-        """A camera's up to some radius."""
-        r, lens = _RADII * reach_px, camera.lens
-        across = {*lens.decentring, *lens.more_terms.get("tangential", ())}
-        lens = lens.with_values([0.0 if name in across else lens.coefficients[name] for name in lens.names])
-        rays = lens.undistort(np.column_stack([r, np.zeros_like(r)]), camera.phi)
-        angles = np.arctan2(rays[:, 0], rays[:, 2])
-        known = np.isfinite(angles)
-        return cls(r[known], angles[known])
-
-    @property
-    def reach_px(self) -> float:
-        return float(np.max(self.radii_px, initial=0.0))
-
-    def nearest(self, blank: Lens, phi: float, held: Container[str]) -> Lens:
-        """The lens that comes nearest to it: every model is linear in its coefficients at given radii. Fewer of them
-        where it would fold.
-
-        Args:
-            blank: with the values of the coefficients that are held.
-        """
-        r = self.radii_px
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ideal = np.where(np.cos(self.angles) > _GRAZING, phi * np.tan(self.angles), np.nan)
-        columns, right = blank.start_equations(r, ideal, self.angles, phi)
-        free = [i for i, name in enumerate(blank.names) if name in columns and name not in held]
-        ahead = np.isfinite(right)
-        right = right - sum(
-            np.nan_to_num(columns[n]) * blank.coefficients[n] for n in blank.names if n in columns and n in held
-        )
-        for count in range(len(free), 0, -1):
-            basis = np.column_stack([columns[blank.names[i]] for i in free[:count]])[ahead]
-            values = np.array(blank.values)
-            values[free[:count]] = np.linalg.lstsq(basis, right[ahead], rcond=1e-8)[0]
-            lens = blank.with_values(values)
-            if lens.monotone_radius(phi) > 1.05 * self.reach_px:
-                return lens
-        return blank
-
-
-# ---- stations and placements ----------------------------------------------------------------------------------------
-
-
-def chained_poses(
-    observations: Observations,
-    sights: Sights,
-    numbers: Indices,
-    poses: Array,
-    standing: Mapping[str, Station] | None = None,
-    open_numbers: Mapping[int, tuple[str, ...]] | None = None,
-) -> tuple[dict[str, Station], Poses]:
-    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known.
-
-    Args:
-        numbers: (K,) of these sights. standing: stations whose place is known. open_numbers: what other sights leave
-            open, by their numbers.
-
-    Raises:
-        DegenerateError: naming a sight that nothing places.
-    """
-    sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
-    order = np.argsort(-sizes[numbers], kind="stable")
-    keys, seen = [sights.keys[i] for i in numbers[order]], poses[order]
-    stations = {name: station.cam_from_world.matrix for name, station in (standing or {}).items()}
-    stations = stations or {name: np.eye(3, 4) for name in anchored_stations(observations)}
-    placements: dict[str | None, Array] = {None: np.eye(3, 4)}
-    known = -1
-    while len(stations) + len(placements) > known:
-        known = len(stations) + len(placements)
-        for key, pose in zip(keys, seen, strict=True):
-            if key.station not in stations and key.placement in placements:
-                stations[key.station] = chained(pose, inverted(placements[key.placement]))
-        fresh: dict[str | None, int] = {}
-        for row, key in enumerate(keys):
-            if key.placement not in placements and key.station in stations:
-                fresh.setdefault(key.placement, row)
-        if fresh:
-            rows = list(fresh.values())
-            world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
-            placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
-    _require_all(observations, sights, stations, placements, open_numbers or {})
-    cameras = observations.stations
-    named = [name for name in placements if name is not None]
-    return (
-        {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
-        Poses.stacked(named, np.array([placements[name] for name in named]).reshape(-1, 3, 4)),
-    )
-
-
-def _require_all(
-    observations: Observations,
-    sights: Sights,
-    stations: Container[str],
-    placements: Container[str | None],
-    open_numbers: Mapping[int, tuple[str, ...]],
-) -> None:
-    for number, key in enumerate(sights.keys):
-        if key.station in stations and key.placement in placements:
-            continue
-        sight = sights[number]
-        frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
-        names = ", ".join(open_numbers.get(number, ()))
-        what = f"its pose: {names} of the camera stay open" if names else "its pose"
-        raise DegenerateError(
-            f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(distinct(sight.track_index))} curves) cannot fix {what}: give at least four points, "
-            "not on one line, or straight lines in two directions, two of each, or remove the view"
-        )
