@@ -208,10 +208,11 @@ def turn_basis(camera: Camera, rays: Array) -> Array:
 
 def pose_basis(camera: Camera, rays: Array) -> Array:
     """(2 N, 6) the same when a plane that faces the camera, on which the rays (N, 3) end, is moved and turned."""
-    places = rays / rays[:, 2:]
-    moves = [lambda to, axis=axis: places + to * axis for axis in np.eye(3)]
-    moves += [lambda to, axis=axis: places + to * places @ skew(axis) for axis in np.eye(3)]
-    columns = [(camera.project(move(_STEP)) - camera.project(move(-_STEP))).ravel() for move in moves]
+    places, columns = rays / rays[:, 2:], []
+    for axis in np.eye(3):
+        for step in (np.broadcast_to(axis, places.shape), places @ skew(axis)):
+            ahead, behind = (camera.project(places + sign * _STEP * step) for sign in (1.0, -1.0))
+            columns.append((ahead - behind).ravel())
     return np.asarray(np.linalg.qr(np.column_stack(columns))[0])
 
 
