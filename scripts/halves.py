@@ -3,7 +3,8 @@
 Each half is calibrated by itself. What the two differ by, over the standard deviation that both together state: of the
 intrinsics (Mahalanobis length over the square root of their number) and of where rays are seen over the part of the
 image that the views fill (root mean square over a grid, the rotation that fits best taken out, for nothing says which
-way a camera frame looks). Both are 1 where the statement is honest. "By defaults" each half chooses its lens, too. Each
+way a camera frame looks; "in plane" the pose of a plane that faces the camera is taken out instead, as a board's is, or
+that of a floor). All are 1 where the statement is honest. "By defaults" each half chooses its lens, too. Each
 set stands beside its control: the same views as the calibration of the whole set sees them, with independent normal
 noise of the size that it found. Exits with 1 when a figure is missed by more than two of its standard errors; the
 folder of real sets is $CERES_CAL_REAL, or shared/real beside the repository.
@@ -41,6 +42,7 @@ LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1
 _GRID = 12  # places along the longer side of the image
 _STEP = 1e-5  # of each number's natural size
+_LEAST_AHEAD = 0.17  # cosine of the angle off the axis up to which a plane before the camera is looked at
 
 
 # ---- the sets -------------------------------------------------------------------------------------------------------
@@ -107,11 +109,12 @@ class Agreement:
     """How far two calibrations of one camera lie apart, over what they state: 1 on average where both are honest.
 
     Attributes:
-        intrinsics, projections: see the script's own words; mean squares, not yet their roots.
+        intrinsics, projections, in_plane: see the script's own words; mean squares, not yet their roots.
     """
 
     intrinsics: float
     projections: float
+    in_plane: float
 
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
@@ -134,11 +137,18 @@ def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreeme
     rays = cameras[0].rays(pixels)
     shown = np.isfinite(rays[:, 0]) & np.isfinite(cameras[1].project(rays)[:, 0])
     pixels, rays = pixels[shown], rays[shown]
-    turned = turn_basis(cameras[0], rays)
     off = (cameras[1].project(rays) - pixels).ravel()
-    off -= turned @ (turned.T @ off)
-    stated = [stated_squares(*each, rays, turned) for each in zip((first, second), cameras, strict=True)]
-    return Agreement(mahalanobis, float(np.mean(pairs(off**2) / pairs(np.sum(stated, axis=0)))))
+
+    def over_stated(shown: Mask, basis: Array) -> float:
+        left = off.reshape(-1, 2)[shown].ravel()
+        left = left - basis @ (basis.T @ left)
+        both = zip((first, second), cameras, strict=True)
+        stated = np.sum([stated_squares(*each, rays[shown], basis) for each in both], axis=0)
+        return float(np.mean(pairs(left**2) / pairs(stated)))
+
+    ahead = rays[:, 2] > _LEAST_AHEAD * np.linalg.norm(rays, axis=1)
+    turned, posed = turn_basis(cameras[0], rays), pose_basis(cameras[0], rays[ahead])
+    return Agreement(mahalanobis, over_stated(np.ones_like(ahead), turned), over_stated(ahead, posed))
 
 
 def _meaning(lens: Lens) -> tuple[object, ...]:
@@ -196,6 +206,16 @@ def turn_basis(camera: Camera, rays: Array) -> Array:
     return np.asarray(np.linalg.qr(np.column_stack([(a - b).ravel() for a, b in zip(ahead, behind, strict=True)]))[0])
 
 
+def pose_basis(camera: Camera, rays: Array) -> Array:
+    """(2 N, 6) the same when a plane that faces the camera, on which the rays (N, 3) end, is moved and turned."""
+    places, columns = rays / rays[:, 2:], []
+    for axis in np.eye(3):
+        for step in (np.broadcast_to(axis, places.shape), places @ skew(axis)):
+            ahead, behind = (camera.project(places + sign * _STEP * step) for sign in (1.0, -1.0))
+            columns.append((ahead - behind).ravel())
+    return np.asarray(np.linalg.qr(np.column_stack(columns))[0])
+
+
 # ---- the command ----------------------------------------------------------------------------------------------------
 
 
@@ -226,9 +246,11 @@ def _rows(
             failed += 1
     views = " and ".join(str(len(half.shown_views)) for half in pairs[0])
     note = f"{len(found)} splits into {views} views" + (f", {failed} without a calibration" if failed else "")
-    for what in ("intrinsics", "projections"):
+    for what in ("intrinsics", "projections", "in_plane"):
         squares = [value for one in found if np.isfinite(value := getattr(one, what))]
-        yield Row(name, f"{what}: difference over stated, rms", *root_and_error(squares), *limits, note)
+        if squares:
+            words = what.replace("_", " ")
+            yield Row(name, f"{words}: difference over stated, rms", *root_and_error(squares), *limits, note)
 
 
 _cases = {name: partial(rows, name, chosen) for name, chosen in SETS.items()}

@@ -18,8 +18,8 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance, make_structure, numbers_by_kind
 from ceres_cal.scene.targets import checkerboard
 
-DRAWN = Options(lens="radial")
-BUILT = replace(DRAWN, as_built="estimate")
+BUILT = Options(lens="radial")
+DRAWN = replace(BUILT, as_built="as drawn")
 
 
 def phi_of(calibration: Calibration) -> float:

@@ -99,7 +99,6 @@ def test_help_lists_every_command(say: Say) -> None:
     assert set(COMMANDS) == {
         "open",
         "run",
-        "open",
         "detect board",
         "detect rings",
         "detect field",

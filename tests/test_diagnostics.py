@@ -305,7 +305,8 @@ def test_points_that_count_pixels_otherwise_than_curves(shift: tuple[float, floa
     for amount, planted in zip(finding.amounts, shift, strict=True):
         assert abs(amount.value - planted) < 4.0 * amount.sd < 0.2
     assert ("half pixel" in finding.advice) == (abs(shift[1]) == 0.5)
-    assert judge_quality(quality_of(found, seen)).level != "good"
+    # 0.4 px along x alone moves places by less than a standard deviation.
+    assert (judge_quality(quality_of(found, seen)).level == "good") == (shift[1] == 0.0)
 
 
 def test_model_error_is_said_to_be_outside_of_the_covariance() -> None:

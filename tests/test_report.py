@@ -24,7 +24,7 @@ from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
-from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, worst
+from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, reaches, worst
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.material import Material
 from ceres_cal.report.quality import quality_of
@@ -209,8 +209,8 @@ def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
 def test_a_wrong_model_is_never_simply_trusted() -> None:
     observations = sample()[1]
     page = make_report(calibrate(observations, Options(powers=(3,))), observations)
-    assert headline(page).startswith("care: Use it with care, no accuracy can be stated: the model is wrong by ")
-    assert "No standard deviation on this page contains that" in page
+    assert headline(page).startswith("no: Do not trust this calibration: what is named below moves it by ")  # 69 sd
+    assert "The accuracy in the first line includes it" in page
     cards = re.findall(r'<article class="card (\w+)"><h3>(.*?)</h3>', page)
     assert cards[0][0] == "no" and "residuals follow the radius" in cards[0][1]
 
@@ -246,13 +246,30 @@ def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
     assert few is not None and few.new_data and 1000 < len(few.table) <= 5_500 < 4 * 2271
 
 
+def test_a_fault_that_moves_places_by_little_is_counted() -> None:
+    """A fault that moves places by less than their standard deviations widens what is promised."""
+    calibration, observations = sample()
+    sound = quality_of(calibration, observations)
+    assert sound.diagnosis is not None and sound.uncertainty is not None
+    key = next(key for key in sound.uncertainty.posterior.keys if key.quantity == "x")
+    sd = sound.uncertainty.posterior.sd_of(*key[:3])
+    (finding, *_) = sound.diagnosis.findings
+    for sigmas, level in ((0.05, "good"), (30.0, "no")):
+        fault = replace(finding, wrong="model", effect_mm=1.0, moves=((key, sigmas * sd),))
+        judged = replace(sound, diagnosis=replace(sound.diagnosis, findings=(fault,)))
+        assert judge_quality(judged).level == level
+        before, after = reaches(sound)[0].radius_mm, reaches(judged)[0].radius_mm
+        assert after >= np.hypot(before, 2.0) and (after > before + 1.0 if sigmas > 1.0 else after < before + 2.0)
+
+
 @pytest.mark.usefixtures("words_alone")
 def test_boards_alone_tell_no_places() -> None:
     scene, disturbance = built_in_scene("boards")
     observations = simulate(scene, disturbance, seed=1).observations
     page = make_report(calibrate(observations, RADIAL), observations)
     assert headline(page) == (
-        "good: The intrinsics can be trusted. No station sees a field: places in the world cannot be told."
+        "good: The intrinsics can be trusted, to 1.8 px of the picture that was observed. No station sees a field: "
+        "places in the world cannot be told."
     )
     assert '<figure id="map' not in page and "held as the world" in page
 

@@ -60,8 +60,8 @@ def observed(board: Board, seed: int) -> tuple[Scene, Observations]:
     return scene, replace(seen, targets={"board": drawn})
 
 
-DRAWN = Options(lens="radial")
-BUILT = replace(DRAWN, as_built="estimate")
+BUILT = Options(lens="radial")
+DRAWN = replace(BUILT, as_built="as drawn")
 
 
 def built(drawn: Target, board: Board, seed: int) -> Target:

@@ -37,6 +37,7 @@ from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.ranges import require_possible_numbers
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
@@ -155,6 +156,13 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)
+    if calibration.as_built:
+        # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone.
+        near = replace(calibration.estimate, structure=EXACT)
+        before, anew = chosen, replace(start, estimate=near)
+        chosen = choose_lens(observations, options, anew, calibration.estimate.structure)
+        if chosen.choice.chosen != before.choice.chosen:
+            calibration, chosen = chosen.first_solved(solved, papers(options), start)
     said = []
     try:
         while other := chosen.instead(*calibration.outlier_masks(observations)):

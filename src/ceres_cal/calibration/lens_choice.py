@@ -36,6 +36,7 @@ from ceres_cal.calibration.lens_seen import FewGroupsError, InlierRows
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options
+from ceres_cal.problem.structure import EXACT, Structure
 from ceres_cal.start.initialise import Start
 
 _T = TypeVar("_T")
@@ -192,11 +193,12 @@ class Comparison:
             return None
 
 
-def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
+def choose_lens(observations: Observations, options: Options, start: Start, built: Structure = EXACT) -> Chosen:
     """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
 
     Args:
         options: their lens is not looked at. start: of everything, with whatever lens.
+        built: how the targets are taken to be built.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
@@ -205,7 +207,7 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
         by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start))
     )
     try:
-        seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate)
+        seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built)
         return _among(seen, share, as_good, start, kinds).outcome
     except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
         failed = "" if isinstance(error, FewGroupsError) else str(error)

@@ -38,6 +38,7 @@ from ceres_cal.observations.thinning import thinned
 from ceres_cal.posterior.roughness import cells_of
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import problem_of
+from ceres_cal.problem.structure import EXACT, Structure
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
@@ -90,10 +91,13 @@ _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong va
 
 
 def compared_kinds(
-    observations: Observations, options: Options, start: Estimate
+    observations: Observations, options: Options, start: Estimate, built: Structure = EXACT
 ) -> tuple[InlierRows, list[Kind], float]:
     """The observations that take part, each kind near its best over them, at the noise of the one that explains the
     most, and their share of all.
+
+    Args:
+        built: how the targets are taken to be built.
 
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
@@ -101,14 +105,14 @@ def compared_kinds(
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
     few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
-    sights = gather_sights(few)
+    sights = built.built_into(gather_sights(few))
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
     tried = every
     while True:
         end, used = _solved(few, options, sights, start, tried)
-        seen = InlierRows(few, end, options)
+        seen = InlierRows(few, end, options, sights)
         compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)

@@ -15,7 +15,7 @@ from ceres_cal.calibration.lens_forms import Form
 from ceres_cal.calibration.lens_kinds import Candidate, Kind
 from ceres_cal.effects.groups import group_normals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, problem_of
@@ -56,11 +56,16 @@ def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, Le
 
 @dataclass(frozen=True, eq=False)
 class InlierRows:
-    """The inliers of a solve."""
+    """The inliers of a solve.
+
+    Attributes:
+        every: sights of all the observations.
+    """
 
     observations: Observations
     end: RobustSolution
     options: Options
+    every: Sights
 
     @property
     def sights(self) -> Sights:
@@ -89,7 +94,7 @@ class InlierRows:
         options = forms[0].of(self.options)
         estimate = seen_through(near, options, profiles_of(near, self.sights))
         try:
-            problem = problem_of(self.observations, gather_sights(self.observations), options, estimate)
+            problem = problem_of(self.observations, self.every, options, estimate)
             end = solve_robustly(problem, self.observations, estimate, most_rounds=MOST_ROUNDS)
             estimate = end.solution.estimate
             problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)

@@ -112,11 +112,12 @@ class CalibrateArguments(ReportArguments):
         repeatable=True,
         group=_CAMERA,
     )
-    as_built: bool = switch(
-        "solve for corners, bows and lines whose residuals repeat over the views, with a sigma from the data; "
-        "else targets without a tolerance are taken as drawn",
+    as_drawn: bool = switch(
+        "take targets without a tolerance as drawn (default: corners, bows and lines whose residuals repeat over the "
+        "views are solved for, with a sigma from the data)",
         group=_CAMERA,
     )
+    as_built: bool = switch("the contrary of --as-drawn, which is the default", group=_CAMERA)
     prior: tuple[str, ...] = prior_option(group=_CAMERA)
     estimate: tuple[str, ...] = estimate_option(group=_CAMERA)
     mend_labels: bool = switch(
@@ -247,7 +248,7 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
         "priors": tuple(priors),
         "dimensions": tuple(prior.dimension for prior in lengths),
         "tolerances": _tolerances(args.tolerance),
-        "as_built": "estimate" if args.as_built else "as drawn",
+        "as_built": "as drawn" if args.as_drawn and not args.as_built else "estimate",
     }
     same = {one.name for one in fields(Options)} & vars(args).keys() - parsed.keys()
     return Options(**{name: getattr(args, name) for name in same}, **parsed)

@@ -21,8 +21,10 @@ from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import Equations, plane_shift, whole_structure
+from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
 from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.structure import Kind, Structure
 
 SMALL = 0.4
@@ -108,6 +110,7 @@ class Finding:
         amounts: what would mend it.
         log10_p: decimal logarithm of the probability of a false alarm anywhere in the calibration, after Bonferroni.
         observations: how many it moves; rows: (kind, row) of the observations of a wrong label.
+        moves: by how much numbers of cameras and stations would move, were it taken into account.
     """
 
     kind: str
@@ -123,6 +126,7 @@ class Finding:
     log10_p: float
     observations: int
     rows: tuple[tuple[str, int], ...] = ()
+    moves: tuple[tuple[Key, float], ...] = ()
 
     @property
     def is_model_error(self) -> bool:
@@ -183,6 +187,12 @@ class Case:
         twice = np.where(self.equations.is_curve, 1.0, 2.0)  # both equations of a point carry its whole shift in mm
         squared = np.nansum(((x**2 + y**2) / twice)[rows])
         return Displacement(float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count)
+
+    def moves(self, score: ScoreTest) -> tuple[tuple[Key, float], ...]:
+        """By how much numbers of cameras and stations move where a group of an effect is at its amounts."""
+        keys = free_keys(self.estimate, self.problem.layout, self.problem.private)
+        moved = zip(keys, (self.model.taken_by(score.columns) @ score.amount).tolist(), strict=True)
+        return tuple((key, by) for key, by in moved if key.kind in ("camera", "station"))
 
     def noise_px(self, left_over: Array, rows: Mask) -> float:
         """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
@@ -293,5 +303,5 @@ class Effect(ABC):
             sentence += f"; these data cannot tell it from {names}"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
-            selection.log10_p(score.log_p), effect.observations,
+            selection.log10_p(score.log_p), effect.observations, moves=case.moves(score),
         )  # fmt: skip

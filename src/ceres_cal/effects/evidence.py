@@ -160,9 +160,10 @@ class RandomEffects:
 
     def amounts(self, root: Array, scatter: float = 0.0) -> tuple[Array, Array]:
         """(Z,) likeliest amounts of a root (Q, Z), best linear unbiased predictions, and (Z,) standard deviations."""
-        _, normal, slope = self._precisions(self.modes(root)[None], np.array([scatter]))
-        covariance = np.linalg.inv(np.eye(root.shape[1]) + normal[0, 0])
-        return -covariance @ slope[0, 0], np.sqrt(np.diagonal(covariance))
+        modes = self.modes(root)
+        weighted = modes / (1.0 + scatter**2 * self.size)[:, None]
+        covariance = np.linalg.inv(np.eye(root.shape[1]) + weighted.T @ modes)
+        return -covariance @ (weighted.T @ self.value), np.sqrt(np.diagonal(covariance))
 
     def _precisions(self, modes: Array, scatter: Array) -> tuple[Array, Array, Array]:
         """(T, R) inverse variances of w by scatter; (H, T, Z, Z) and (H, T, Z) what they make of modes (H, R, Z)."""

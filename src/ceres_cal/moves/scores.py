@@ -52,7 +52,7 @@ def score(
     """
     observed = matched(calibration, observations)
     given = replace(options or calibration.options, lens=calibration.options.lens, tolerances={}, dimensions=())
-    sights = _as_built(observed, calibration)
+    sights = sights_as_built(observed, calibration)
     if hold_stations:
         require_stations(calibration, observed)
     known = {name: calibration.estimate.stations[name] for name in observed.stations} if hold_stations else {}
@@ -81,7 +81,7 @@ def score(
     return Agreements(answers)
 
 
-def _as_built(observations: Observations, calibration: Calibration) -> Sights:
+def sights_as_built(observations: Observations, calibration: Calibration) -> Sights:
     """The sights of targets as the calibration says that they were built."""
     sights = gather_sights(observations)
     built: Structure = make_structure(

@@ -86,8 +86,14 @@ def assess(
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
-    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say."""
+    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say.
+
+    How targets lie off their drawings bends nothing, and a board may have a thousand such numbers: they are held.
+    """
     followed = {posterior.mixtures[name].keys[0] for name in posterior.followed}
+    if not estimate.structure.dimensions:
+        followed |= {key for key in posterior.keys if key.kind == "structure"}
+        problem, estimate = problem.built_as(estimate)
     held = [key for key in posterior.keys if key not in followed]
     by_model = posterior.by_model or posterior.information
     for name in posterior.followed:

@@ -61,8 +61,8 @@ class Options:
         tolerances: target -> how far it may have been built from its drawing.
         dimensions: lengths of targets that are solved for, "target/dimension" such as "field/field_length_m": from what
             a prior says of them, or from the target as drawn. Those that a prior is about are among them.
-        as_built: of a target without a tolerance "estimate" how far it was, from what repeats over the views (what it
-            is, a calibration says in its tolerances), or take it "as drawn".
+        as_built: of a target without a tolerance "estimate" how far it was built from its drawing, where residuals
+            repeat over the views (what it is, a calibration says in its tolerances), or take it "as drawn".
         loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
             deviations; from half to double of 2.5 the squared error changes by under a tenth.
         reject_sigma: observations farther off than this many standard deviations are taken out and listed. At half of 5
@@ -90,7 +90,7 @@ class Options:
     loss_scale: float = 2.5
     reject_sigma: float = 5.0
     noise_scale: str = "estimate"
-    as_built: str = "as drawn"
+    as_built: str = "estimate"
     closed_form_only: bool = False
     max_iterations: int = 100
     threads: int = 0

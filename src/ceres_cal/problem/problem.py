@@ -16,6 +16,7 @@ from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, make_layout
 from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.quantities import free_keys, intrinsic_keys
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.lens import Lens
 
 _CONVEX = ("trivial", "huber", "soft_l1")
@@ -170,6 +171,11 @@ class Problem:
     def holding(self, camera: str, number: int) -> Problem:
         """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
         return replace(self, layout=self.layout.holding(camera, number))
+
+    def built_as(self, estimate: Estimate) -> tuple[Problem, Estimate]:
+        """The problem and the estimate of targets that are drawn as the estimate has them built."""
+        sights = estimate.structure.built_into(self.sights)
+        return replace(self, sights=sights), replace(estimate, structure=EXACT)
 
 
 def problem_of(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:

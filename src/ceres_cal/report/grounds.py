@@ -16,6 +16,7 @@ from ceres_cal.diagnostics import Finding
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.weak import Verdict
+from ceres_cal.report.faults import FaultyMap
 from ceres_cal.report.quality import Quality
 from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.heights import HEIGHTS_M
@@ -23,8 +24,13 @@ from ceres_cal.scene.heights import HEIGHTS_M
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
 care, beyond it not to be used."""
+GOOD_PX, CARE_PX = 2.0, 10.0
+"""The same of places in the picture, of a camera that sees no field: a pixel shows about 5 mm of one."""
 LARGE_NOISE = 3.0
 """Times the stated sigmas, from which on something else than noise is in it: no number of mm is promised."""
+MOVED, MOVED_FAR = 1.0, 3.0
+"""Standard deviations by which a named fault moves a result, from which on it is to be used with care, or not at all
+where more than GOOD_MM are left of it."""
 _UNJUDGED = "its residuals could not be judged"
 _MANY_OUTLIERS = 0.3
 _MOST_LINES = 6
@@ -34,6 +40,11 @@ _ORDER = ("good", "care", "no")
 def level_of(radius_mm: float) -> str:
     """By GOOD_MM and CARE_MM; nothing seen is nothing to trust."""
     return "good" if radius_mm <= GOOD_MM else "care" if radius_mm <= CARE_MM else "no"
+
+
+def level_of_px(radius_px: float) -> str:
+    """By GOOD_PX and CARE_PX; nothing observed is nothing to trust."""
+    return "good" if radius_px <= GOOD_PX else "care" if radius_px <= CARE_PX else "no"
 
 
 def worst(*levels: str) -> str:
@@ -128,7 +139,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
-    diagnosis, wrong_mm, off_mm = quality.diagnosis, model_error_mm(quality), misfit_mm(quality)
+    diagnosis, off_mm = quality.diagnosis, misfit_mm(quality)
     if diagnosis is None:
         return
     wrong = [f"{finding.kind} ({finding.subject})" for finding in diagnosis.findings if finding.is_model_error]
@@ -137,16 +148,23 @@ def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
     elif not wrong:
         yield "", f"{counted(len(diagnosis.findings), 'finding')} below; none says that the model is wrong."
     if wrong:
-        yield (
-            "no" if wrong_mm > CARE_MM else "care",
-            f"The model is wrong: {first_of(list(dict.fromkeys(wrong)), 4)}; up to {mm(wrong_mm)} rms. No standard "
-            "deviation on this page contains that.",
-        )
+        yield _of_faults(quality, first_of(list(dict.fromkeys(wrong)), 4))
     if off_mm:
         yield (
             "no" if off_mm > GOOD_MM else "care",
             f"A refit to these new data would move it by {mm(off_mm)} rms: was the camera bumped?",
         )
+
+
+def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
+    """Level and line of what is wrong with the model, by how far it moves a result."""
+    sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
+    worst_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
+    level = "" if sigmas < MOVED else "no" if sigmas >= MOVED_FAR and not worst_mm <= GOOD_MM else "care"
+    counted_in = "The accuracy in the first line includes it" if places else "They do not contain it"
+    moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
+    wrong_mm = mm(model_error_mm(quality))
+    return level, f"The model is wrong: {names}; up to {wrong_mm} rms. It moves {moved}. {counted_in}."
 
 
 def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
@@ -155,7 +173,8 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     if quality.uncertainty.widening:
         yield "", f"{sentence(quality.uncertainty.widening)}."
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
-    level = "" if quality.maps else "care"  # what they do to places is in the maps
+    # What they do to places is in the maps, and what to the picture, in what is said of it.
+    level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
     yield from ((level, f"{sentence(words)}.") for words in weak[:_MOST_LINES])
     if len(weak) > _MOST_LINES:
         yield level, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
@@ -189,14 +208,14 @@ class Reach:
 
 
 def reaches(quality: Quality) -> tuple[Reach, ...]:
-    """One for each of HEIGHTS_M; none where no station sees the world."""
+    """One for each of HEIGHTS_M, with what is named as wrong counted; none where no station sees the world."""
     if not quality.maps:
         return ()
-    radii = [worst_radius(*(maps[number] for maps in quality.maps.values())) for number in range(len(HEIGHTS_M))]
+    radii = [worst_radius(*(maps[number] for maps in quality.faulty_maps)) for number in range(len(HEIGHTS_M))]
     return tuple(Reach(height, radius, level_of(radius)) for height, radius in zip(HEIGHTS_M, radii, strict=True))
 
 
-def worst_radius(*maps: FieldMap) -> float:
+def worst_radius(*maps: FieldMap | FaultyMap) -> float:
     """The largest of their 95 % radii, mm; NaN where they show nothing."""
     radii = np.concatenate([one.radius_95_mm.ravel() for one in maps])
     shown = radii[~np.isnan(radii)]
@@ -221,9 +240,11 @@ def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple
     if quality.uncertainty is None:
         return "no", "Not to be used: nothing was minimised, this is the paper's closed form alone."
     if not every:
-        level = worst(reasons, *(level_of_verdict(verdict) for verdict in focal(quality)))
+        px = quality.observed_px
+        level = worst(reasons, level_of_px(px), *(level_of_verdict(verdict) for verdict in focal(quality)))
         how = {"good": "can be trusted", "care": "are to be used with care", "no": "cannot be trusted"}[level]
-        return level, f"The intrinsics {how}. No station sees a field: places in the world cannot be told."
+        promised = f", to {short(px)} px of the picture that was observed" if level != "no" and px <= CARE_PX else ""
+        return level, f"The intrinsics {how}{promised}. No station sees a field: places in the world cannot be told."
     if misfit_mm(quality) > GOOD_MM:
         return "no", f"It does not hold: on these new data it is off by {mm(misfit_mm(quality))} (rms)."
     floor, above = every
@@ -253,7 +274,8 @@ def _doubt(quality: Quality) -> str:
         return "what was known beforehand is contradicted"
     if noise_ratio(quality) >= LARGE_NOISE:
         return f"the noise is {short(noise_ratio(quality))} times what was stated"
-    off, wrong = misfit_mm(quality), model_error_mm(quality)
-    if off:
+    if off := misfit_mm(quality):
         return f"on these new data it is off by {mm(off)} (rms)"
-    return f"the model is wrong by {mm(wrong)} (rms)" if wrong else ""
+    if quality.fault_sigmas >= MOVED_FAR and not all(one.level == "good" for one in reaches(quality)):
+        return f"what is named below moves it by {short(quality.fault_sigmas)} of its standard deviations"
+    return ""

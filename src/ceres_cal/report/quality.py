@@ -11,13 +11,15 @@ import numpy as np
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics import Diagnosis, diagnose
+from ceres_cal.diagnostics import Diagnosis, Finding, diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.thinning import thinned
+from ceres_cal.posterior.image import ImageMap
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.seam import Disagreement
 from ceres_cal.posterior.uncertainty import Uncertainty
 from ceres_cal.posterior.weak import Verdict
+from ceres_cal.report.faults import FaultyMap, faulty_map, sigmas_of_cameras
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Target
 
@@ -95,6 +97,40 @@ class Quality:
             return {}
         return {name: tuple(self.uncertainty.map_sd_mm(name, h) for h in HEIGHTS_M) for name in self.placed}
 
+    @cached_property
+    def faults(self) -> tuple[Finding, ...]:
+        """What is wrong with the model, which no standard deviation contains."""
+        every = () if self.diagnosis is None else self.diagnosis.findings
+        return tuple(finding for finding in every if finding.is_model_error)
+
+    @cached_property
+    def faulty_maps(self) -> tuple[tuple[FaultyMap, ...], ...]:
+        """The maps with faults counted, of each placed station, at HEIGHTS_M."""
+        if self.uncertainty is None:
+            return ()
+        return tuple(
+            tuple(faulty_map(self.uncertainty, one, self.faults) for one in maps) for maps in self.maps.values()
+        )
+
+    @cached_property
+    def fault_sigmas(self) -> float:
+        """By how many standard deviations faults move places on the fields, or, without any, a camera's numbers."""
+        if self.uncertainty is None:
+            return 0.0
+        if not self.faulty_maps:
+            return sigmas_of_cameras(self.uncertainty, self.faults)
+        return max(one.sigmas for maps in self.faulty_maps for one in maps)
+
+    @cached_property
+    def observed_px(self) -> float:
+        """95 % of places in the picture are nearer, whatever the pose, at the worst place in the box around what was
+        observed; of the camera of which least is known, NaN where nothing was minimised.
+        """
+        if self.uncertainty is None:
+            return np.nan
+        every = [_of_observed(self.uncertainty.map_px(name), self.observations) for name in self.calibration.cameras]
+        return max(every, default=np.nan)
+
     def each_seam(self) -> Iterator[Seam]:
         """Of stations of different cameras that see some place both."""
         owners = self.calibration.estimate.stations
@@ -104,3 +140,17 @@ class Quality:
             maps = tuple(self.uncertainty.seam_sd_mm(*pair, height_m) for height_m in HEIGHTS_M)
             if not np.all(np.isnan(maps[0].sd_mm)):
                 yield Seam(pair, maps, self.calibration.disagreement(self.observations, *pair))
+
+
+def _of_observed(known: ImageMap, observations: Observations) -> float:
+    """The largest radius in the box around what a camera observed, px."""
+    views = np.array([view.camera == known.camera for view in observations.views])
+    seen = [one.pixels[views[one.view]] for one in (observations.points, observations.curves)]
+    pixels = np.concatenate(seen)
+    if not len(pixels):
+        return np.nan
+    (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
+    columns, rows = (known.x_px >= left) & (known.x_px <= right), (known.y_px >= top) & (known.y_px <= bottom)
+    inside = known.radius_95_px[np.ix_(rows, columns)]
+    inside = inside[~np.isnan(inside)]
+    return float(inside.max()) if len(inside) else np.nan

@@ -70,7 +70,7 @@ def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
         names = first_of([one.subject for one in own], 3)
         yield replace(
             own[0], subject=target, sentence=f"{target} is not as drawn: {names} ({px:.2f} px, {mm:.1f} mm rms)",
-            advice=f"measure it, or let `calibrate` solve for it: with --as-built, or --tolerance {target}",
+            advice=f"measure it, or let `calibrate` solve for it: without --as-drawn, or with --tolerance {target}",
             effect_px=px, effect_mm=mm, noise_ratio=ratio, amounts=(), observations=int(counts.sum()),
             log10_p=min(one.log10_p for one in own),
         )  # fmt: skip
