@@ -7,9 +7,8 @@ infinity: never 0, never a large number that is rounding alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 
@@ -81,8 +80,7 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
     return np.asarray(root @ root.T)
 
 
-@dataclass(frozen=True, eq=False)
-class Spread:
+class Spread(Struct, frozen=True, eq=False):
     """What is known of n numbers.
 
     Attributes:

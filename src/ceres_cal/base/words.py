@@ -97,7 +97,7 @@ def counted(number: int, word: str) -> str:
     return plural(number, word, grouped(number))
 
 
-def first_of(names: Sequence[str], most: int) -> str:
+def first_of(names: Sequence[str], most: int = 3) -> str:
     """At most so many names, and how many more there are."""
     more = f" and {grouped(len(names) - most)} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

@@ -62,7 +62,7 @@ def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
             return str(error), error.exit_code
         case KeyboardInterrupt():
             how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
-            return f"{how}: {f'written were {first_of(files, 3)}' if files else 'nothing was written'}", code
+            return f"{how}: {f'written were {first_of(files)}' if files else 'nothing was written'}", code
         case MemoryError():
             return "out of memory: give fewer observations or images at a time", InputError.exit_code
         case OSError():

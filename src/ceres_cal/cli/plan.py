@@ -9,7 +9,6 @@ import shlex
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +25,12 @@ _FIRST = 1000  # bytes
 _NAME = re.compile(r"[\w][\w .+-]*")
 
 
-class _Row(msgspec.Struct, forbid_unknown_fields=True):
-    name: str
-    command: str
-    arguments: str | list[str] = ""
-
-
-@dataclass(frozen=True)
-class Planned:
+class Planned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One row: a job's name, its command, and arguments as they are typed; files are named from the plan's folder."""
 
     name: str
     command: str
-    arguments: tuple[str, ...]
+    arguments: tuple[str, ...] = ()
 
 
 def read_plan(path: Path) -> tuple[Planned, ...]:
@@ -89,14 +81,15 @@ def _of_table(path: Path) -> Iterator[Planned]:
         raise InputError(f"{path}: is no text in UTF-8: {error}") from None
     read = {".jsonl": _json_lines, ".csv": _csv, ".toml": _toml}[path.suffix]
     for where, data in read(text, str(path)):
-        row = convert(data, _Row, where)
+        if isinstance(data, dict) and isinstance(data.get("arguments"), str):
+            try:
+                data["arguments"] = shlex.split(data["arguments"])
+            except ValueError as error:
+                raise InputError(f"{where}: arguments {data['arguments']!r}: {error}") from None
+        row = convert(data, Planned, where)
         if not _NAME.fullmatch(row.name):
             raise InputError(f"{where}: a job is called {row.name!r}: files have its name: letters, digits, - and _")
-        try:
-            given = shlex.split(row.arguments) if isinstance(row.arguments, str) else row.arguments
-        except ValueError as error:
-            raise InputError(f"{where}: arguments {row.arguments!r}: {error}") from None
-        yield Planned(row.name, row.command, tuple(given))
+        yield row
 
 
 def _json_lines(text: str, where: str) -> Iterator[tuple[str, Any]]:

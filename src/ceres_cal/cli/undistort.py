@@ -109,23 +109,23 @@ def _run(args: UndistortArguments) -> Document:
     from ceres_cal.base.files import write_json
 
     calibration = read_calibration(args.calibration)
-    make = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
+    make, facts, words = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
     args.output.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
     written: list[dict[str, Any]] = []
     about = args.output / f"{kind}.json"
     with progress_bar(args) as bar:
         for number, (path, output) in enumerate(outputs.items(), start=1):
-            picture, facts, line = make.picture(path)
+            picture, own, line = make(path)
             _write(output, picture)
             lines.append(f"{output}: {line}")
-            written.append({"image": str(path), "output": str(output), **facts})
+            written.append({"image": str(path), "output": str(output), **own})
             bar.update(number, len(outputs), path.name)
-    data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
+    data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **facts}
     with finishing():
         write_json(about, {**data, "pictures": written})
     said = {**data, "pictures": written, "output": str(about)}
-    return Document((Section("", [*lines, f"{about}: {make.about}"], said),))
+    return Document((Section("", [*lines, f"{about}: {words}"], said),))
 
 
 # ---- options --------------------------------------------------------------------------------------------------------
@@ -196,13 +196,8 @@ def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, st
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _PictureMaker:
-    """How each picture is made: from a path to picture, facts and a line about it; facts on all, and what they are."""
-
-    picture: Callable[[Path], tuple[Image, dict[str, Any], str]]
-    facts: Mapping[str, Any]
-    about: str
+_PictureMaker = tuple[Callable[[Path], tuple["Image", dict[str, Any], str]], Mapping[str, Any], str]
+"""How each picture is made: from a path to picture, facts and a line about it; facts on all, and what they are."""
 
 
 def _read(path: Path, camera: Camera, name: str) -> Image:
@@ -244,7 +239,7 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
         "limit_deg": straight.limit_deg,
         "black_px": straight.warp.black,
     }
-    return _PictureMaker(
+    return (
         lambda path: (straight.warp.apply(_read(path, camera, name)), {}, _straight_line(straight, args.whole)),
         facts,
         "the straight image's camera: its matrix K, no distortion" + ("" if station is None else ", its pose"),
@@ -298,9 +293,7 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
         f"{grid.size[0]} x {grid.size[1]} px of {mm_per_px:g} mm, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m "
         f"at {1e3 * grid.height_m:g} mm, {_black(grid.size, warp.black)}"
     )
-    return _PictureMaker(
-        lambda path: (warp.apply(_read(path, camera, name)), {}, line), facts, "scale and area: x right, y up"
-    )
+    return (lambda path: (warp.apply(_read(path, camera, name)), {}, line), facts, "scale and area: x right, y up")
 
 
 def _field(calibration: Calibration) -> Area:
@@ -349,4 +342,4 @@ def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMake
             line += f"; {moved[0]:.2f} px from before in the median, {moved[1]:.2f} px at most"
         return draw_overlay(image, drawn, marks), facts, line
 
-    return _PictureMaker(picture, {"camera": name, "station": station}, "what was drawn")
+    return picture, {"camera": name, "station": station}, "what was drawn"

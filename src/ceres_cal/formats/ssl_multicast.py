@@ -22,7 +22,6 @@ from ceres_cal.scene.targets import Target
 _LARGEST = 65536
 _TTL = 1  # stays in the local network
 _LOOK_S = 60.0  # longest wait at a time: select does not take any number
-_MOST_SENDERS = 3
 _IP_MULTICAST_ALL = 49  # of Linux; Python has no name for it
 
 
@@ -109,7 +108,7 @@ def received_geometry(group: Group, seconds: float) -> Heard:
             return Heard(dict(packet["geometry"]), target_of(packet["geometry"]["field"]), sender)
         except InputError as error:  # reads: "no geometry of a field within 10 s, but from 10.0.0.7:10006 ..."
             refused[sender] = str(error)
-    heard = first_of([f"from {sender} {why}" for sender, why in refused.items()], _MOST_SENDERS)
+    heard = first_of([f"from {sender} {why}" for sender, why in refused.items()])
     heard = heard or "nothing at all: is vision running, and on this network card?"
     raise InputError(f"{group.address}:{group.port}: no geometry of a field within {seconds:g} s, but {heard}")
 

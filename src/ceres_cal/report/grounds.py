@@ -6,9 +6,9 @@ What speaks for it and against it has a level each: good, care, no, or "" where 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.words import counted, first_of, mm, sentence, short
 from ceres_cal.calibration.outcome import RESTING
@@ -52,8 +52,7 @@ def worst(*levels: str) -> str:
     return max(levels, key=_ORDER.index)
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(Struct, frozen=True):
     """The verdict.
 
     Attributes:
@@ -189,8 +188,7 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
 # ---- the headline -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Reach:
+class Reach(Struct, frozen=True):
     """How well places at one height are told, over all stations.
 
     Attributes:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
@@ -26,8 +27,7 @@ from ceres_cal.scene.targets import Target
 _DIAGNOSED = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
 
 
-@dataclass(frozen=True, eq=False)
-class Seam:
+class Seam(Struct, frozen=True, eq=False):
     """What two stations disagree about: predicted at HEIGHTS_M, and measured in what both observed."""
 
     stations: tuple[str, str]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
@@ -257,8 +258,7 @@ def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> A
     return np.column_stack([part.ravel() for part in np.meshgrid(*axes)])
 
 
-@dataclass(frozen=True, eq=False)
-class OpenCvCamera:
+class OpenCvCamera(Struct, frozen=True, eq=False):
     """A camera as OpenCV's functions take it: `K, dist, rvec, tvec = camera.to_opencv()`.
 
     Attributes:

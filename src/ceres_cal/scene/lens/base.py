@@ -19,6 +19,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Mask
@@ -55,8 +56,7 @@ def unit_rays(across: Array, depth: Array | float) -> Array:
     return np.asarray(rays / np.hypot(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])[:, None])
 
 
-@dataclass(frozen=True, eq=False)
-class Roughness:
+class Roughness(Struct, frozen=True, eq=False):
     """A quadratic form of some coefficients that is small where the lens is smooth.
 
     Attributes:

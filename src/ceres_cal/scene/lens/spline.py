@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import AnyArray, Array, Mask
 from ceres_cal.base.cached import cached_property
@@ -43,8 +44,7 @@ _LOOSE_SURFACE, _LEAST_SURFACE = 1e-3, 1e-5
 _BEYOND = 1.15  # of the picture, how far a surface goes: places move by less than that
 
 
-@dataclass(frozen=True)
-class _Monomial:
+class _Monomial(Struct, frozen=True):
     """weight c q^m conj(q)^n of the complex place q, or conj(c) for c; c has its real part at `name`."""
 
     names: tuple[str, str]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
@@ -149,8 +150,7 @@ _SPLINES = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3
 _DEGREE, _WITHOUT = 3, 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
+class Surface(Struct, frozen=True, eq=False):
     """Displacements of the places of a plane.
 
     Attributes:

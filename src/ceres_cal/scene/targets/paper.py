@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 
@@ -34,8 +35,7 @@ def share_inside(distance: Array, step: Array) -> Array:
     return np.clip(distance / step + 0.5, 0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class Square:
+class Square(Struct, frozen=True):
     """A dark square by its corner of the least x and y, and its side, m."""
 
     corner_m: tuple[float, float]
@@ -43,8 +43,7 @@ class Square:
     is_dark: bool = True
 
 
-@dataclass(frozen=True)
-class Disc:
+class Disc(Struct, frozen=True):
     """A disc by its centre and radius, m; a light one lies on a dark one."""
 
     centre_m: tuple[float, float]
@@ -52,8 +51,7 @@ class Disc:
     is_dark: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Paper:
+class Paper(Struct, frozen=True, eq=False):
     """The rectangular sheet that a target is printed on.
 
     Attributes:

@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
@@ -49,8 +50,7 @@ def require_size(features: float, what: str) -> None:
         raise InputError(f"{what}: at most {MOST_FEATURES} points and curves, not {features:.3g}: split it")
 
 
-@dataclass(frozen=True)
-class Grid:
+class Grid(Struct, frozen=True):
     """Points at even distances in columns (along x) and rows (along y), listed row by row.
 
     Attributes:
@@ -189,8 +189,7 @@ def from_arguments(kind: str, make: Callable[..., Target]) -> Callable[[dict[str
     return from_spec
 
 
-@dataclass(frozen=True)
-class TargetKind:
+class TargetKind(Struct, frozen=True):
     """A kind of target: all that the package knows of it.
 
     Attributes:
