@@ -231,6 +231,7 @@ def test_a_killed_browser_and_the_keyboard(window: Browser, tmp_path: Path) -> N
         window.run("document.getElementById('view').focus()")
         for key in ("n", "n"):  # the second corner
             window.key(key, text=key)
+        assert window.run("document.getElementById('hint').textContent").startswith("Click where TopRightCorner is")
         before = window.run("page.now.model.points.TopRightCorner")
         for _ in range(3):
             window.key("ArrowRight", modifiers=8)
@@ -284,7 +285,13 @@ def test_parts_are_said_on_the_right(window: Browser, tmp_path: Path) -> None:
             (680.0, 420.0),
         )
         assert window.run("page.now.state.places.length") == 1  # the same one, again
-        for _ in range(7):
+        choose = "document.getElementById('choose')"
+        window.run(f"{choose}.value = 'CenterMark'; {choose}.dispatchEvent(new Event('change'))")
+        x, y = screen(window, "[640, 700]")  # where nothing of the model is
+        window.mouse("Pressed", x, y, button="left", buttons=1, clickCount=1)
+        window.mouse("Released", x, y, button="left", clickCount=1)
+        window.wait_for("'CenterMark' in page.now.state.points")
+        for _ in range(8):
             before = window.run("page.now.revision")
             window.run("document.getElementById('undo').click()")
             window.wait_for(f"page.now.revision > {before}")
@@ -306,4 +313,4 @@ def test_the_model_follows_within_100_ms(window: Browser, tmp_path: Path) -> Non
             drag(window, f"page.now.model.points.{name}", pixel, 20)
         latencies = window.run("page.latencies")
         assert len(latencies) > 20
-        assert np.median(latencies) <= 100.0  # measured: 13 ms, the picture drawn again included
+        assert np.median(latencies) <= 100.0  # measured: 19 ms, until the model is drawn

@@ -186,6 +186,7 @@ async function load() {
   } else view.picture = null;
 }
 function hint() {
+  if (!now) return;
   const shown = Object.keys(now.state.points).length, name = selected;
   let text = "";
   if (view.tool === "goal") text = `Click in the picture towards ${now.goal}.`;
@@ -196,12 +197,14 @@ function hint() {
   else if (name && !(name in now.state.points)) text = `Click where ${name} is, or drag it there.`;
   else if (shown < 4) text = `Drag four corners or crossings of the model to where they are: ${shown} of 4.`;
   else text = "Drag whatever is off; then find the lines.";
-  $("hint").textContent = text;
+  $("hint").textContent = $("message").hidden ? text : "";
 }
 function say(text) {
   $("goal").classList.toggle("wanted", text.includes("--facing"));
-  $("message").textContent = text;
+  // what a command's option would say is a button here
+  $("message").textContent = text.replace(/: say which, such as --facing .*$/, `. Press “Where is ${now?.goal}?” and click there.`);
   $("message").hidden = !text;
+  hint();
 }
 function tool(name) {
   view.tool = name;
@@ -223,6 +226,7 @@ $("undo").onclick = () => press("undo");
 $("redo").onclick = () => press("redo");
 $("fit").onclick = () => view.fit();
 $("residuals").onclick = () => { withResiduals = !withResiduals; $("residuals").setAttribute("aria-pressed", withResiduals); refresh(); };
+$("message").onclick = () => say("");
 $("help").onclick = () => $("keys").showModal();
 $("auto").onclick = () => press("auto");
 $("find").onclick = () => press("find");

@@ -13,6 +13,7 @@ export class Panel {
     this.act = act;
     this.height = 0;
     $("target").onchange = event => act.change({ target: event.target.value, points: {}, places: [], not_painted: [], lengths: {}, solved: [], facing: "" });
+    $("choose").onchange = event => { act.select(event.target.value); event.target.value = ""; };
     $("board-size").onchange = event => act.change({ board: event.target.value.trim() });
     const prior = () => {
       const height = parseFloat($("height").value), sd = parseFloat($("height-sd").value);
@@ -104,6 +105,11 @@ export class Panel {
     const places = now.state.places.map((one, number) => row(one.curve, `◆ ${one.curve}`, now.against[`#${number}`],
       () => this.act.change({ places: now.state.places.filter((_, other) => other !== number) }), false));
     $("clicks").replaceChildren(...points, ...places);
+    const left = (now.target?.points ?? []).filter(name => !(name in now.state.points));
+    $("choose").parentElement.hidden = !left.length;
+    if (document.activeElement !== $("choose")) {
+      $("choose").replaceChildren(element("option", { value: "", textContent: "a corner …" }), ...left.map(name => element("option", { value: name, textContent: name })));
+    }
   }
 
   known(now) {
