@@ -16,9 +16,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import CHECKS, diagnose
-from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
 from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import simulate

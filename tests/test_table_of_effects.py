@@ -14,8 +14,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.effects import estimated
-from ceres_cal.effects.estimated import ESTIMATED, rows_of
+from ceres_cal.effects import table
+from ceres_cal.effects.table import EFFECTS, rows
 from ceres_cal.observations import Observations
 from ceres_cal.problem.quantities import difference
 from ceres_cal.simulate import simulate
@@ -29,7 +29,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.amounts import amounts
+from ceres_cal.effects.effect import amounts
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 from ceres_cal.effects.evidence import SizePrior
 
@@ -57,14 +57,14 @@ EFFECTS = (Sway(),)
 
 @pytest.fixture(scope="module")
 def added(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The file, put into the folder of those that are estimated."""
-    folder = tmp_path_factory.mktemp("estimated")
+    """The file, put into the folder of the table."""
+    folder = tmp_path_factory.mktemp("table")
     (folder / "sway.py").write_text(FILE)
-    estimated.__path__.append(str(folder))
-    ESTIMATED.update(rows_of(estimated.__name__, estimated.__path__))
+    table.__path__.append(str(folder))
+    EFFECTS.update(rows())
     yield
-    estimated.__path__.remove(str(folder))
-    del ESTIMATED["sway"]
+    table.__path__.remove(str(folder))
+    del EFFECTS["sway"]
 
 
 def swaying(pixels: Array) -> Array:
@@ -102,16 +102,16 @@ def test_it_is_solved_for(calibration: Calibration, without: Calibration) -> Non
     (one,) = calibration.effects
     assert (one.kind, one.subject, one.frame) == ("sway", "overhead", None) and one.probability > 0.999
     (sway,) = one.amounts
-    assert abs(sway.value - SWAY_PX) < 4.0 * sway.sd
-    assert np.max(np.abs(off(calibration))) < 3.5 < np.max(np.abs(off(without)))
-    assert calibration.fit.points_rms_px < 0.97 * without.fit.points_rms_px
+    assert abs(sway.value - SWAY_PX) < 4.0 * sway.sd  # 1.492 +- 0.023
+    assert np.max(np.abs(off(calibration))) < 3.5 < np.max(np.abs(off(without)))  # 2.0, 5.5
+    assert calibration.fit.points_rms_px < 0.9 * without.fit.points_rms_px  # 0.41, 0.51 px
 
 
 def test_it_widens(calibration: Calibration) -> None:
     """By what is open of its amounts: the same noise before a steady camera says more."""
     steady = calibrate(simulate(scenes.overhead(boards=8), scenes.NOISE, 1).observations, RADIAL)
     sds = [one.uncertainty.posterior.sd for one in (calibration, steady)]
-    assert np.all(sds[0] > sds[1]) and np.max(sds[0] / sds[1]) > 1.1, sds[0] / sds[1]
+    assert np.all(sds[0] > sds[1]) and np.max(sds[0] / sds[1]) > 1.1
 
 
 def test_it_is_diagnosed_and_reported(calibration: Calibration, swayed: Observations, tmp_path: Path) -> None:

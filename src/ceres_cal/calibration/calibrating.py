@@ -21,9 +21,9 @@ from ceres_cal.calibration.outcome import (
     resting_phi,
     unknown_phi,
 )
-from ceres_cal.effects.amounts import AsBuilt
 from ceres_cal.effects.dependence import Scatter, measure_scatter
-from ceres_cal.effects.estimated import ESTIMATED
+from ceres_cal.effects.effect import AsBuilt
+from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -40,10 +40,10 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
+from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
 from ceres_cal.robust.usable import require_possible, require_usable
-from ceres_cal.robust.wholes import Subproblem
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
@@ -262,7 +262,7 @@ def solved_from(
     if again is None and problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
     beside = None
-    if ESTIMATED and again is None and watched.settle is None:
+    if again is None and watched.settle is None and estimated():
         from ceres_cal.robust.effects import solve_beside_effects
 
         beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)

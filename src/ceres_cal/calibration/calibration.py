@@ -25,7 +25,7 @@ from ceres_cal.calibration.file import (
     options_to_json,
 )
 from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
-from ceres_cal.effects.amounts import AsBuilt, EffectEstimate
+from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.files import PosteriorFile

@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PixelOrigin, Units, convert
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
-from ceres_cal.effects.amounts import AsBuilt, EffectEstimate
+from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.posterior.files import PosteriorFile, information_from, lower_triangle, require_keys
 from ceres_cal.problem.information import Key

@@ -52,7 +52,7 @@ def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
 
 
 @dataclass(frozen=True, eq=False)
-class _MovedRows:
+class _GroupedRows:
     """The equations in use that an effect moves, by group of it.
 
     Attributes:
@@ -64,7 +64,7 @@ class _MovedRows:
     columns: Array
 
     @classmethod
-    def of(cls, model: Linearised, effect: EffectColumns) -> _MovedRows:
+    def of(cls, model: Linearised, effect: EffectColumns) -> _GroupedRows:
         """By an effect."""
         inside = np.flatnonzero((effect.group >= 0) & model.used)
         rows = inside[np.argsort(effect.group[inside], kind="stable")]
@@ -125,7 +125,7 @@ class EffectSums:
         directions: how many shared directions of the model X is beyond.
     """
 
-    moved: _MovedRows
+    moved: _GroupedRows
     sizes: Array
     normals: Array
     scores: Array
@@ -134,7 +134,7 @@ class EffectSums:
     @classmethod
     def of(cls, model: Linearised, effect: EffectColumns) -> EffectSums:
         """Of an effect."""
-        moved = _MovedRows.of(model, effect)
+        moved = _GroupedRows.of(model, effect)
         sums = moved.products(np.column_stack([moved.columns, model.placed_score[moved.rows]]))
         normals, scores = sums[:, :, :-1], sums[:, :, -1]
         sizes = np.diagonal(normals, axis1=1, axis2=2)

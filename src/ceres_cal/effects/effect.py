@@ -1,12 +1,12 @@
 """What an effect is: something that may displace the observations, its columns over the equations and its words.
 
-What is found of it: the cause by name, how large, how sure.
+What is found of it: the cause by name, how large, how sure; and what is solved for, targets as built and other effects.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -15,7 +15,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
-from ceres_cal.effects.amounts import Amount
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
@@ -24,11 +23,72 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import Equations, plane_shift, whole_structure
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.structure import Structure
+from ceres_cal.problem.structure import Kind, Structure
 
 SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
 Wrong = Literal["model", "calibration", "observations"]
+
+
+@dataclass(frozen=True)
+class Amount:
+    """One number that would mend it: its name, value, standard deviation and unit ("mm", "deg", "px", "")."""
+
+    name: str
+    value: float
+    sd: float
+    unit: str
+
+
+def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
+    """Several numbers of one unit."""
+    return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
+
+
+@dataclass(frozen=True)
+class AsBuilt:
+    """By how much the features of one kind lie off a target's drawing.
+
+    Attributes:
+        target, kind: "lines", "points" or "warp". sigma_m: the standard deviation that their offsets were solved for
+            under. probability: that they are off at all. rms_m: of the offsets.
+    """
+
+    target: str
+    kind: Kind
+    sigma_m: float
+    probability: float
+    rms_m: float = 0.0
+
+    @property
+    def words(self) -> str:
+        """What it says, without the target."""
+        amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
+        return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
+
+
+@dataclass(frozen=True)
+class EffectEstimate:
+    """A group of an effect that was solved for.
+
+    Attributes:
+        kind, subject, frame: which, as a `Finding` has them. sigma: the standard deviation of its amounts, in their
+            own unit, that they were solved for under. probability: that there is such an effect.
+        sentence: what it is, in words. amounts: what was taken off the observations.
+    """
+
+    kind: str
+    subject: str
+    frame: str | None
+    sigma: float
+    probability: float
+    sentence: str
+    amounts: tuple[Amount, ...]
+
+    @property
+    def warning(self) -> str:
+        """What somebody must know who uses the calibration."""
+        return f"{self.sentence}; it was solved for"
 
 
 @dataclass(frozen=True)
@@ -184,14 +244,15 @@ class Effect(ABC):
         kind: its name. wrong: what is where it is found, see `Finding`. absorbed: whether its displacement is what the
             calibration's free numbers could not have taken up of it.
         built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
-        prior: what is expected of its amounts, in their own unit, of one whose size is estimated.
+        prior: what is expected of its amounts, in their own unit, of one whose size `calibrate` estimates: it solves
+            for it where it is likely, and states no number better than with it in doubt.
     """
 
     kind: ClassVar[str]
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
     built: ClassVar[str] = ""
-    prior: ClassVar[SizePrior]
+    prior: ClassVar[SizePrior | None] = None
 
     @abstractmethod
     def columns(self, case: Case) -> Iterator[EffectColumns]:

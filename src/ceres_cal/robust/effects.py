@@ -1,8 +1,8 @@
-"""Effects of the table that `calibrate` solves for: their sizes, their best amounts, and by how much they widen.
+"""Effects that `calibrate` solves for: their sizes, their best amounts, and by how much they widen.
 
 Such an effect displaces the observations by amounts that are the same in all views. Its size is read off the residuals
-(`effects.sizes`); where it is likelier that there is one than not, its best amounts are taken off the observations and
-everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
+(`effects.evidence`); where it is likelier that there is one than not, its best amounts are taken off the observations
+and everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
 without the effect as far as it is probable, go into the covariance; an effect that is in doubt, but not solved for,
 does with all of its amounts.
 """
@@ -16,13 +16,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
-from ceres_cal.effects.amounts import EffectEstimate
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
-from ceres_cal.effects.effect import Case, Effect
-from ceres_cal.effects.estimated import ESTIMATED
+from ceres_cal.effects.effect import Case, Effect, EffectEstimate
+from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
-from ceres_cal.effects.sizes import LIKELY, RepeatedAmounts
+from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.information import Key
@@ -80,7 +79,7 @@ def solve_beside_effects(
 
 
 @dataclass(frozen=True, eq=False)
-class _Group:
+class _EffectGroup:
     """A group of an effect, and which amounts are its own."""
 
     effect: Effect
@@ -101,7 +100,7 @@ class _Amounts:
     case: Case
     repeated: RepeatedAmounts
     taken: Array
-    groups: Sequence[_Group]
+    groups: Sequence[_EffectGroup]
     sizes: Sequence[tuple[float, float]]
 
     @classmethod
@@ -115,20 +114,21 @@ class _Amounts:
         weights = equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
         model = make_linear_model(problem, estimate, equations, weights)
         case = Case(observations, problem, estimate, model)
-        groups, parts, size = list[_Group](), list[SparseColumns](), 0
-        for effect in ESTIMATED.values():
+        groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
+        for effect in estimated():
             for columns in effect.columns(case):
                 width, count = columns.columns.shape[1], len(columns.subjects)
                 scaled = columns.columns * model.weight[:, None]
                 parts.append(SparseColumns.of_groups(model, scaled, columns.group, count))
                 for number in range(count):
                     own = size + width * number + np.arange(width)
-                    groups.append(_Group(effect, columns, number, own))
+                    groups.append(_EffectGroup(effect, columns, number, own))
                 size += parts[-1].size
         every = SparseColumns.side_by_side(parts, len(equations))
         repeated = RepeatedAmounts.of(model, every)
         numbers = {number: group.own for number, group in enumerate(groups)}
-        sizes = repeated.sizes(numbers, {number: group.effect.prior for number, group in enumerate(groups)})
+        priors = {number: group.effect.prior for number, group in enumerate(groups) if group.effect.prior is not None}
+        sizes = repeated.sizes(numbers, priors)
         taken = -model.root @ every.in_shared(model)
         return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers])
 
@@ -153,7 +153,7 @@ class _Amounts:
         moved, sd = amounts - before._best[0], np.sqrt(np.diagonal(covariance))
         return self.likely == before.likely and bool(np.all(np.abs(moved) <= _AT_REST * sd))
 
-    def _shift(self, group: _Group) -> Array:
+    def _shift(self, group: _EffectGroup) -> Array:
         """(E,) px by which a group's best amounts move the model."""
         return np.asarray(group.columns.of(group.number) @ self._best[0][group.own])
 
@@ -180,19 +180,11 @@ class _Amounts:
     def shifts(self) -> Iterator[Array]:
         """(K,) each, see `EffectsEnd`."""
         amounts, covariance = self._best
-        yield from _roots(self.taken, covariance)
+        yield from shifts_by(self.taken, covariance)
         for number, group in enumerate(self.groups):
             (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
             if probability > LIKELY:
                 yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
             elif probability > _NEGLIGIBLE:
                 alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))
-                yield from np.sqrt(probability) * np.array([taken @ alone, *_roots(taken, open_)])
-
-
-def _roots(taken: Array, covariance: Array) -> Iterator[Array]:
-    """(K,) shifts by each direction of a covariance (Q, Q) that is not nothing."""
-    values, vectors = np.linalg.eigh(covariance)
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value > 0.0:
-            yield np.sqrt(value) * taken @ vector
+                yield from np.sqrt(probability) * shifts_by(taken, open_ + np.outer(alone, alone))

@@ -1,14 +1,26 @@
-"""The table of effects: every module of this folder adds its rows, in its EFFECTS, beside those that are estimated."""
+"""The table of effects: every module of this folder adds its rows, in its EFFECTS."""
 
 from __future__ import annotations
 
-from collections import ChainMap
+from importlib import import_module
+from pkgutil import iter_modules
 
 from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.effect import Case
-from ceres_cal.effects.estimated import ESTIMATED, rows_of
+from ceres_cal.effects.effect import Case, Effect
 
-EFFECTS = ChainMap(rows_of(__name__, __path__), ESTIMATED)
+
+def rows() -> dict[str, Effect]:
+    """The effects of every module of the folder, by kind."""
+    modules = (import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__))
+    return {effect.kind: effect for module in modules for effect in module.EFFECTS}
+
+
+EFFECTS = rows()
+
+
+def estimated() -> list[Effect]:
+    """Those that `calibrate` solves for, and widens by."""
+    return [effect for effect in EFFECTS.values() if effect.prior is not None]
 
 
 def columns_of_all(case: Case) -> list[EffectColumns]:

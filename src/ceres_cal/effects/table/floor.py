@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
 
 _CELL_M = 1.0  # side of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
 # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted. Nothing

@@ -10,9 +10,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, numbers_of
 from ceres_cal.base.transforms import skew
-from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
 
 
 class _PoseTest(Effect):

@@ -9,9 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.words import first_of
-from ceres_cal.effects.amounts import amounts
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words
+from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.problem.structure import WARP
 from ceres_cal.scene.targets import Arc, Segment
 
