@@ -214,7 +214,7 @@ void fit_saddles(const Array<const float, N, N>& levels, const Read<N, Saddles::
     require(starts.shape(0) == fitted.shape(0), "starts and fitted are of as many corners");
     unlocked([&] {
         Saddles saddles({levels.data(), static_cast<int64_t>(levels.shape(0)), static_cast<int64_t>(levels.shape(1))});
-        for (size_t k = 0; k < starts.shape(0); ++k) saddles.fit(row(starts, k), row(fitted, k));
+        for (int64_t k = 0; k < static_cast<int64_t>(starts.shape(0)); ++k) saddles.fit(row(starts, k), row(fitted, k));
     });
 }
 

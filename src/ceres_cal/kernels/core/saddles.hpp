@@ -69,7 +69,7 @@ class Saddles {
     }
 
   private:
-    enum Place { X, Y, ANGLE, SHARP = 4, MEAN, MEAN_X, MEAN_Y, CONTRAST, CONTRAST_X, CONTRAST_Y, LEFT };
+    enum Place : uint8_t { X, Y, ANGLE, SHARP = 4, MEAN, MEAN_X, MEAN_Y, CONTRAST, CONTRAST_X, CONTRAST_Y, LEFT };
     static constexpr int STRIDE = SIZE + 4;
     static constexpr double FARTHEST_PX = 1e3, NO_CORNER = std::numeric_limits<double>::quiet_NaN();
 
@@ -107,7 +107,7 @@ class Saddles {
         return add_up(now);
     }
 
-    double at(int row, int column) const { return normal_[static_cast<size_t>(STRIDE * row + column)]; }
+    double at(int row, int column) const { return normal_.data()[STRIDE * row + column]; }
 
     // The equations of what is left at `now`; the answer is its square.
     double add_up(const double* now) {
@@ -120,7 +120,7 @@ class Saddles {
             differentiate(start, n, now);
             find_products(own, SIZE + 1, (n + LANES - 1) / LANES * LANES, products_);
             for (int k = 0; k <= SIZE; ++k)
-                for (int j = 0; j <= k; ++j) normal_[static_cast<size_t>(STRIDE * k + j)] += products_[STRIDE * k + j];
+                for (int j = 0; j <= k; ++j) normal_.data()[STRIDE * k + j] += products_[STRIDE * k + j];
         }
         return at(LEFT, LEFT);
     }
