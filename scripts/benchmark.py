@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from benchmarks.lenses import lens_rows
 from benchmarks.peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, reset_peak, solve_warm
+from benchmarks.photographs import field_rows, field_summary, photograph_rows
 from benchmarks.problems import (
     HEIGHT_M,
     OVERHEAD,
@@ -317,6 +318,30 @@ PROCESS = {
     "opencv_processor": ("OpenCV CPU s", ".3f"),
     "times_processor": ("ratio", ".2f"),
 }
+PHOTOGRAPHS = {
+    "set": ("photographs of a board", ""),
+    "ours": ("ours s", ".2f"),
+    "plain": ("OpenCV s", ".2f"),
+    "times_plain": ("ratio", ".2f"),
+    "accurate": ("its SB s", ".2f"),
+    "times_accurate": ("ratio", ".2f"),
+    "ours_processor": ("ours CPU s", ".2f"),
+    "times_plain_processor": ("ratio", ".2f"),
+    "times_accurate_processor": ("to SB", ".2f"),
+    "commands": ("two commands s", ".2f"),
+    "ours_boards": ("boards", "d"),
+    "plain_boards": ("OpenCV", "d"),
+    "accurate_boards": ("SB", "d"),
+    "ours_rms_px": ("rms px", ".3f"),
+    "plain_rms_px": ("OpenCV", ".3f"),
+    "accurate_rms_px": ("SB", ".3f"),
+}
+FIELDS = {
+    "fields": ("detect field --auto", ""),
+    "photographs": ("photographs", "d"),
+    "median": ("median CPU s", ".2f"),
+    "worst": ("worst", ".2f"),
+}
 SCALE = {
     "size": ("line points", "d"),
     "workers": ("workers", "d"),
@@ -474,6 +499,15 @@ def measure_processes(repeat: int) -> dict[str, Any]:
     return {"environment": environment(), "process": rows}
 
 
+def measure_photographs(repeat: int, fields: bool) -> dict[str, Any]:
+    """From photographs of boards to a calibration beside OpenCV, and fields, printed."""
+    rows = photograph_rows(repeat)
+    print_table(f"from photographs to a calibration, whole processes, median of {repeat} turns", PHOTOGRAPHS, rows)
+    found = field_rows() if fields else []
+    print_table("fields, a command for each photograph", FIELDS, field_summary(found))
+    return {"environment": environment(), "boards": rows, "fields": found}
+
+
 def measure_lenses(chosen: argparse.Namespace) -> dict[str, Any]:
     """A lens by its name beside another one and beside the choice of it, printed."""
     rows = lens_rows(chosen.frames, chosen.repeat, chosen.warm_up)
@@ -538,6 +572,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--scale-frames", type=numbers, default="1e3,1e4,1e5", help="in --scale: %(default)s")
     parser.add_argument("--workers", type=numbers, default="0,1,2", help="of Dask in --scale, 0 is none: %(default)s")
     parser.add_argument("--process", action="store_true", help="whole processes in turns, and no more")
+    parser.add_argument(
+        "--photographs", action="store_true", help="from photographs to a calibration beside OpenCV, and no more"
+    )
+    parser.add_argument("--no-fields", action="store_true", help="with --photographs: boards alone")
     parser.add_argument("--lenses", action="store_true", help="spline and auto beside a lens by name, and no more")
     parser.add_argument("--alone", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args(arguments)
@@ -550,6 +588,8 @@ def main(arguments: Sequence[str]) -> int:
         chosen.warm_up = 0.0
     if chosen.scale:
         report = measure_scale(chosen)
+    elif chosen.photographs:
+        report = measure_photographs(chosen.repeat, not chosen.no_fields)
     elif chosen.lenses:
         report = measure_lenses(chosen)
     else:

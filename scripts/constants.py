@@ -30,7 +30,8 @@ class Constant:
     """A constant that decides something.
 
     Attributes:
-        module: below `ceres_cal`. name: there; "Class.field" for a default of a dataclass. figures: what it may touch.
+        module: below `ceres_cal`. name: there; "Class.field" for a default of a dataclass,
+            "PRIOR.field" for a prior. figures: what it may touch.
     """
 
     module: str
@@ -45,7 +46,10 @@ class Constant:
         owner = importlib.import_module(f"ceres_cal.{self.module}")
         if "." in self.name:
             cls, field = self.name.split(".")
-            value: Value = inspect.signature(getattr(owner, cls)).parameters[field].default
+            of = getattr(owner, cls)
+            value: Value = (
+                inspect.signature(of).parameters[field].default if inspect.isclass(of) else getattr(of, field)
+            )
         else:
             value = getattr(owner, self.name)
         return value
@@ -55,6 +59,9 @@ class Constant:
         owner, old = importlib.import_module(f"ceres_cal.{self.module}"), self.value
         if "." in self.name:
             cls, field = self.name.split(".")
+            if not inspect.isclass(getattr(owner, cls)):
+                object.__setattr__(getattr(owner, cls), field, value)
+                return
             make = getattr(owner, cls).__init__
             names = [name for name, one in inspect.signature(make).parameters.items() if one.default is not one.empty]
             defaults = list(make.__defaults__)
@@ -94,11 +101,14 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.poses", "_LOST _FEWEST", "calibrate"),
     *_of("robust.poses", "_DECIDED_SIGMA _SAME _MUCH_WORSE", "calibrate"),
     *_of("robust.competing", "_STANDS_OUT", "calibrate"),
-    *_of("robust.wholes", "_LEFT", "calibrate"),
+    *_of("robust.groups", "_LEFT", "calibrate"),
     *_of("robust.competing", "DOUBTFUL", "calibrate"),
-    *_of("effects.offsets", "_FAULTY_FEATURE _FAULTY_VIEW _INDEPENDENT", "calibrate"),
-    *_of("robust.repeats", "_REPEATS _AS_DRAWN _LIKELY", "calibrate", "diagnose"),
-    *_of("robust.wholes", "FEWEST", "calibrate"),
+    *_of("effects.evidence", "FEATURE_ASIDE.absent VIEW_ASIDE.absent OFFSETS_SCATTER.absent", "calibrate"),
+    *_of("effects.evidence", "DEPENDENCE.absent", "verdicts"),
+    *_of("robust.as_built", "_REPEATS", "calibrate", "diagnose"),
+    *_of("effects.evidence", "AS_BUILT.absent", "calibrate", "diagnose"),
+    *_of("effects.evidence", "LIKELY", "calibrate"),
+    *_of("robust.groups", "FEWEST", "calibrate"),
     *_of("problem.bundle", "_POSED", "calibrate"),
     *_of("problem.costs", "_LEFT_TO_THE_COMPLEMENT", "calibrate"),
     *_of("start.initialise", "USUAL_PHI", "calibrate", "verdicts"),
@@ -112,7 +122,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("diagnostics.advice.ranking", "_MUST_LEAVE _LARGER _LESS", "advice"),
     *_of("diagnostics.advice.candidates", "_MARKED", "advice"),
     *_of("effects.effect", "SMALL", "diagnose"),
-    *_of("diagnostics.leftover", "LARGER _FEWEST_PAIRS", "diagnose"),
+    *_of("diagnostics.checks", "LARGER _FEWEST_PAIRS", "diagnose"),
     *_of("effects.score_tests", "_LEAST_SHARE", "diagnose"),
     *_of("effects.table.target", "_FEWEST_ON_CURVE _FEWEST_OF_POINT", "diagnose"),
     *_of("diagnostics.diagnose", "_FEWEST_AGREE _FAR_M", "diagnose"),

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -85,13 +86,13 @@ class Browser:
             first, _, self._rest = self._rest.partition(b"\0")
             yield json.loads(first)
 
-    def open(self, page: Path, width: int, height: int = 900) -> None:
-        """Show a page in a window of so many CSS pixels."""
+    def open(self, page: Path | str, width: int, height: int = 900) -> None:
+        """Show a page, a file or an address, in a window of so many CSS pixels."""
         self.events.clear()
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
-        self.call("Page.navigate", url=page.as_uri())
+        self.call("Page.navigate", url=page if isinstance(page, str) else page.as_uri())
         self.run("new Promise(done => document.readyState == 'complete' ? done() : addEventListener('load', done))")
 
     def run(self, script: str) -> Any:
@@ -99,6 +100,27 @@ class Browser:
         answer = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
+
+    def wait_for(self, condition: str, seconds: float = 60.0) -> None:
+        """Until an expression in the page is true."""
+        end = time.monotonic() + seconds
+        while not self.run(f"Boolean({condition})"):
+            assert time.monotonic() < end, f"{condition} did not come true; {self.complaints}"
+            time.sleep(0.03)
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """An event of the mouse: "Moved", "Pressed", "Released" or "Wheel"."""
+        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **more)
+
+    def key(self, key: str, **more: Any) -> None:
+        """A key pressed and let go; `text`: what it writes, `modifiers`: 1 Alt, 2 Ctrl, 8 Shift."""
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, **more)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, **{n: v for n, v in more.items() if n != "text"})
+
+    def kill(self) -> None:
+        """As a crash or a user would."""
+        self._process.kill()
+        self._process.wait()
 
     @property
     def complaints(self) -> list[str]:

@@ -211,10 +211,10 @@ def _noise(calibration: Calibration) -> float:
 
 
 def test_the_map_is_off_by_what_was_promised() -> None:
-    """Beyond what is stated: what it is off by in fact, where phi was open before; 16 runs, 18 % of chance."""
+    """Beyond what is stated: what it is off by in fact, where phi was open before; 8 runs, 25 % of chance."""
     problem, kept = PROBLEMS["whole field, 3 deg"](), Kept()
     tape = first_of(advised("whole field, 3 deg"))["tape"].measurement
-    for seed in range(16):
+    for seed in range(8):
         calibration = calibrated("whole field, 3 deg", seed)
         (promise,) = promised(calibration, [tape], None, 0.15)
         kept.add(
@@ -225,8 +225,8 @@ def test_the_map_is_off_by_what_was_promised() -> None:
     figures = {row.what.split(": ")[1]: row.value for row in kept.rows("", "tape")}
     assert figures["worst stated"] == pytest.approx(1.0, abs=0.04)  # 1.022
     assert figures["mean stated"] == pytest.approx(1.0, abs=0.04)
-    assert figures["worst in fact"] == pytest.approx(1.0, abs=0.4)
-    assert figures["mean in fact"] == pytest.approx(1.0, abs=0.4)
+    assert figures["worst in fact"] == pytest.approx(1.0, abs=0.5)
+    assert figures["mean in fact"] == pytest.approx(1.0, abs=0.5)
     assert figures["in the range"] == 1.0
 
 

@@ -13,9 +13,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
+from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance, make_structure, numbers_by_kind
-from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.scene.targets import checkerboard
 
 BUILT = Options(lens="radial")

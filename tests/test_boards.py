@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import AnyArray, Array, Image8
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.threads import at_most
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect import boards
 from ceres_cal.detect.boards import BoardDetections, detect_boards, right_handed
@@ -317,6 +318,16 @@ def test_a_mirrored_grid_is_turned_over(truth: Array) -> None:
     assert np.array_equal(right_handed(grid[:, ::-1]), grid)
     assert np.array_equal(right_handed(grid[::-1]), grid[::-1, ::-1])
     assert np.array_equal(right_handed(grid.transpose(1, 0, 2)), grid.transpose(1, 0, 2)[:, ::-1])
+
+
+def test_pictures_side_by_side_are_measured_as_one_by_one(tmp_path: Path, picture: Array) -> None:
+    images = [write(tmp_path / f"{seed}.png", photograph(picture, seed=seed)) for seed in range(5)]
+    with at_most(3):
+        together = detect_boards(images, BOARD).observations
+    with at_most(1):
+        alone = detect_boards(images, BOARD).observations
+    assert np.array_equal(together.points.pixels, alone.points.pixels)
+    assert np.array_equal(together.points.sigma_px, alone.points.sigma_px)
 
 
 def test_views_stations_and_placements(tmp_path: Path, picture: Array) -> None:

@@ -17,15 +17,15 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.effects.evidence import RandomEffects
-from ceres_cal.effects.offsets import Offsets, fault_of
+from ceres_cal.effects.evidence import VIEW_ASIDE, RandomEffects
+from ceres_cal.effects.offsets import Offsets
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference
 from ceres_cal.robust import competing
-from ceres_cal.robust import wholes as looked_at
+from ceres_cal.robust import groups as compared
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Segment
@@ -129,15 +129,15 @@ def test_of_very_many_observations_a_part_is_asked_and_all_of_a_whole_is_taken_o
 ) -> None:
     observations = moved_aside(simulate(half_field(24), NOISE, 4).observations, "HalfwayLine", 4.0, frame)
     of_all = calibrate(observations, RADIAL)
-    monkeypatch.setattr(looked_at, "_MOST_ASKED", 1_000)
-    monkeypatch.setattr(looked_at, "_FEWEST_ASKED", 4)
-    parts: list[looked_at.Subproblem] = []
+    monkeypatch.setattr(compared, "_MOST_ASKED", 1_000)
+    monkeypatch.setattr(compared, "_FEWEST_ASKED", 4)
+    parts: list[compared.Subproblem] = []
 
-    def spied(every: looked_at.Subproblem) -> looked_at.Subproblem:
-        parts.append(looked_at.asked(every))
+    def spied(every: compared.Subproblem) -> compared.Subproblem:
+        parts.append(compared.compared_part(every))
         return parts[0]
 
-    monkeypatch.setattr(competing, "asked", spied)
+    monkeypatch.setattr(competing, "compared_part", spied)
     of_some = calibrate(observations, RADIAL)
     assert len(parts[0].observations.curves) < 0.9 * len(observations.curves)
     where = "all 24 frames" if frame is None else f"frame {frame!r}"
@@ -255,7 +255,7 @@ def offsets(values: Array) -> Offsets:
     size = np.full(len(values), 20.0)
     effects = RandomEffects(size, values, np.eye(len(values)), 200.0, 200 + len(values))
     modes = np.sqrt(20.0) * np.eye(len(values))[:, :, None]
-    return Offsets(effects, modes, fault_of(features=False))
+    return Offsets(effects, modes, VIEW_ASIDE)
 
 
 @pytest.mark.parametrize(("scatter", "is_wrong"), [(1.0, True), (5.0, False), (25.0, False)])
@@ -322,7 +322,11 @@ def test_features_of_different_targets_are_different_wholes() -> None:
     observations = simulate(every, NOISE, seed=0).observations
     target = np.array([view.target for view in observations.views])
     owner = target[np.concatenate([observations.points.view, observations.curves.view])]
-    kinds = [one for one in looked_at.wholes_of(observations, gather_sights(observations)) if one.of_features]
+    kinds = [
+        one
+        for one in compared.groups_of(observations, gather_sights(observations))
+        if isinstance(one, compared.FeatureGroups)
+    ]
     assert len(kinds) == 2
     for wholes in kinds:
         assert all(len(set(owner[wholes.of == number])) == 1 for number in set(wholes.of.tolist()) - {-1})

@@ -62,10 +62,10 @@ def test_a_constant_is_set_where_it_is_read() -> None:
     """Where it is defined, where it was imported to, and as the default of a dataclass; in a process of its own."""
     code = (
         "from constants import Constant; from ceres_cal.problem.parameters import Options; "
-        "import ceres_cal.effects.table.radius as radius; "
+        "import ceres_cal.effects.table.lens as lens_rows; "
         "Constant('problem.parameters', 'Options.reject_sigma', ()).set(7.0); "
         "Constant('effects.effect', 'SMALL', ()).set(0.8); "
-        "print(Options().reject_sigma, Options().loss_scale, radius.SMALL)"
+        "print(Options().reject_sigma, Options().loss_scale, lens_rows.SMALL)"
     )
     folder = Path(__file__).parents[1] / "scripts"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=folder)

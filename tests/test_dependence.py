@@ -20,8 +20,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
 from ceres_cal.effects.groups import _averaged, _expected
 from ceres_cal.effects.likelihood import likelihoods
-from ceres_cal.effects.sample import _shown
-from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of
+from ceres_cal.effects.strands import Strand, StrandFamily, _shown, decay, distances_of
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights

@@ -399,7 +399,7 @@ def test_two_coefficients_are_too_few_for_the_wide_camera_and_three_enough(gopro
     assert radius["two"] is not None and "too short" in radius["two"].sentence and "r^7" in radius["two"].sentence
     assert "let k3 free" in radius["two"].advice
     assert radius["three"] is None or radius["three"].effect_px < 0.5 * radius["two"].effect_px
-    choice = choose(seen, three)
+    choice = choose(seen, three, 2)
     by_label = {one.label: one for one in choice.candidates}
     short, enough = by_label["brown k1 k2"], by_label["brown k1 k2 k3"]
     best = choice.candidates[choice.chosen]

@@ -1,12 +1,38 @@
 """One evidence of random effects, against the dense Gaussian likelihood that it stands for."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
+from accuracy.diagnostic_scenes import NOISE, overhead
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.effects.evidence import RandomEffects, agreement, likeliest_sizes, logsum
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.effects.columns import EffectColumns, EffectSums, SparseColumns, grouped
+from ceres_cal.effects.effect import Case
+from ceres_cal.effects.evidence import (
+    FEATURE_ASIDE,
+    OFFSETS_SCATTER,
+    RandomEffects,
+    SizePrior,
+    agreement,
+    likeliest_sizes,
+    logsum,
+)
+from ceres_cal.effects.likelihood import likelihoods
+from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
+from ceres_cal.effects.offsets import measure_offsets
+from ceres_cal.effects.score_tests import score_all
+from ceres_cal.effects.strands import decay, distances_of, families_of, views_or_placements
+from ceres_cal.effects.table import EFFECTS
+from ceres_cal.observations import Observations
+from ceres_cal.problem.equations import write_equations
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.simulate import simulate
 
 SEEDS = st.integers(0, 10_000)
 
@@ -22,17 +48,24 @@ def drawn(seed: int, equations: int = 30, free: int = 4, numbers: int = 5) -> tu
     )
 
 
-def restricted(left: Array, columns: Array, residuals: Array, covariance: Array, freedom: int | None) -> float:
-    """Logarithm of the restricted likelihood, written down: the density of what the free numbers leave."""
+def basis_of(left: Array) -> Array:
+    """(E, E - free) orthonormal, of what a projector leaves."""
     values, vectors = np.linalg.eigh(left)
-    basis = vectors[:, values > 0.5]  # (E, E - free) orthonormal
+    return np.asarray(vectors[:, values > 0.5])
+
+
+def restricted(
+    left: Array, columns: Array, residuals: Array, covariance: Array, freedom: int | None, basis: Array | None = None
+) -> float:
+    """Logarithm of the restricted likelihood, written down: the density of what the free numbers leave."""
+    basis = basis_of(left) if basis is None else basis
     whole = np.eye(basis.shape[1]) + basis.T @ columns @ covariance @ columns.T @ basis
     squares = float(basis.T @ residuals @ np.linalg.solve(whole, basis.T @ residuals))
     fit = -0.5 * squares if freedom is None else -0.5 * freedom * np.log(squares / freedom)
     return float(fit - 0.5 * np.linalg.slogdet(whole)[1])
 
 
-def effects(left: Array, columns: Array, residuals: Array, known_noise: bool) -> RandomEffects:
+def effects_of(left: Array, columns: Array, residuals: Array, known_noise: bool) -> RandomEffects:
     slope = columns.T @ left @ residuals
     found = RandomEffects.of(columns.T @ left @ columns, slope, 1e-12)
     rest = float(residuals @ left @ residuals - found.value @ found.value)
@@ -44,7 +77,7 @@ def test_evidence_is_the_restricted_likelihood(seed: int, known_noise: bool, sca
     """Differences between hypotheses, as constants are left out."""
     left, columns, residuals = drawn(seed)
     root = size * np.random.default_rng(seed + 1).standard_normal((5, 2))
-    found = effects(left, columns, residuals, known_noise)
+    found = effects_of(left, columns, residuals, known_noise)
     roots = np.stack([np.zeros((5, 2)), root])
     logs = found.log_evidence(found.modes(roots), np.array([0.0, scatter]))
     freedom = None if known_noise else 26
@@ -59,7 +92,7 @@ def test_evidence_is_the_restricted_likelihood(seed: int, known_noise: bool, sca
 def test_amounts_are_the_posterior_mean_and_standard_deviation(seed: int, scatter: float) -> None:
     left, columns, residuals = drawn(seed)
     root = np.random.default_rng(seed + 1).standard_normal((5, 2))
-    mean, sd = effects(left, columns, residuals, True).amounts(root, scatter)
+    mean, sd = effects_of(left, columns, residuals, True).amounts(root, scatter)
     values, vectors = np.linalg.eigh(left)
     basis = vectors[:, values > 0.5]
     along = basis.T @ columns
@@ -100,3 +133,133 @@ def test_agreement_is_of_different_groups_alone() -> None:
 
 def test_sum_of_logarithms_far_below_zero() -> None:
     assert logsum(np.array([[-1000.0, -1000.0], [-3.0, -np.inf]])) == pytest.approx([-1000.0 + np.log(2.0), -3.0])
+
+
+# ---- one evidence for all effects -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A calibration's linear model, and the same written down: what the free numbers leave (E, E), and residuals."""
+
+    model: Linearised
+    case: Case
+    left: Array
+    residuals: Array
+    basis: Array
+
+    def log(self, columns: Array, covariance: Array) -> float:
+        """Restricted likelihood of amounts of columns (E, Q), in standard deviations, with a covariance."""
+        return restricted(self.left, columns, self.residuals, covariance, self.model.spare, self.basis)
+
+
+def linearised(observations: Observations) -> Seen:
+    options = Options(lens="radial", usual_camera=False, loss="trivial", noise_scale="stated")
+    calibration = calibrate(observations, options)
+    problem, estimate = calibration.problem(observations), calibration.estimate
+    there = residuals(observations, problem.sights, estimate)
+    equations = write_equations(observations, problem.sights, estimate, there)
+    model = make_linear_model(
+        problem, estimate, equations, equation_weights(observations, Weighting(loss="trivial"), equations, there)
+    )
+    taken = [model.private * (equations.sight == sight)[:, None] for sight in range(len(equations.bounds) - 1)]
+    values, basis = np.linalg.eigh(sum(part @ part.T for part in (*taken, model.shared)))
+    left = np.eye(len(equations)) - basis[:, values > 0.5] @ basis[:, values > 0.5].T
+    return Seen(model, Case(observations, problem, estimate, model), left, model.score, basis_of(left))
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    """Lines and points of a field, and two boards."""
+    observations = simulate(overhead(frames=1, boards=2), NOISE, 3).observations
+    points, curves = (np.arange(len(rows)) % 3 == 0 for rows in (observations.points, observations.curves))
+    return linearised(observations.part(points, curves))
+
+
+def test_a_line_aside(seen: Seen) -> None:
+    """Log odds of each line, with every size of its offset and of the scatter of all written down."""
+    model, equations = seen.model, seen.model.equations
+    _, group = grouped(equations.view * 100 + equations.feature, equations.is_curve)
+    few = np.where(group < 5, group, -1)
+    columns = EffectColumns("feature aside", np.ones((len(equations), 1)), few, tuple("abcde"))
+    offsets = measure_offsets(model, columns, FEATURE_ASIDE)
+    lines = (few[:, None] == np.arange(5)).astype(float)
+
+    def log(wrong: Array, sizes: tuple[float, ...]) -> float:
+        each = [
+            seen.log(lines, tau**2 * np.eye(5) + size**2 * np.diag(wrong)) + np.log(probability / len(sizes))
+            for size in sizes
+            for tau, probability in zip(OFFSETS_SCATTER.scatter, OFFSETS_SCATTER.probabilities, strict=True)
+        ]
+        return float(logsum(np.array(each)))
+
+    none, odds = offsets.log_evidence(), offsets.log_evidence_with_each()
+    for line in range(5):
+        wanted = log(np.eye(5)[line], FEATURE_ASIDE.sizes) - log(np.zeros(5), (0.0,)) + np.log(0.05 / 5)
+        assert odds[line] - none == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_bent_board(seen: Seen) -> None:
+    """How probable its bows are, and how large."""
+    model, prior = seen.model, SizePrior(0.5, (1e-4, 3e-4, 1e-3))
+    columns = (seen.model.equations.built[:, 2:4] * model.weight[:, None]) * ~model.equations.is_curve[:, None]
+    bows = SparseColumns.of_groups(model, columns, np.zeros(len(columns), dtype=np.int64), 1)
+    normal, slope = bows.left_of(model)
+    effects = RandomEffects.of(normal, slope, 0.0)
+    rest = float(model.left_over @ model.left_over - effects.value @ effects.value)
+    sigma, probability = replace(effects, rest=rest, freedom=model.spare).scatter_under(prior)
+    logs = np.array([seen.log(columns, size**2 * np.eye(2)) for size in prior.scatter])
+    weight = prior.probabilities * np.exp(logs - logs.max())
+    assert probability == pytest.approx(1.0 - weight[0] / weight.sum(), abs=1e-9)
+    assert sigma == pytest.approx(np.sqrt(weight[1:] @ prior.scatter[1:] ** 2 / weight[1:].sum()), rel=1e-9)
+
+
+def test_a_rough_lens(seen: Seen) -> None:
+    """The likeliest size of waves along the radius is where the same likelihood, of known noise, is largest."""
+    offsets = seen.case.offsets("overhead")
+    radius = np.linalg.norm(offsets, axis=1)
+    outward = np.sum(seen.model.equations.direction * offsets, axis=1) / radius
+    waves = outward[:, None] * np.cos(np.pi * np.arange(4, 64) * radius[:, None]) * seen.model.weight[:, None]
+    rough = seen.model.score + waves @ np.random.default_rng(0).normal(0.0, 0.3, 60)
+    slope, normal = waves.T @ seen.left @ rough, waves.T @ seen.left @ waves
+    found = likeliest_sizes(normal, slope, [np.eye(60)], np.array([1.0]), np.array([1e-3]), 1e-6)
+
+    def log(sigma: float) -> float:
+        return restricted(seen.left, waves, rough, sigma**2 * np.eye(60), None, seen.basis)
+
+    assert log(float(found.sigmas[0])) > max(log(0.85 * found.sigmas[0]), log(1.15 * found.sigmas[0]))
+
+
+def test_correlated_errors() -> None:
+    """Errors along curves are an effect on every row, whose covariance falls off with the distance."""
+    observations = simulate(overhead(frames=1, boards=0), NOISE, 3).observations
+    half = np.arange(len(observations.curves)) % 2 == 0
+    seen = linearised(observations.part(np.zeros(len(observations.points), bool), half))
+    model, every = replace(seen.model, step=np.zeros(len(seen.model.step))), np.eye(len(seen.residuals))
+    family = families_of(model, views_or_placements(model.equations), True)[0]
+    at = likelihoods([family], False, float(np.sum(model.shared**2)))
+    none = seen.log(every, 0.0 * every)
+    for place in np.flatnonzero(np.isfinite(at.log))[1::5]:
+        together = 0.0 * every
+        for strand in family.strands:
+            correlation = decay(distances_of(strand.places), at.length_m[place], False)
+            together[np.ix_(strand.rows, strand.rows)] = at.share[place] * (correlation - np.eye(len(strand.rows)))
+        assert at.log[place] - at.log[0] == pytest.approx(seen.log(every, together) - none, abs=1e-6)
+
+
+def test_the_probability_of_a_diagnostic(seen: Seen) -> None:
+    """A score test asks the amounts of the largest likelihood: those under a size without bounds."""
+    for effect in (EFFECTS["skew"], EFFECTS["decentring"], EFFECTS["curve aside"]):
+        (columns,) = effect.columns(seen.case)
+        for score in score_all(seen.model, [EffectSums.of(seen.model, columns)])[:4]:
+            own = score.columns[:, np.any(score.columns != 0.0, axis=0)] * seen.model.weight[:, None]
+            one = RandomEffects.of(
+                *SparseColumns.of_groups(seen.model, own, np.zeros(len(own), dtype=np.int64), 1).left_of(seen.model),
+                0.0,
+            )
+            best = 1e9 * one.amounts(1e9 * np.eye(own.shape[1]))[0]
+            np.testing.assert_allclose(score.amount[: len(best)], best, rtol=1e-4)
+            after = seen.left @ (seen.residuals + own @ best)
+            before = seen.left @ seen.residuals
+            variance = after @ after / (seen.model.spare - own.shape[1])
+            assert score.statistic == pytest.approx((before @ before - after @ after) / variance, rel=1e-6)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "src" / "ceres_cal"
 SAID = re.compile(r'# (reads: "[^"]{3,}"|quiet: .{10,})')
-MOST = 72  # there are so many; one more needs one less elsewhere
+MOST = 67  # there are so many; one more needs one less elsewhere
 GOES_ON = (ast.Return, ast.Continue, ast.Break)
 
 

@@ -31,7 +31,8 @@ FLOORS = {
     "diagnostics": 9,
     "detect": 10,
     "report": 11,
-    "cli": 12,
+    "page": 12,
+    "cli": 13,
 }
 
 # Library: who may import it, at the top or inside a function.
@@ -43,6 +44,7 @@ DOORS = {
     "google": {"formats"},  # protobuf
     "yaml": {"formats"},
     "distributed": {"cli"},
+    "aiohttp": {"cli", "page"},
     "scipy": set(),  # for the tests only
 }
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyceres
 import pytest
 import scenes
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
@@ -797,3 +797,53 @@ def test_a_fisheye_sees_behind_itself() -> None:
     points = rays(np.deg2rad(130.0), -np.deg2rad(100.0))
     seen = with_points(take(looked_at("brown")[1], points=slice(0, 2)), places=points, pixels=np.zeros((2, 2)))
     assert np.max(np.abs(point_residuals(camera, seen) - camera.project(points))) < 1e-10
+
+
+# ---- saddles --------------------------------------------------------------------------------------------------------
+
+
+def saddle_levels(numbers: Array, bends: Array, size: tuple[int, int]) -> Array:
+    """The picture of the model in `detect.saddles`, by its formula."""
+    dy, dx = np.indices(size) - numbers[1::-1, None, None]
+    steps = []
+    for angle, bend in zip(numbers[2:4], bends, strict=True):
+        along, across = np.cos(angle) * dx + np.sin(angle) * dy, np.cos(angle) * dy - np.sin(angle) * dx
+        steps.append(np.tanh(numbers[4] * (across - 0.5 * bend * along**2)))
+    mean, contrast = (numbers[k] + numbers[k + 1] * dx + numbers[k + 2] * dy for k in (5, 8))
+    return np.asarray(mean + contrast * steps[0] * steps[1])
+
+
+@settings(max_examples=30)
+@given(
+    place=st.tuples(st.floats(18.0, 22.0), st.floats(18.0, 22.0)),
+    turn=st.floats(-3.0, 3.0),
+    sharp=st.floats(0.3, 2.0),
+    slopes=st.tuples(*[st.floats(-1.0, 1.0)] * 4),
+)
+def test_a_saddle_is_found_again(
+    place: tuple[float, float], turn: float, sharp: float, slopes: tuple[float, float, float, float]
+) -> None:
+    numbers = np.array([*place, turn, turn + 1.4, sharp, 120.0, *slopes[:2], 60.0, *slopes[2:]])
+    bends = np.array([1e-3, -2e-3])
+    levels = saddle_levels(numbers, bends, (40, 44)).astype(np.float32)
+    start, fitted = np.array([[20.0, 20.0, turn + 0.1, turn + 1.3, *bends, 14.0]]), np.empty((1, 14))
+    kernels.fit_saddles(levels, start, fitted)
+    assert fitted[0, :11] == pytest.approx(numbers, abs=1e-3)  # 3e-5, of float32's rounding
+    assert fitted[0, 11] < 2e-3  # 1e-4 where the last step is the longest
+
+
+def test_the_scatter_of_saddles_is_what_noise_makes_of_them() -> None:
+    numbers, rng = np.array([20.3, 19.8, 0.3, 1.8, 0.7, 120.0, 0.0, 0.0, 60.0, 0.0, 0.0]), np.random.default_rng(4)
+    picture, start = saddle_levels(numbers, np.zeros(2), (40, 40)), np.array([[20.0, 20.0, 0.3, 1.8, 0.0, 0.0, 12.0]])
+    found = np.empty((300, 14))
+    for own in found:
+        kernels.fit_saddles((picture + rng.standard_normal(picture.shape)).astype(np.float32), start, own[None])
+    assert np.std(found[:, :2], axis=0) == pytest.approx(np.mean(found[:, 12:], axis=0), rel=0.15)  # 4 % expected
+    assert np.mean(found[:, 11]) == pytest.approx(1.0, abs=0.05)  # 11 of 450 freedoms are taken
+
+
+def test_no_saddle_is_looked_for_outside_of_a_picture() -> None:
+    starts = np.array([[x, 5.0, 0.0, 1.5, 0.0, 0.0, radius] for x, radius in ((-3, 5), (np.nan, 5), (5, 1e300))])
+    fitted = np.zeros((3, 14))
+    kernels.fit_saddles(np.ones((10, 10), np.float32), starts, fitted)
+    assert np.isnan(fitted).all()

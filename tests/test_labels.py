@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.labels import mended, renamings
+from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
@@ -39,12 +39,17 @@ def renamed(observations: Observations, kind: str, names: dict[str, str]) -> Obs
         ("curve", "HalfwayLine", "CenterLine"),
         ("curve", "BottomTouchLine", "RightGoalLine"),
         ("point", "CenterMark", "TopRightCorner"),
+        ("curve", "LeftFieldRightPenaltyStretch", "RightFieldLeftPenaltyStretch"),  # on one line
+        ("curve", "LeftFieldLeftPenaltyStretch", "RightFieldLeftPenaltyStretch"),  # each taken out as a whole
     ],
 )
 def test_exchanged_names_are_found_and_mended(right: Observations, kind: str, first: str, second: str) -> None:
     wrong = renamed(right, kind, {first: second, second: first})
     found = tuple(renamings(wrong, calibrate(wrong, Options(lens="radial"))))
-    assert {(one.kind, one.name, one.right) for one in found} == {(kind, first, second), (kind, second, first)}
+    seen = set(getattr(wrong, f"{kind}s").feature.tolist())
+    index = getattr(wrong.targets["field"], f"{kind}_index")
+    exchanged = {(kind, a, b) for a, b in ((first, second), (second, first)) if index[a] in seen}
+    assert exchanged and {(one.kind, one.name, one.right) for one in found} == exchanged
     again = mended(wrong, found)
     assert np.array_equal(again.points.feature, right.points.feature)
     assert np.array_equal(again.curves.feature, right.curves.feature)

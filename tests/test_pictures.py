@@ -27,7 +27,7 @@ from ceres_cal.problem.structure import Tolerance, make_structure
 from ceres_cal.report.pictures.files import jpeg_of_at_most
 from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of, photographs_by_frame
 from ceres_cal.report.pictures.model import model_seen
-from ceres_cal.report.pictures.overlay import AFTER, BEFORE, Layer, Marks, draw_overlay
+from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay
 from ceres_cal.report.pictures.straight import Straight, straighten
 from ceres_cal.report.pictures.top_view import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
@@ -304,7 +304,7 @@ def test_drawing_touches_what_it_should(shot: script.Shot) -> None:
     photograph = np.full((960, 1280, 3), 90, np.uint8)
     estimate = true_estimate(shot)
     model = model_seen(estimate, {"field": shot.target}, "overhead", [("field", None)])
-    drawn = draw_overlay(photograph, [Layer(model, "mod\u00e8le", AFTER)])
+    drawn = draw_overlay(photograph, [Layer(model, "mod\u00e8le", "after")])
     assert np.all(photograph == 90)  # not into the original
     changed = np.argwhere(np.any(drawn[:800] != 90, axis=2))[:, ::-1]  # the legend is below
     lines = np.concatenate([p for line in model.lines for p in (line.edges or (line.middle,))])
@@ -313,14 +313,14 @@ def test_drawing_touches_what_it_should(shot: script.Shot) -> None:
     assert len(changed) > 2000 and max(away) < 8.0  # half a step along a line, or a cross's arm
     place = np.array([[640.0, 300.0]])
     for crosses in (False, True):
-        marked = draw_overlay(photograph[..., 0], [], [Marks(place, "observed", BEFORE, crosses)])
+        marked = draw_overlay(photograph[..., 0], [], [Marks(place, "observed", "before", crosses)])
         assert marked.shape == (960, 1280, 3)
         found = np.argwhere(np.any(marked[:800] != 90, axis=2))[:, ::-1]
         assert len(found) >= 4 and np.mean(found, axis=0) == pytest.approx(place[0], abs=0.1)
     deep = draw_overlay((photograph.astype(np.uint16) * 256), [])
     assert deep.dtype == np.uint8
     far = np.array([[1e12, 0.0], [np.nan, np.nan], [np.inf, 3.0]])
-    assert np.all(draw_overlay(photograph, [], [Marks(far, "", BEFORE), Marks(far, "", BEFORE, True)])[:800] == 90)
+    assert np.all(draw_overlay(photograph, [], [Marks(far, "", "before"), Marks(far, "", "before", True)])[:800] == 90)
 
 
 def true_estimate(shot: script.Shot) -> Estimate:

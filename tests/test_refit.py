@@ -147,13 +147,13 @@ def test_the_new_posterior_is_data_and_prior(calibration: Calibration, observati
 
 
 def test_moves_are_picked_up() -> None:
-    rows = {row.what: row for row in moves_case(40)}
+    rows = {row.what: row for row in moves_case(15)}
     assert rows["share within 5 sigma of the truth"].value == 1.0  # 1.0 of 1000
     assert rows["farther off, not refused"].value == 0
 
 
 def test_few_observations_reach_the_bound() -> None:
-    rows = list(bound_case(12))
+    rows = list(bound_case(8))
     for row in rows[:2]:
         assert row.value < 1.1 + 2.0 * row.error  # 0.99 +- 0.02 of 200 runs
     assert rows[2].value > 3.0  # 4.5 of 200 runs

@@ -552,6 +552,12 @@ def crowded() -> Scene:
     return SCENES["brown/several-stations"]()
 
 
+@cache
+def crowded_page() -> str:
+    observations = simulate(crowded(), Disturbance(0.3, 0.3), seed=3).observations
+    return make_report(calibrate(observations, Options(lens="brown")), observations)
+
+
 @pytest.mark.parametrize("width", [1280, 400])
 @pytest.mark.parametrize("name", ["sample", "frontal", "two-cameras", "stations"])
 def test_nothing_is_cut_off_and_nothing_complains(window: Browser, tmp_path: Path, name: str, width: int) -> None:
@@ -562,8 +568,7 @@ def test_nothing_is_cut_off_and_nothing_complains(window: Browser, tmp_path: Pat
     elif name == "two-cameras":
         page = two_cameras_page()
     else:
-        observations = simulate(crowded(), Disturbance(0.3, 0.3), seed=3).observations
-        page = make_report(calibrate(observations, Options(lens="brown")), observations)
+        page = crowded_page()
     file = tmp_path / "page.html"
     file.write_text(page, encoding="utf-8")
     window.open(file, width)

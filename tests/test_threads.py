@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ceres_cal.base.threads import at_most, meanwhile, parts_of, run_parts
+from ceres_cal.base.threads import at_most, in_turn, meanwhile, parts_of, run_parts
 
 
 @given(
@@ -44,3 +44,25 @@ def test_meanwhile_is_another_thread_and_brings_what_it_raises() -> None:
     assert meanwhile(threading.get_ident).result() != threading.get_ident()
     with pytest.raises(ZeroDivisionError):
         meanwhile(lambda: 1 // 0).result()
+
+
+@given(count=st.integers(0, 30), threads=st.integers(1, 4))
+def test_items_come_in_their_order(count: int, threads: int) -> None:
+    with at_most(threads):
+        assert list(in_turn(lambda item: item**2, range(count))) == [item**2 for item in range(count)]
+
+
+def test_two_items_are_at_work_at_once_and_the_rest_ends_with_an_error() -> None:
+    both, seen = threading.Barrier(2), []
+
+    def work(item: int) -> int:
+        seen.append(item)
+        if item < 2:
+            both.wait(10.0)  # breaks where they come one after the other
+        if item == 1:
+            raise ValueError("the second")
+        return item
+
+    with at_most(2), pytest.raises(ValueError, match="the second"):
+        list(in_turn(work, range(1000)))
+    assert len(seen) < 10

@@ -261,12 +261,10 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 
 @pytest.mark.parametrize(
     "name, runs",
-    [("tilt 25 deg", 60), ("tilt 3 deg", 30), ("tilt 1 deg", 60), ("tilt 1 deg, height", 60), ("boards", 60)],
+    [("tilt 25 deg", 20), ("tilt 3 deg", 30), ("tilt 1 deg", 20), ("tilt 1 deg, height", 20), ("boards", 20)],
 )
 def test_intervals_hold_what_they_say(name: str, runs: int) -> None:
-    """Four standard errors around 0.95; accuracy/intervals.py has 500 runs of each, 0.943 to 0.964 measured. (25
-    degrees: 0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
-    """
+    """Four standard errors around 0.95, by few runs; accuracy/intervals.py has 500 of each, 0.943 to 0.964 measured."""
     found, wider = cover(CASES[name], range(runs)), np.sqrt(60.0 / runs)
     assert found.failed == 0
     mean, error = share(found.parameters)
@@ -277,7 +275,7 @@ def test_intervals_hold_what_they_say(name: str, runs: int) -> None:
     if found.points and np.mean(np.concatenate(found.open[0.15])) < 0.01:
         assert share(found.points[0.15])[0] == pytest.approx(0.95, abs=0.06 * wider)
     if found.placements:
-        assert share(found.placements)[0] == pytest.approx(0.95, abs=0.04)
+        assert share(found.placements)[0] == pytest.approx(0.95, abs=0.04 * wider)
     assert np.mean(found.verdicts) >= 0.9  # 0.92 at 1 degree, 1.0 elsewhere
 
 

@@ -4,8 +4,8 @@
 line and the circle (and the centre line), a quarter's over lines of its corner, 30 points on each, with and without a
 height. "drawn": 2 to 8 features of a field before a camera whose phi is known or not. Counted are refusals of scenes
 that a rank by finite differences of the exact scene calls solvable, and calibrations of which a number that is called
-"known" is over 5 standard deviations off. "labels": two lines of a field under each other's names. Exits with 1 where
-there are any.
+"known" is over 5 standard deviations off. "labels": two points or two curves of one of ten fields under each other's
+names. Exits with 1 where there are any.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.labels import mended, renamings
+from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, nearest_on_curve
 from ceres_cal.scene.lens import Brown, Radial
-from ceres_cal.scene.targets import ssl_field
+from ceres_cal.scene.targets import ssl_field, targets_by_name
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
 
 _FIELD = ssl_field("A")
@@ -71,26 +71,29 @@ def labels(runs: int) -> Iterator[Row]:
 
 
 def _exchanged(seed: int) -> bool:
-    """Whether two exchanged curves of a field are found to be, and nothing else is."""
+    """Whether two exchanged points or curves of a field are found to be, and nothing else is."""
     rng = np.random.default_rng([seed, 24])
+    fields = targets_by_name()
+    field = fields[list(fields)[seed % len(fields)]]
+    size = 0.1 * float(np.ptp(field.point_array, axis=0).max())  # of a tenth of it
     camera = Camera(_SIZE, rng.uniform(500.0, 700.0), (639.5, 511.5), Radial((rng.uniform(-6e-5, 0.0), 5e-7)))
-    x, y, height = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(5.0, 6.5)
+    x, y, height = size * rng.uniform(-1.0, 1.0), size * rng.uniform(-1.0, 1.0), size * rng.uniform(5.0, 6.5)
     pose = overhead_pose(x, y, height, rng.uniform(-15.0, 15.0), rng.uniform(-15.0, 15.0))
-    field = ssl_field("AB"[seed % 2])
-    scene = field_scene(field, {"c": camera}, {"c": Station("c", pose)})
+    scene = field_scene(field, {"c": camera}, {"c": Station("c", pose)}, spacing_m=0.02 * size)
     right = _thinned(simulate(scene, Disturbance(_NOISE_PX, _NOISE_PX), seed).observations)
-    straight = [f for f in np.unique(right.curves.feature) if not field.is_arc[f]]
-    first, second = rng.permutation(straight)[:2]
-    feature = right.curves.feature.copy()
-    feature[right.curves.feature == first], feature[right.curves.feature == second] = second, first
-    wrong = replace(right, curves=replace(right.curves, feature=feature))
+    kind = "points" if rng.random() < len(field.points) / (len(field.points) + len(field.curves)) else "curves"
+    columns = getattr(right, kind)
+    first, second = rng.permutation(np.unique(columns.feature))[:2]
+    feature = columns.feature.copy()
+    feature[columns.feature == first], feature[columns.feature == second] = second, first
+    wrong = replace(right, **{kind: replace(columns, feature=feature)})
     try:
         calibration = calibrate(wrong, Options(lens="radial"))
     except CalibrationError:
         return False
-    return bool(
-        np.array_equal(mended(wrong, tuple(renamings(wrong, calibration))).curves.feature, right.curves.feature)
-    )
+    again = mended(wrong, tuple(renamings(wrong, calibration)))
+    found = getattr(again, kind).feature, again.points.feature, again.curves.feature
+    return all(map(np.array_equal, found, (columns.feature, right.points.feature, right.curves.feature)))
 
 
 def _rows(case: str, found: Sequence[Outcome]) -> Iterator[Row]:

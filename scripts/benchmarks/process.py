@@ -39,20 +39,30 @@ cv2.calibrateCamera(objects, images, tuple(size.tolist()), None, None)
 
 @dataclass(frozen=True)
 class Spent:
-    """Seconds of one process, and of processor time in all its threads."""
+    """Seconds of one process, and of processor time in all its threads; and its exit code."""
 
     wall: float
     processor: float
+    code: int = 0
 
 
-def spent(command: Sequence[str]) -> Spent:
-    """Of one run, which must succeed; Python keeps its compiled modules, as an installed package has them."""
+def command_of(*arguments: str) -> list[str]:
+    """The command line of `ceres-cal`."""
+    return [sys.executable, "-c", _OURS, *arguments]
+
+
+def spent(command: Sequence[str], codes: Sequence[int] = (0,)) -> Spent:
+    """Of one run, which must end with one of the codes; Python keeps its compiled modules, as an installed package has
+    them.
+    """
     variables = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     before, start = os.times(), time.perf_counter()
-    subprocess.run(command, env=variables, stdout=subprocess.DEVNULL, check=True)
+    done = subprocess.run(command, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)
+    if done.returncode not in codes:
+        raise subprocess.CalledProcessError(done.returncode, command, stderr=done.stderr)
     wall, after = time.perf_counter() - start, os.times()
     processor = after.children_user - before.children_user + after.children_system - before.children_system
-    return Spent(wall, processor)
+    return Spent(wall, processor, done.returncode)
 
 
 def process_rows(repeat: int) -> list[dict[str, Any]]:
@@ -74,7 +84,7 @@ def process_rows(repeat: int) -> list[dict[str, Any]]:
 
 def _commands(path: Path, corners: Path, *options: str) -> tuple[list[str], list[str]]:
     calibrate = ["calibrate", str(path), "--quiet", "--output", str(path.with_suffix(".out.json")), *options]
-    return [sys.executable, "-c", _OURS, *calibrate], [sys.executable, "-c", _OPENCV, str(corners)]
+    return command_of(*calibrate), [sys.executable, "-c", _OPENCV, str(corners)]
 
 
 def _save(path: Path, views: Any, places: Any, pixels: Any, size: Any) -> None:

@@ -7,7 +7,7 @@ import math
 import warnings
 import zipfile
 from collections.abc import Mapping
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import numpy as np
 
@@ -18,11 +18,8 @@ from ceres_cal.base.files import require_room
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
-class Column(NamedTuple):
-    """What a column must be: its type, and its lengths; a letter stands for one and the same length in all columns."""
-
-    dtype: Any
-    shape: tuple[int | str, ...]
+Column = tuple[Any, tuple[int | str, ...]]
+"""What a column must be: its type, and its lengths; a letter stands for one and the same length in all columns."""
 
 
 def read_npz(content: bytes, columns: Mapping[str, Column], where: str) -> dict[str, AnyArray]:
@@ -103,18 +100,18 @@ def require_columns(arrays: Mapping[str, AnyArray], columns: Mapping[str, Column
 
 
 def _require_type(name: str, dtype: Any, shape: tuple[int, ...], column: Column, where: str) -> None:
-    wanted = np.dtype(column.dtype)
+    wanted, lengths = np.dtype(column[0]), column[1]
     same = dtype.kind == "U" if wanted.kind == "U" else dtype == wanted
-    if not same or len(shape) != len(column.shape) or dtype.itemsize == 0:
+    if not same or len(shape) != len(lengths) or dtype.itemsize == 0:
         kind = "text" if wanted.kind == "U" else wanted
         raise InputError(
-            f"{where}: column {name} must be {kind} in {len(column.shape)} dimensions, not {dtype} in {len(shape)}"
+            f"{where}: column {name} must be {kind} in {len(lengths)} dimensions, not {dtype} in {len(shape)}"
         )
 
 
 def _require_fitting(arrays: Mapping[str, AnyArray], columns: Mapping[str, Column], where: str) -> None:
     lengths: dict[int | str, int] = {}
-    for name, column in columns.items():
-        for wanted, length in zip(column.shape, arrays[name].shape, strict=True):
+    for name, (_, shape) in columns.items():
+        for wanted, length in zip(shape, arrays[name].shape, strict=True):
             if (lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted) != length:
                 raise InputError(f"{where}: column {name} has a shape, {arrays[name].shape}, that does not fit others")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
+
+_T = TypeVar("_T")
 
 
 class CalibrationError(Exception):
@@ -50,3 +53,12 @@ def naming(where: object) -> Iterator[None]:
         text = str(error)
         begins_with_it = text.startswith((f"{where}: ", f"{where}.", f"{where}/"))
         raise InputError(text if begins_with_it else f"{where}: {text}") from None
+
+
+def answer_or_reason(work: Callable[[], _T]) -> tuple[_T | None, str]:
+    """What work returns, or None and the line that says why there is nothing; for whoever goes on after any failure."""
+    try:
+        return work(), ""
+    except Exception as error:  # reads: "field.json: cannot be written: ..." on the page
+        foreseen = isinstance(error, CalibrationError)
+        return None, str(error) if foreseen else f"unexpected {type(error).__name__}: {error}: please report it"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -21,6 +22,7 @@ _LATER_US = 100.0  # that another thread begins after this one
 _MOST = 8
 _allowed: ContextVar[int] = ContextVar("allowed", default=0)
 _T = TypeVar("_T")
+_Item = TypeVar("_Item")
 
 
 @cache
@@ -97,3 +99,24 @@ def run_parts(function: Callable[[int, int], _T], parts: Sequence[int]) -> list[
     """function(first, last) of every part, at the same time."""
     others = [_pool().submit(function, *parts[i : i + 2]) for i in range(1, len(parts) - 1)]
     return [function(*parts[:2]), *(other.result() for other in others)]
+
+
+def in_turn(function: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
+    """function(item) of each, in their order; as many at the same time as threads may work, and a few items ahead."""
+    most = available()
+    if most == 1:
+        yield from map(function, items)
+        return
+    from concurrent.futures import ThreadPoolExecutor
+
+    waiting: deque[Future[_T]] = deque()
+    own = ThreadPoolExecutor(most, thread_name_prefix="ceres_cal")
+    try:
+        for item in items:
+            waiting.append(own.submit(function, item))
+            if len(waiting) > 2 * most:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:  # what is at work when it is no longer wanted is left to itself
+        own.shutdown(wait=False, cancel_futures=True)

@@ -22,6 +22,8 @@ from ceres_cal.calibration.outcome import (
     unknown_phi,
 )
 from ceres_cal.effects.dependence import Scatter, measure_scatter
+from ceres_cal.effects.effect import AsBuilt
+from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -36,14 +38,13 @@ from ceres_cal.problem.ranges import require_possible_numbers
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT
-from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, tolerances_of
+from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
+from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
-from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
 from ceres_cal.robust.usable import require_possible, require_usable
-from ceres_cal.robust.wholes import Subproblem
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
@@ -268,6 +269,12 @@ def solved_from(
     as_built: tuple[AsBuilt, ...] = ()
     if again is None and problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
+    beside = None
+    if again is None and watched.settle is None and estimated():
+        from ceres_cal.robust.effects import solve_beside_effects
+
+        beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
+        problem, end = beside.problem, beside.end
     end, others = least_of_few(problem, observations, end, start.others) if again is None else (end, ())
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
@@ -279,11 +286,14 @@ def solved_from(
         settled = watched.settle(problem, end, explanations, watched.progress)
         end = settled.end
     warnings = tuple(one.warning for one in (settled.explanations if settled else explanations))
+    effects = beside.estimates if beside else ()
+    warnings = (*warnings, *(one.warning for one in effects))
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         if again is None:
             require_lens_told(end.solution.estimate, posterior)
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
+        posterior = posterior.in_doubt(beside.keys, beside.shifts) if beside else posterior
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
         warnings = (
@@ -299,7 +309,8 @@ def solved_from(
     warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
-    return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
+    options = replace(problem.options, tolerances=tolerances)
+    return replace(calibration, options=options, as_built=as_built, effects=effects)
 
 
 def _as_long_as_asked(

@@ -25,6 +25,7 @@ from ceres_cal.calibration.file import (
     options_to_json,
 )
 from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
+from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.files import PosteriorFile
@@ -37,7 +38,6 @@ from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import every_key
 from ceres_cal.problem.structure import redrawn
-from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
@@ -45,7 +45,7 @@ from ceres_cal.scene.targets import Target, targets_from_specs
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice", "as_built"),
+    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice", "as_built", "effects"),
 )
 """What the file has as it is."""
 
@@ -69,6 +69,7 @@ class Calibration:
         lens_choice: how the lens was chosen; None where it was given.
         as_built: what of the targets is not where it is drawn, and was solved for under the sigmas that the data show;
             these are in the options' tolerances.
+        effects: what else displaces the observations, and was solved for.
         notes: whatever somebody wants to keep with it, plain data.
     """
 
@@ -90,6 +91,7 @@ class Calibration:
     conflicts: tuple[Conflict, ...] = ()
     lens_choice: LensChoice | None = None
     as_built: tuple[AsBuilt, ...] = ()
+    effects: tuple[EffectEstimate, ...] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

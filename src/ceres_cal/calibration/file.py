@@ -13,13 +13,13 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PixelOrigin, Units, convert
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
+from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.posterior.files import PosteriorFile, information_from, lower_triangle, require_keys
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, Options, Station
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.structure import EXACT, WARP, make_structure
-from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
@@ -138,6 +138,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     conflicts: tuple[Conflict, ...] = ()
     lens_choice: LensChoice | None = None
     as_built: tuple[AsBuilt, ...] = ()
+    effects: tuple[EffectEstimate, ...] = ()
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:

@@ -158,7 +158,7 @@ def _run(args: CalibrateArguments) -> Document:
     options = _options(args, observations, fixed=fixed, powers=powers)
     with progress_bar(args) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
-        from ceres_cal.moves.labels import mended, renamings
+        from ceres_cal.diagnostics.labels import mended, renamings
         from ceres_cal.report.quality import quality_of
 
         workers = {} if client is None else {"client": client}

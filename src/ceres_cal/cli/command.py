@@ -92,6 +92,7 @@ def print_answer(answer: Document, *, as_json: bool) -> None:
 
 
 _MODULES = {
+    "open": "open",
     "run": "run",
     "detect board": "detect",
     "detect rings": "detect_rings",

@@ -319,7 +319,7 @@ def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMake
     from ceres_cal.calibration import Calibration as File
     from ceres_cal.observations import Observations
     from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
-    from ceres_cal.report.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
+    from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 
     station, height = _station(args, calibration), metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
@@ -329,10 +329,10 @@ def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMake
 
     def layers(frame: Frame) -> Iterator[Layer]:
         if before is not None:
-            yield Layer(model_of(before, frame), f"before: {Path(args.before or '').name}", BEFORE)
+            yield Layer(model_of(before, frame), f"before: {Path(args.before or '').name}", "before")
         if height:
-            yield Layer(model_of(calibration, frame, height), f"{1e3 * height:g} mm above", LIFTED)
-        yield Layer(model_of(calibration, frame), args.calibration.name, AFTER)
+            yield Layer(model_of(calibration, frame, height), f"{1e3 * height:g} mm above", "lifted")
+        yield Layer(model_of(calibration, frame), args.calibration.name, "after")
 
     def picture(path: Path) -> tuple[Image, dict[str, Any], str]:
         image, called = _read(path, camera, name), frame_of(path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.threads import in_turn
 from ceres_cal.base.words import frame_of, printable
 from ceres_cal.detect.april_grids import measured_april_grid
 from ceres_cal.detect.charuco import CharucoSpec, charuco_detector
@@ -22,7 +24,7 @@ from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.markers import markers_finder, measured_markers
 from ceres_cal.detect.partly import part_of_board
-from ceres_cal.detect.saddles import REACH, is_begun_dark, measure_saddles
+from ceres_cal.detect.saddles import REACH, Saddles, is_begun_dark, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
@@ -39,6 +41,10 @@ _HINTS = {
 # camera's picture.
 _LONG = 16
 _LEAST_SIDE_PX = 8  # three squares of less than 3 px show no corner
+_ADAPTIVE = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+# Where a board is looked for first: of 62 real boards as many are found so as at full size, in a fifth of the time; but
+# no smaller than leaves corners to a few pixels.
+_FAST_PX, _FAST_SCALE = 2e5, 1.0 / 3.0
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
@@ -101,7 +107,9 @@ def detect_boards(
     paths = [Path(path) for path in images]
     find = _finder(board, corners)
     placements = _placement_names(paths) if board.movable else dict.fromkeys(paths)
-    size, grids, missed = _find_all(paths, find, progress)
+    # OpenCV's marker detectors keep a state that threads would share.
+    side_by_side = board.kind == "checkerboard" and isinstance(corners, str)
+    size, grids, missed = _find_all(paths, find, in_turn if side_by_side else map, progress)
     if not grids:
         reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}"
         raise NothingShownError(f"no {_what(board)} {reason}", tuple(missed))
@@ -121,25 +129,29 @@ def _what(board: Target) -> str:
 
 Finder = Callable[[Image], Array | str]
 """Image -> measured grid (rows, columns, 2) px, NaN where a corner was not seen, or the reason why there is none."""
+EachImage = Callable[[Callable[[Path], Any], Sequence[Path]], Iterator[Any]]
+"""What a function makes of each image, in their order."""
 
 
 def _find_all(
-    paths: Sequence[Path], find: Finder, progress: ImageProgress | None
+    paths: Sequence[Path], find: Finder, each: EachImage, progress: ImageProgress | None
 ) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
     """The images' (width, height), the grid in each image that shows the board, and (path, reason) of the others."""
     size = (0, 0)
     grids: dict[Path, Array] = {}
     missed: list[tuple[str, str]] = []
-    for number, path in enumerate(paths, start=1):
+
+    def look(path: Path) -> tuple[tuple[int, int], Array | str]:
         image = read_grey(path)
-        own_size = (image.shape[1], image.shape[0])
+        return (image.shape[1], image.shape[0]), find(image)
+
+    for number, (path, (own_size, grid)) in enumerate(zip(paths, each(look, paths), strict=True), start=1):
         size = own_size if number == 1 else size
         if own_size != size:
             raise InputError(
                 f"{path}: {own_size[0]} x {own_size[1]} px, but {paths[0]} has {size[0]} x {size[1]}: "
                 "images of another size are another camera's, detect them on their own"
             )
-        grid = find(image)
         if isinstance(grid, str):
             missed.append((str(path), grid))
         else:
@@ -178,14 +190,19 @@ def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
 
 def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str) -> Array | str:
     levels = _as_8_bit(image)
-    seen = _find_chessboard(levels, columns, rows)
-    if seen is None and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
+    found: list[tuple[Array, Saddles]] = []
+    for look in (_found_fast, _find_chessboard):
+        if (seen := look(levels, columns, rows)) is None:
+            continue
+        found.append((right_handed(seen), measure_saddles(image, right_handed(seen))))
+        if not np.isnan(found[-1][1].contrast).any():
+            break
+    if not found and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
         part = part_of_board(image, seed, columns, rows)
         return _placing(part)
-    if seen is None:
+    if not found:
         return f"no chessboard of {columns} x {rows} inner corners found"
-    seen = right_handed(seen)
-    saddles = measure_saddles(image, seen)
+    seen, saddles = max(found, key=lambda one: np.count_nonzero(np.isfinite(one[1].contrast)))
     grid = saddles.grid if corner_fit == "saddle" else _subpixel(levels, seen)
     turned = (columns + rows) % 2 == 1 and not is_begun_dark(saddles.contrast)
     return _enough(grid[::-1, ::-1] if turned else grid)
@@ -209,15 +226,27 @@ def right_handed(grid: Array) -> Array:
     return grid[:, ::-1] if np.sum(turn) < 0.0 else grid
 
 
+def _found_fast(image: Image8, columns: int, rows: int) -> Array | None:
+    """Roughly where the corners are, (rows, columns, 2) px, in a smaller picture: most boards that are seen whole."""
+    scale = min(1.0, max(float(np.sqrt(_FAST_PX / image.size)), _FAST_SCALE))
+    if scale * min(image.shape) < _LEAST_SIDE_PX:
+        return None
+    scaled = _resized(image, scale)
+    # The check takes as long as the search where there is a board; where there is none, large pictures take seconds.
+    flags = _ADAPTIVE | (cv2.CALIB_CB_FAST_CHECK if scaled.size > 1.1 * _FAST_PX else 0)
+    shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=flags)
+    return _places_in(image, scaled, corners).reshape(rows, columns, 2) if shown else None
+
+
 def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
-    """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
-    legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    """The same by OpenCV's two detectors at several scales: boards that are blurred, far away or in the dark, too."""
     for scale in _scales(image.shape):
         scaled = _resized(image, scale)
         # The newer detector is the better one, but blind where it is dark.
         shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
         if not shown:
-            shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
+            flags = _ADAPTIVE | cv2.CALIB_CB_FAST_CHECK
+            shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=flags)
         if shown:
             return _places_in(image, scaled, corners).reshape(rows, columns, 2)
     return None

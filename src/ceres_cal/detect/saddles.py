@@ -30,6 +30,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Mask
 
 REACH = 0.6
@@ -39,16 +40,16 @@ _SMOOTHING_PX = 0.7
 _RADIUS_PX = (3.0, 20.0)
 # A corner that moved further, as a part of that distance, followed something else. Nothing changes from 0.33 to 0.67.
 _LOST = 0.5
+_ROUGH = 0.6  # of the reach, in the first fit
+_WHOLE = 32.0  # px, by which no picture is shrunk
 # A contrast below this part of the usual one shows something else: a sticker, a finger. Nothing changes from half to
 # double.
 _FAINT = 0.2
-_SHARPNESS = (0.05, 3.0)  # 1 / px; the smoothing alone makes it 1.1
+_ROUNDING = 1e-6  # of the brightest pixel: in a picture of one grey every contrast is rounding
 _BLUR = 0.8  # sharpness times the standard deviation of a Gaussian blur: tanh then has its slope
-_STEPS = 20
-_SETTLED_PX = 1e-3  # the steps shrink quadratically: the last one is smaller by far than the noise
 
-# Places in a row of parameters.
-_X, _Y, _ANGLE, _SHARP, _MEAN, _MEAN_SLOPE, _CONTRAST, _CONTRAST_SLOPE, _SIZE = 0, 1, 2, 4, 5, 6, 8, 9, 11
+# Places in a row of what the kernel has fitted.
+_SHARP, _CONTRAST, _LEFT, _FITTED = 4, 8, 11, 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,25 +85,46 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
     rows, columns = np.indices(fitted.contrast.shape)
     signed = np.where((rows + columns) % 2 == 0, fitted.contrast, -fitted.contrast)
     usual = np.nanmedian(signed) if np.any(np.isfinite(signed)) else np.nan
-    wrong = ~(signed * np.sign(usual) > _FAINT * np.abs(usual))
-    contrast, misfit = (np.where(wrong, np.nan, values) for values in (fitted.contrast, fitted.misfit))
+    wrong = ~(signed * np.sign(usual) > max(_FAINT * np.abs(usual), _ROUNDING * float(np.max(image))))
     contrast, misfit = (np.where(wrong, np.nan, values) for values in (fitted.contrast, fitted.misfit))
     return Saddles(np.where(wrong[..., None], np.nan, fitted.grid), contrast, misfit)
 
 
 def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH) -> Saddles:
     """The saddles near the wanted places (rows, columns) of a grid; the others say where edges run."""
-    level, discs = image.astype(np.float32), (reach, wanted)
-    fitted = _fit_grid(level, grid, grid, discs, curved=False)  # where the edges bend is known only after it
+    corner, level = _around(image, grid)
+    seen, discs, first = grid - corner, (reach, wanted), (_ROUGH * reach, wanted)
+    smooth = _smoothed(level)
+    fitted = _fit_grid(smooth, seen, seen, first, curved=False)  # where the edges bend is known only after it
     shrink = _shrink(fitted, grid, reach)
-    small, seen = _shrunk(level, shrink), (grid + 0.5) / shrink - 0.5
-    start = (_started(fitted, grid, wanted) + 0.5) / shrink - 0.5
+    start = _started(fitted, seen, wanted)
     if shrink > 1:
-        start = _started(_fit_grid(small, start, seen, discs, curved=False), seen, wanted)
-    fitted = _fit_grid(small, start, seen, discs, curved=True)
+        smooth = _smoothed(_shrunk(level, shrink))
+        start, seen = ((places + 0.5) / shrink - 0.5 for places in (start, seen))
+        start = _started(_fit_grid(smooth, start, seen, discs, curved=False), seen, wanted)
+    fitted = _fit_grid(smooth, start, seen, discs, curved=True)
     contrast = fitted[..., _CONTRAST]
-    misfit = fitted[..., _SIZE] / np.maximum(np.abs(contrast), 1e-9)
-    return Saddles((fitted[..., :2] + 0.5) * shrink - 0.5, contrast, misfit)
+    misfit = fitted[..., _LEFT] / np.maximum(np.abs(contrast), 1e-9)
+    return Saddles((fitted[..., :2] + 0.5) * shrink - 0.5 + corner, contrast, misfit)
+
+
+def _around(image: AnyArray, grid: Array) -> tuple[Array, AnyArray]:
+    """The part of a picture that discs around a grid can reach, and x and y of its first pixel."""
+    steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1) for axis in (0, 1)])
+    margin = np.max(np.abs(steps[np.isfinite(steps)]), initial=_RADIUS_PX[1]) + _RADIUS_PX[1]
+    known = grid[np.isfinite(grid).all(axis=-1)]
+    if not len(known):
+        return np.zeros(2), image.astype(np.float32)
+    low = np.maximum((known.min(axis=0) - margin) // _WHOLE * _WHOLE, 0.0)
+    high = np.maximum(known.max(axis=0) + margin, low)
+    (x, y), (right, below) = (
+        ends.clip(0.0, np.array(image.shape[::-1]) - 1.0).astype(int).tolist() for ends in (low, high)
+    )
+    return np.array([x, y], dtype=float), image[y : below + 1, x : right + 1].astype(np.float32)
+
+
+def _smoothed(level: AnyArray) -> AnyArray:
+    return np.asarray(cv2.GaussianBlur(level, (0, 0), _SMOOTHING_PX))
 
 
 def is_begun_dark(contrast: Array) -> bool:
@@ -132,22 +154,21 @@ def _shrunk(level: AnyArray, factor: int) -> AnyArray:
     return cv2.resize(level[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _fit_grid(level: AnyArray, start: Array, seen: Array, discs: tuple[float, Mask], curved: bool) -> Array:
-    """Parameters of one fit from `start` and the root mean square of what it leaves, (rows, columns, 12); NaN where a
-    corner got lost on its way from where it was `seen`. `discs`: their reach, and which corners are wanted.
+def _fit_grid(smooth: AnyArray, start: Array, seen: Array, discs: tuple[float, Mask], curved: bool) -> Array:
+    """What one fit from `start` has found, (rows, columns, _FITTED); NaN where a corner got lost on its way from where
+    it was `seen`. `discs`: their reach, and which corners are wanted.
     """
     reach, wanted = discs
     (along_row, row_bend), (along_column, column_bend), distance = _distances(start)
-    height, width = level.shape
-    x, y = np.moveaxis(start, -1, 0)
-    known = wanted & np.isfinite(distance) & (x > -0.5) & (y > -0.5) & (x < width - 0.5) & (y < height - 0.5)
-    fitted = np.full((*distance.shape, _SIZE + 1), np.nan)
+    known = wanted & np.isfinite(distance) & np.isfinite(start).all(axis=-1)
+    fitted = np.full((*distance.shape, _FITTED), np.nan)
     if not np.any(known):
         return fitted
-    bends = np.stack([row_bend[known], column_bend[known]], axis=1) * curved
-    smooth = cv2.GaussianBlur(level, (0, 0), _SMOOTHING_PX)
-    patches = _Patches.cut(smooth, start[known], np.clip(reach * distance[known], *_RADIUS_PX), bends)
-    params = _fit(patches, _first_guess(patches, start[known], along_row[known], along_column[known]))
+    angles = [np.arctan2(along[known, 1], along[known, 0]) for along in (along_row, along_column)]
+    bends = [bend[known] * curved for bend in (row_bend, column_bend)]
+    radius = np.clip(reach * distance[known], *_RADIUS_PX)
+    params = np.empty((len(radius), _FITTED))
+    kernels.fit_saddles(smooth, np.column_stack([start[known], *angles, *bends, radius]), params)
     moved = np.linalg.norm(params[:, :2] - seen[known], axis=1)
     fitted[known] = np.where((moved < _LOST * distance[known])[:, None], params, np.nan)
     return fitted
@@ -164,13 +185,12 @@ def _distances(grid: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], A
 
 def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
     """Unit tangent (.., 2), curvature (1 / px) and distance to the next corner (px) of the lines along `axis`."""
-    line = np.moveaxis(grid, axis, 0)
+    line = grid.swapaxes(0, axis)
     gap = np.full((1, *line.shape[1:]), np.nan)
-    ahead = np.concatenate([np.diff(line, axis=0), gap])
-    behind = np.concatenate([gap, np.diff(line, axis=0)])
-    alone_ahead, alone_behind = np.isnan(behind), np.isnan(ahead)
-    chord = np.where(alone_ahead, ahead, np.where(alone_behind, behind, 0.5 * (ahead + behind)))
-    length = np.linalg.norm(chord, axis=-1)
+    steps = np.diff(line, axis=0)
+    ahead, behind = np.concatenate([steps, gap]), np.concatenate([gap, steps])
+    chord = np.where(np.isnan(behind), ahead, np.where(np.isnan(ahead), behind, 0.5 * (ahead + behind)))
+    length = np.hypot(chord[..., 0], chord[..., 1])
     with np.errstate(divide="ignore", invalid="ignore"):  # where two are foreseen at one place
         tangent = chord / length[..., None]
         bend = _cross(tangent, ahead - behind) / length**2
@@ -178,124 +198,10 @@ def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
     after, before = np.concatenate([bend[1:], gap[..., 0]]), np.concatenate([gap[..., 0], bend[:-1]])
     for other in (after, before, np.zeros_like(bend)):
         bend = np.where(np.isnan(bend), other, bend)
-    step = np.fmin(np.linalg.norm(ahead, axis=-1), np.linalg.norm(behind, axis=-1))
-    return np.moveaxis(tangent, 0, axis), np.moveaxis(bend, 0, axis), np.moveaxis(step, 0, axis)
+    size = np.hypot(steps[..., 0], steps[..., 1])
+    step = np.fmin(np.concatenate([size, gap[..., 0]]), np.concatenate([gap[..., 0], size]))
+    return tangent.swapaxes(0, axis), bend.swapaxes(0, axis), step.swapaxes(0, axis)
 
 
 def _cross(a: Array, b: Array) -> Array:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-
-
-@dataclass(frozen=True, eq=False)
-class _Patches:
-    """The pixels around n corners: columns, rows, grey levels and weights (n, pixels), and the edges' bends (n, 2)."""
-
-    x: Array
-    y: Array
-    values: Array
-    weights: Array
-    bends: Array
-
-    @classmethod
-    def cut(cls, image: AnyArray, corners: Array, radius: Array, bends: Array) -> _Patches:
-        height, width = image.shape
-        half = int(np.ceil(radius.max()))
-        dy, dx = (d.ravel() for d in np.mgrid[-half : half + 1, -half : half + 1])
-        middle = np.rint(corners).astype(int)
-        x, y = middle[:, :1] + dx, middle[:, 1:] + dy
-        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        near = (x - corners[:, :1]) ** 2 + (y - corners[:, 1:]) ** 2 <= radius[:, None] ** 2
-        values = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
-        return cls(x.astype(float), y.astype(float), values, (inside & near).astype(float), bends)
-
-    def take(self, which: Mask) -> _Patches:
-        """The pixels around some of the corners."""
-        return _Patches(*(values[which] for values in (self.x, self.y, self.values, self.weights, self.bends)))
-
-
-def _first_guess(patches: _Patches, corners: Array, along_row: Array, along_column: Array) -> Array:
-    params = np.zeros((len(corners), _SIZE))
-    params[:, :2] = corners
-    for i, tangent in enumerate((along_row, along_column)):
-        params[:, _ANGLE + i] = np.arctan2(tangent[:, 1], tangent[:, 0])
-    params[:, _SHARP] = 0.7
-    weights, values = patches.weights, patches.values
-    params[:, _MEAN] = np.sum(weights * values, axis=1) / np.sum(weights, axis=1)
-    shape = _model(params, patches)[1][..., _CONTRAST]
-    above = weights * (values - params[:, _MEAN, None]) * shape
-    params[:, _CONTRAST] = np.sum(above, axis=1) / np.sum(weights * shape**2, axis=1)
-    return params
-
-
-def _model(params: Array, patches: _Patches) -> tuple[Array, Array]:
-    """Grey levels (n, pixels) and their derivatives (n, pixels, 11) by the parameters (n, 11)."""
-    dx, dy = patches.x - params[:, _X, None], patches.y - params[:, _Y, None]
-    sharp = params[:, _SHARP, None]
-    contrast = _plane(params, _CONTRAST, dx, dy)
-    edges = [_edge(params[:, _ANGLE + i, None], sharp, patches.bends[:, i, None], dx, dy) for i in (0, 1)]
-    steps = [np.tanh(sharp * distance) for distance, _ in edges]
-    shape = steps[0] * steps[1]
-    jacobian = np.zeros((*dx.shape, _SIZE))
-    for i, (distance, by_place) in enumerate(edges):
-        slope = contrast * steps[1 - i] * (1.0 - steps[i] ** 2)
-        jacobian[..., _X] += slope * by_place[0]
-        jacobian[..., _Y] += slope * by_place[1]
-        jacobian[..., _ANGLE + i] = slope * by_place[2]
-        jacobian[..., _SHARP] += slope * distance
-    for first, factor in ((_MEAN, np.ones_like(dx)), (_CONTRAST, shape)):
-        jacobian[..., first], jacobian[..., first + 1], jacobian[..., first + 2] = factor, factor * dx, factor * dy
-        jacobian[..., _X] -= params[:, first + 1, None] * factor
-        jacobian[..., _Y] -= params[:, first + 2, None] * factor
-    return _plane(params, _MEAN, dx, dy) + contrast * shape, jacobian
-
-
-def _plane(params: Array, first: int, dx: Array, dy: Array) -> Array:
-    level, by_x, by_y = (params[:, first + i, None] for i in range(3))
-    return np.asarray(level + by_x * dx + by_y * dy)
-
-
-def _edge(angle: Array, sharp: Array, bend: Array, dx: Array, dy: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Signed distance (px) of each pixel to a bent edge, and sharpness times its derivatives by x, y and angle."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    along, across = cosine * dx + sine * dy, cosine * dy - sine * dx
-    turn = bend * along
-    by_place = (sharp * (sine + turn * cosine), sharp * (turn * sine - cosine), -sharp * (along + turn * across))
-    return across - 0.5 * turn * along, by_place
-
-
-def _fit(patches: _Patches, params: Array) -> Array:
-    """Levenberg-Marquardt on all corners side by side, each with its own damping, until it rests: parameters, and the
-    root mean square of what is left.
-    """
-    settled = np.column_stack([params, np.zeros(len(params))])
-    moving, damping = np.arange(len(params)), np.full(len(params), 1e-3)
-    model, jacobian = _model(params, patches)
-    cost = np.sum(patches.weights * (patches.values - model) ** 2, axis=1)
-    for _ in range(_STEPS):
-        step = _steps(patches, model, jacobian, damping)
-        trial = params + step
-        trial[:, _SHARP] = np.clip(trial[:, _SHARP], *_SHARPNESS)
-        trial_model, trial_jacobian = _model(trial, patches)
-        trial_cost = np.sum(patches.weights * (patches.values - trial_model) ** 2, axis=1)
-        better = trial_cost < cost
-        params = np.where(better[:, None], trial, params)
-        model, cost = np.where(better[:, None], trial_model, model), np.where(better, trial_cost, cost)
-        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
-        damping = np.where(better, np.maximum(0.1 * damping, 1e-9), 10.0 * damping)
-        settled[moving] = np.column_stack([params, np.sqrt(cost / np.sum(patches.weights, axis=1))])
-        far = np.any(np.abs(step[:, :2]) >= _SETTLED_PX, axis=1)
-        if not np.any(far):
-            break
-        moving, patches = moving[far], patches.take(far)
-        params, model, jacobian, cost, damping = (a[far] for a in (params, model, jacobian, cost, damping))
-    return settled
-
-
-def _steps(patches: _Patches, model: Array, jacobian: Array, damping: Array) -> Array:
-    """(n, 11) the damped Gauss-Newton step of each corner."""
-    weighted = (jacobian * patches.weights[..., None]).transpose(0, 2, 1)
-    normal = weighted @ jacobian
-    # The last term keeps a patch without any contrast solvable; it then stays where it is.
-    scale = damping[:, None] * np.einsum("nii->ni", normal) + 1e-12
-    off = weighted @ (patches.values - model)[..., None]
-    return np.asarray(np.linalg.solve(normal + scale[..., None] * np.eye(_SIZE), off)[..., 0])

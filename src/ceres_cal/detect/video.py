@@ -17,6 +17,7 @@ from ceres_cal.detect.images import encoded
 
 MOST_FRAMES = 200_000
 """Of a video, an hour and a half: each has to be passed over."""
+_JUDGED_PX = 5e5
 _LOOKED_AT = 10  # frames of each stretch: a hand that holds a board comes to rest in between
 
 
@@ -95,22 +96,34 @@ def spread_frames(video: Path, count: int, progress: ImageProgress | None = None
 def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgress | None = None) -> list[Path]:
     """Write the sharpest frames of `count` even stretches of a video into a folder, as PNG; their paths.
 
-    How sharp a frame is, is told by the variance of its Laplacian.
-
     Raises:
         InputError: see `open_video` and `Video.frames`.
     """
     opened = open_video(video)
     stretches = min(count, opened.total)
-    best: dict[int, tuple[float, Path]] = {}
+    written: list[Path] = []
+    best: tuple[int, float, Image] | None = None  # of a stretch: its number, sharpness and frame
     make_folder(folder)
+
+    def write(frame: Image) -> None:
+        written.append(folder / f"{len(written) + 1:04d}.png")
+        write_bytes(written[-1], encoded(frame, ".png", 100))
+
     for number, frame in opened.frames(max(1, opened.total // (stretches * _LOOKED_AT))):
-        stretch = number * stretches // opened.total
-        sharpness = float(np.var(cv2.Laplacian(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), cv2.CV_32F)))
-        path = folder / f"{stretch + 1:04d}.png"
-        if stretch not in best or sharpness > best[stretch][0]:
-            best[stretch] = (sharpness, path)
-            write_bytes(path, encoded(frame, ".png", 100))
+        stretch, sharp = number * stretches // opened.total, _sharpness(frame)
+        if best and best[0] != stretch:
+            write(best[2])
+        if best is None or best[0] != stretch or sharp > best[1]:
+            best = (stretch, sharp, frame)
         if progress is not None:
             progress(number + 1, opened.total, video.name)
-    return [path for _, path in best.values()]
+    if best:
+        write(best[2])
+    return written
+
+
+def _sharpness(frame: Image) -> float:
+    """The variance of the Laplacian, in a picture of _JUDGED_PX at most: what is blurred by less does not matter."""
+    scale = min(1.0, float(np.sqrt(_JUDGED_PX / (frame.shape[0] * frame.shape[1]))))
+    small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(np.var(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_32F)))

@@ -1,8 +1,7 @@
 """Reading what is left over: a table, what it says of the model, the choice of lens by held-out error."""
 
-from ceres_cal.diagnostics.checks import CHECKS, Check, DiagnosisCase, Tested
+from ceres_cal.diagnostics.checks import CHECKS, Check, DiagnosisCase, Noise, TestResults
 from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE, Diagnosis, diagnose
-from ceres_cal.diagnostics.leftover import Noise
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summaries, Summary
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects.effect import Amount, Finding
@@ -20,6 +19,6 @@ __all__ = [
     "ResidualTable",
     "Summaries",
     "Summary",
-    "Tested",
+    "TestResults",
     "diagnose",
 ]

@@ -12,9 +12,8 @@ from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Tested, solved_for
+from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResults, measure_noise, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled
-from ceres_cal.diagnostics.leftover import Noise, measure_noise
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.effects.columns import EffectSums
@@ -111,10 +110,14 @@ def diagnose(
     )
 
 
-def _findings(tested: Tested) -> Iterator[Finding]:
+def _findings(tested: TestResults) -> Iterator[Finding]:
     """Of effects, also of those that the calibration solved for by itself, and of checks."""
+    solved = {(one.kind, one.subject, one.frame) for one in tested.case.effects}
     for effect in EFFECTS.values():
-        yield from effect.findings(tested.case, tested.selection)
+        for finding in effect.findings(tested.case, tested.selection):
+            if (finding.kind, finding.subject, finding.frame) in solved:
+                finding = replace(finding, wrong="observations", sentence=f"{finding.sentence}; it was solved for")
+            yield finding
         for one in tested.case.as_built:
             if one.kind == effect.built and one.probability >= 1.0 - tested.rate:
                 yield solved_for(effect.kind, one, tested)
@@ -151,8 +154,8 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
         model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
     labels = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
-    other, as_built = (calibration, ()) if new_data else (None, calibration.as_built)
-    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, other, as_built)
+    known = (calibration,) if new_data else (None, calibration.as_built, calibration.effects)
+    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, *known)
     used = _recalled(case)
     if np.array_equal(used, model.used):
         return case
@@ -174,7 +177,7 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
     )
 
 
-def _tested(case: DiagnosisCase, rate: float) -> Tested:
+def _tested(case: DiagnosisCase, rate: float) -> TestResults:
     """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
     alternatives = [EffectSums.of(case.model, columns) for columns in columns_of_all(case)]
     extra = sum(one.tests(case) for one in CHECKS.values())
@@ -185,7 +188,7 @@ def _tested(case: DiagnosisCase, rate: float) -> Tested:
     if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
         selection = select(case.model, alternatives, rate, extra, inflation)
         noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
-    return Tested(case, selection, noise, rate)
+    return TestResults(case, selection, noise, rate)
 
 
 # Rejected observations of one line that must agree on its place: two determine it, three more do not by chance.

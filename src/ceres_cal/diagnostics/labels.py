@@ -1,4 +1,7 @@
-"""Observations that were taken out but lie where another feature of the same target is: wrong labels.
+"""Wrong labels: observations that lie where another feature of the same target is than the one they are named after.
+
+Looked at are those that were taken out, and those beyond the ends of a curve that lies on one line with another: a
+solve, which knows no ends, fits them.
 
 The false alarm is an outlier that happens to lie there. Its probability: the share of the image that lies as near to
 any other feature, for each observation; for several of one frame and label that fit one feature, the binomial tail.
@@ -6,7 +9,8 @@ any other feature, for each observation; for several of one frame and label that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -15,6 +19,7 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.tails import log_binomial_tail
+from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Curves, Observations
 from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
@@ -26,16 +31,18 @@ from ceres_cal.scene.targets import Target
 
 _PIECES = 199  # of a curve, to measure its length in the image
 _MOST = 20_000  # rejected observations looked at: of more, evenly spread ones
+_SAME_LINE = 1e-6  # m and rad, within which two curves lie on one line or circle
+_LEAST_ROWS = 2  # of a feature that is renamed: one observation lies on some curve by chance
 
 
 @dataclass(frozen=True, eq=False)
 class Mislabelled:
-    """Rejected observations of one view under one label that fit another.
+    """Observations of one view under one label that fit another.
 
     Attributes:
         is_curve, view: of all of them. feature, instead: index of the label and of the feature that fits, among the
             target's. rows: (K,) rows. distance_px: (K,) from the feature that fits.
-        tried: how many rejected ones of this view and label were looked at. log_p: of so many by chance.
+        tried: how many of this view and label were looked at. log_p: of so many by chance.
     """
 
     is_curve: bool
@@ -59,7 +66,7 @@ class Mislabelling:
 def find_mislabelled(
     observations: Observations, estimate: Estimate, inliers: Inliers, reject_sigma: float
 ) -> Mislabelling:
-    """Every group of rejected observations that another feature explains within the noise."""
+    """Every group of observations that another feature explains within the noise."""
     mislabelled: list[Mislabelled] = []
     tried = 0
 
@@ -73,15 +80,17 @@ def find_mislabelled(
         (observations.curves, curves & ~inliers.curves, inliers.curve_scale),
     )
     for column, rejected, scale in both:
-        rows = np.flatnonzero(rejected)
+        looked_at = rejected | _may_lie_beyond(observations, column)
+        rows = np.flatnonzero(looked_at)
         rows = rows[:: max(1, len(rows) // _MOST)]
         for number in distinct(column.view[rows]):
             own, view = rows[column.view[rows] == number], observations.views[number]
-            tried += len(distinct(column.feature[own]))
             if view.placement is None or view.placement in estimate.placements:
                 bound = reject_sigma * scale * column.sigma_px[own]
                 seen = sight(view.target, view.station, view.placement)
-                mislabelled += _of_view(seen, column, int(number), own, bound)
+                groups = _of_view(seen, column, int(number), own, bound)
+                tried += len(distinct(column.feature[own[rejected[own]]]))
+                mislabelled += groups
     return Mislabelling(tuple(mislabelled), tried)
 
 
@@ -97,6 +106,14 @@ class _Sight:
         """Length of all its curves within the image."""
         return sum(_visible_length_px(self.camera, curve) for curve in self.target.curves.values())
 
+    def distances(self, column: Columns, rows: Indices) -> Array:
+        """(N, F) px from observations to each point, or to each curve between its ends."""
+        pixels = column.pixels[rows]
+        if isinstance(column, Curves):
+            return _curve_distances(self.target, self.camera, pixels)
+        off = np.linalg.norm(pixels[:, None] - self.camera.project(self.target.point_array), axis=2)
+        return np.where(np.isfinite(off), off, np.inf)
+
     def chance(self, is_curve: bool, distance_px: float) -> float:
         """The share of the image that lies within a distance of any feature."""
         width, height = self.camera.image_size
@@ -107,18 +124,14 @@ class _Sight:
 
 def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Array) -> list[Mislabelled]:
     """The groups of one view."""
-    is_curve = isinstance(column, Curves)
-    pixels, named = column.pixels[rows], column.feature[rows]
-    if is_curve:
-        distance = _curve_distances(sight.target, sight.camera, pixels)
-    else:
-        places = sight.camera.project(sight.target.point_array)
-        distance = np.linalg.norm(pixels[:, None] - places[None], axis=2)
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    distance[np.arange(len(rows)), named] = np.inf
+    is_curve, named = isinstance(column, Curves), column.feature[rows]
+    distance = sight.distances(column, rows)
+    every = np.arange(len(rows))
+    misses = distance[every, named] > bound
+    distance[every, named] = np.inf
     nearest = np.argmin(distance, axis=1)
-    away = distance[np.arange(len(rows)), nearest]
-    fits = away <= bound
+    away = distance[every, nearest]
+    fits = misses & (away <= bound)
     groups = []
     for label, instead in distinct(np.column_stack([named, nearest])[fits], axis=0):
         tried = named == label
@@ -131,6 +144,34 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
             )
         )  # fmt: skip
     return groups
+
+
+def _may_lie_beyond(observations: Observations, column: Columns) -> Mask:
+    """(N,) observations of curves that lie on one line, or circle, with another of their target."""
+    beyond = np.zeros(len(column), dtype=bool)
+    if isinstance(column, Curves):
+        of_view = np.array([list(observations.targets).index(view.target) for view in observations.views])
+        for number, target in enumerate(observations.targets.values()):
+            shared = _shares_its_line(target)
+            if shared.any():
+                own = of_view[column.view] == number
+                beyond[own] = shared[column.feature[own]]
+    return beyond
+
+
+def _shares_its_line(target: Target) -> Mask:
+    """(C,) curves that lie on one straight line, or one circle, with another."""
+    tracks, is_arc = target.tracks[0], target.is_arc
+    c, a = tracks[:, 0], tracks[:, 1]
+    along = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12)
+    between = c[:, None] - c
+    beside = np.linalg.norm(np.cross(along[:, None], between), axis=2)  # of a line: how far the other's start is off it
+    turned = np.linalg.norm(np.cross(along[:, None], along), axis=2)
+    lines = (beside < _SAME_LINE) & (turned < _SAME_LINE) & ~is_arc[:, None] & ~is_arc
+    size = np.linalg.norm(a, axis=1)
+    arcs = (np.linalg.norm(between, axis=2) < _SAME_LINE) & (np.abs(size[:, None] - size) < _SAME_LINE)
+    same = (lines | (arcs & is_arc[:, None] & is_arc)) & ~np.eye(len(c), dtype=bool)
+    return np.asarray(same.any(axis=1))
 
 
 def _visible_length_px(camera: Camera, curve: Curve) -> float:
@@ -156,4 +197,83 @@ def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
     pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
     distance = np.empty(len(s))
     kernels.curve_residuals(camera_optics(camera), pose, columns, distance)
-    return np.where(inside, np.abs(distance), np.inf).reshape(len(curves), -1).T
+    found = inside & np.isfinite(distance)
+    return np.where(found, np.abs(distance), np.inf).reshape(len(curves), -1).T
+
+
+# ---- other names ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Renaming:
+    """What was seen of a feature in one view and lies where another one does.
+
+    Attributes:
+        kind: "point" or "curve". name, right: as it was named, and as it lies. rows: (N,) of its column. feature: the
+            number of the right one in the target.
+    """
+
+    kind: str
+    view: str
+    name: str
+    right: str
+    rows: Indices
+    feature: int
+
+    @property
+    def words(self) -> str:
+        return f"frame {self.view!r}: {self.kind} {self.name!r} is seen where {self.right!r} lies"
+
+
+def renamings(observations: Observations, calibration: Calibration) -> Iterator[Renaming]:
+    """Features of the world all of whose observations in a view lie where another feature does: two and more of a
+    curve, or two features that lie where each other's should.
+    """
+    points, curves = calibration.inlier_masks(observations)
+    nothing, fit = np.empty(0), calibration.fit
+    inliers = Inliers(points, curves, fit.point_scale, fit.curve_scale, nothing, nothing)
+    found = find_mislabelled(observations, calibration.estimate, inliers, calibration.options.reject_sigma)
+    whole = {
+        (one.is_curve, one.view, one.feature): one
+        for one in found.mislabelled
+        if _is_whole(one, observations, calibration)
+    }
+    for one in whole.values():
+        back = whole.get((one.is_curve, one.view, one.instead))
+        exchanged = back is not None and back.instead == one.feature
+        rows = _rows_of(one, observations)
+        if not one.is_curve or len(rows) >= _LEAST_ROWS or exchanged:
+            view = observations.views[one.view]
+            target = observations.targets[view.target]
+            names = target.curve_names if one.is_curve else target.point_names
+            kind = "curve" if one.is_curve else "point"
+            yield Renaming(kind, view.frame, names[one.feature], names[one.instead], rows, one.instead)
+
+
+def _rows_of(one: Mislabelled, observations: Observations) -> Indices:
+    column = observations.curves if one.is_curve else observations.points
+    return np.flatnonzero((column.view == one.view) & (column.feature == one.feature))
+
+
+def _is_whole(one: Mislabelled, observations: Observations, calibration: Calibration) -> bool:
+    """Whether all that was seen of the feature lies where the other does: crossing it, some of that may fit both."""
+    view, rows = observations.views[one.view], _rows_of(one, observations)
+    if view.placement is not None or 2 * len(one.rows) <= len(rows):
+        return False
+    column: Columns = observations.curves if one.is_curve else observations.points
+    scale = calibration.fit.curve_scale if one.is_curve else calibration.fit.point_scale
+    sight = _Sight(observations.targets[view.target], calibration.estimate.camera_at(view.station))
+    off = sight.distances(column, rows)[:, one.instead]
+    return bool(np.all(off <= calibration.options.reject_sigma * scale * column.sigma_px[rows]))
+
+
+def mended(observations: Observations, wrong: tuple[Renaming, ...]) -> Observations:
+    """The observations with the right names."""
+    features = {"point": observations.points.feature.copy(), "curve": observations.curves.feature.copy()}
+    for one in wrong:
+        features[one.kind][one.rows] = one.feature
+    return replace(
+        observations,
+        points=replace(observations.points, feature=features["point"]),
+        curves=replace(observations.curves, feature=features["curve"]),
+    )

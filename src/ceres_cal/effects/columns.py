@@ -8,6 +8,7 @@ times amounts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,7 +52,7 @@ def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
 
 
 @dataclass(frozen=True, eq=False)
-class _MovedRows:
+class _GroupedRows:
     """The equations in use that an effect moves, by group of it.
 
     Attributes:
@@ -63,7 +64,7 @@ class _MovedRows:
     columns: Array
 
     @classmethod
-    def of(cls, model: Linearised, effect: EffectColumns) -> _MovedRows:
+    def of(cls, model: Linearised, effect: EffectColumns) -> _GroupedRows:
         """By an effect."""
         inside = np.flatnonzero((effect.group >= 0) & model.used)
         rows = inside[np.argsort(effect.group[inside], kind="stable")]
@@ -124,7 +125,7 @@ class EffectSums:
         directions: how many shared directions of the model X is beyond.
     """
 
-    moved: _MovedRows
+    moved: _GroupedRows
     sizes: Array
     normals: Array
     scores: Array
@@ -133,7 +134,7 @@ class EffectSums:
     @classmethod
     def of(cls, model: Linearised, effect: EffectColumns) -> EffectSums:
         """Of an effect."""
-        moved = _MovedRows.of(model, effect)
+        moved = _GroupedRows.of(model, effect)
         sums = moved.products(np.column_stack([moved.columns, model.placed_score[moved.rows]]))
         normals, scores = sums[:, :, :-1], sums[:, :, -1]
         sizes = np.diagonal(normals, axis1=1, axis2=2)
@@ -173,6 +174,16 @@ class SparseColumns:
         slots = np.where(there[:, None], group[:, None] * width + np.arange(width), groups * width)
         return cls(slots, np.where(there[:, None], columns, 0.0), groups * width)
 
+    @classmethod
+    def side_by_side(cls, parts: Sequence[SparseColumns], equations: int) -> SparseColumns:
+        """Those of several effects, one after the other."""
+        firsts = np.cumsum([0, *(part.size for part in parts)])
+        size, nothing = int(firsts[-1]), np.zeros((equations, 0), dtype=np.int64)
+        slots = [
+            np.where(one.slots < one.size, one.slots + first, size) for one, first in zip(parts, firsts, strict=False)
+        ]
+        return cls(np.hstack([nothing, *slots]), np.hstack([nothing, *(part.values for part in parts)]), size)
+
     def gathered(self, factors: Array, owner: Indices, owners: int) -> Array:
         """(owners, Q) sums of the values times factors (E,) or (E, B), by number and owner (E,)."""
         products = self.values * (factors if factors.ndim == 2 else factors[:, None])
@@ -198,8 +209,11 @@ class SparseColumns:
         bounds, sight = model.equations.bounds, model.equations.sight
         return np.array([self.gathered(column, sight, len(bounds) - 1) for column in model.private.T])
 
+    def in_shared(self, model: Linearised) -> Array:
+        """(P, Q) what the shared numbers take of them."""
+        return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
+
     def left_of(self, model: Linearised) -> tuple[Array, Array]:
         """V (Q, Q) and u (Q,), see `effects.evidence`."""
-        private = self.in_private(model).reshape(-1, self.size)
-        shared = np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
+        private, shared = self.in_private(model).reshape(-1, self.size), self.in_shared(model)
         return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over)

@@ -24,11 +24,20 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import student_95
 from ceres_cal.base.words import two_digits
-from ceres_cal.effects.groups import FEWEST_GROUPS, INDEPENDENT, Between, GroupNormals, compare_groups
+from ceres_cal.effects.evidence import DEPENDENCE
+from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
 from ceres_cal.effects.likelihood import Likelihoods, is_loud, likelihoods
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.sample import sampled, views_or_placements
-from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of, families_of, go_over_groups
+from ceres_cal.effects.strands import (
+    Strand,
+    StrandFamily,
+    decay,
+    distances_of,
+    families_of,
+    go_over_groups,
+    sampled,
+    views_or_placements,
+)
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import Estimate
@@ -117,10 +126,8 @@ class _Average:
         """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
         own = np.sum(shared[rows] ** 2)
         at = likelihoods(families, may_be_smooth, float(own))
-        weight = np.full(len(at.share), (1.0 - INDEPENDENT) / max(len(at.share) - 1, 1))
-        weight[0] = INDEPENDENT
         variance = at.variance / at.variance[0]  # the noise scale is that of independent errors
-        weight *= np.exp(at.log - at.log.max())
+        weight = DEPENDENCE.over(len(at.share) - 1) * np.exp(at.log - at.log.max())
         weight /= weight.sum()
         weight[weight < _NEGLIGIBLE] = 0.0
         weight /= weight.sum()
@@ -213,7 +220,7 @@ class Dependence:
     """
 
     correlations: tuple[Correlation, ...] = ()
-    between: Between | None = None
+    between: GroupScatter | None = None
     private: float = 1.0
     inverse_freedom: float = 0.0
 

@@ -1,6 +1,6 @@
 """What an effect is: something that may displace the observations, its columns over the equations and its words.
 
-What is found of it: the cause by name, how large, how sure.
+What is found of it: the cause by name, how large, how sure; and what is solved for, targets as built and other effects.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
@@ -24,7 +25,7 @@ from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
-from ceres_cal.problem.structure import Structure
+from ceres_cal.problem.structure import Kind, Structure
 
 SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
@@ -44,6 +45,52 @@ class Amount:
 def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
     """Several numbers of one unit."""
     return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
+
+
+@dataclass(frozen=True)
+class AsBuilt:
+    """By how much the features of one kind lie off a target's drawing.
+
+    Attributes:
+        target, kind: "lines", "points" or "warp". sigma_m: the standard deviation that their offsets were solved for
+            under. probability: that they are off at all. rms_m: of the offsets.
+    """
+
+    target: str
+    kind: Kind
+    sigma_m: float
+    probability: float
+    rms_m: float = 0.0
+
+    @property
+    def words(self) -> str:
+        """What it says, without the target."""
+        amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
+        return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
+
+
+@dataclass(frozen=True)
+class EffectEstimate:
+    """A group of an effect that was solved for.
+
+    Attributes:
+        kind, subject, frame: which, as a `Finding` has them. sigma: the standard deviation of its amounts, in their
+            own unit, that they were solved for under. probability: that there is such an effect.
+        sentence: what it is, in words. amounts: what was taken off the observations.
+    """
+
+    kind: str
+    subject: str
+    frame: str | None
+    sigma: float
+    probability: float
+    sentence: str
+    amounts: tuple[Amount, ...]
+
+    @property
+    def warning(self) -> str:
+        """What somebody must know who uses the calibration."""
+        return f"{self.sentence}; it was solved for"
 
 
 @dataclass(frozen=True)
@@ -207,12 +254,15 @@ class Effect(ABC):
         kind: its name. wrong: what is where it is found, see `Finding`. absorbed: whether its displacement is what the
             calibration's free numbers could not have taken up of it.
         built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
+        prior: what is expected of its amounts, in their own unit, of one whose size `calibrate` estimates: it solves
+            for it where it is likely, and states no number better than with it in doubt.
     """
 
     kind: ClassVar[str]
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
     built: ClassVar[str] = ""
+    prior: ClassVar[SizePrior | None] = None
 
     @abstractmethod
     def columns(self, case: Case) -> Iterator[EffectColumns]:
@@ -226,6 +276,15 @@ class Effect(ABC):
         """The findings of several of its groups, as they are told."""
         yield from findings
 
+    def evidence(self, case: Case, score: ScoreTest, others: Linearised, left_over: Array) -> Evidence:
+        """For one of its groups, beside other effects in a model, which all together leave so much (E,)."""
+        rows = np.any(score.columns != 0.0, axis=1) & case.model.used
+        shift = score.columns @ score.amount
+        if self.absorbed:
+            shift = case.model.unabsorbed(shift)
+        effect = case.effect(shift, rows)
+        return Evidence(case, score, others, shift, effect, effect.px / case.noise_px(left_over, rows))
+
     def findings(self, case: Case, selection: Selection) -> Iterator[Finding]:
         """Of its groups that were chosen."""
         own = [number for number, score in enumerate(selection.chosen) if score.effect.kind == self.kind]
@@ -236,13 +295,9 @@ class Effect(ABC):
         score, others = chosen[number], case.model
         for other in (*chosen[:number], *chosen[number + 1 :]):
             others = others.with_columns(other.columns)
-        rows = np.any(score.columns != 0.0, axis=1) & case.model.used
-        shift = score.columns @ score.amount
-        if self.absorbed:
-            shift = case.model.unabsorbed(shift)
-        effect = case.effect(shift, rows)
-        ratio = effect.px / case.noise_px(selection.model.left_over, rows)
-        sentence, advice, mending = self.words(Evidence(case, score, others, shift, effect, ratio))
+        evidence = self.evidence(case, score, others, selection.model.left_over)
+        effect, ratio = evidence.effect, evidence.noise_ratio
+        sentence, advice, mending = self.words(evidence)
         if score.rivals:
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
             sentence += f"; these data cannot tell it from {names}"

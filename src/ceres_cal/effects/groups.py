@@ -27,6 +27,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import known_inverses
+from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import Key
@@ -40,8 +41,6 @@ _RIDGE = 1e-3  # of everything's information: a group that tells a direction alo
 
 
 FEWEST_GROUPS = 3
-INDEPENDENT = 0.8
-"""Probability, before anything was seen, that errors are independent."""
 # Equations that groups leave between them: views that each tell numbers of their own, as of cameras side by side, leave
 # rounding, and the ratio to that was 17 000 where nothing was wrong.
 _LEAST_LEFT = 1.0
@@ -211,7 +210,7 @@ def _posed(normals: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Between:
+class GroupScatter:
     """How views or placements scatter.
 
     Attributes:
@@ -225,7 +224,7 @@ class Between:
     degrees_of_freedom: float
 
 
-def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[Between, Array] | None:
+def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[GroupScatter, Array] | None:
     """How the groups scatter, and the covariance (P, P) of the whole score with that in it; None where they have too
     little in common to be compared.
 
@@ -251,7 +250,7 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
     jackknife = _jackknife(groups, expected, white, root)
     factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife
     widened = _widened(factor, white @ (whole - groups.known) @ white)
-    return Between(len(scatter), variance, probability, degrees), root @ widened @ root
+    return GroupScatter(len(scatter), variance, probability, degrees), root @ widened @ root
 
 
 def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:
@@ -275,8 +274,8 @@ def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, floa
     """
     logs = np.concatenate([[0.0], _LOG_C, -_LOG_C])
     prior = np.exp(-np.abs(logs)) * (logs >= -np.log(max(widened, 1.0)))
-    weights = (1.0 - INDEPENDENT) / prior[1:].sum() * prior
-    weights[0] = INDEPENDENT
+    weights = (1.0 - DEPENDENCE.absent) / prior[1:].sum() * prior
+    weights[0] = DEPENDENCE.absent
     likelihood = -0.5 * degrees * (logs + ratio * np.exp(-logs))
     weights *= np.exp(np.minimum(likelihood - likelihood[weights > 0.0].max(), 0.0))
     weights /= weights.sum()

@@ -205,6 +205,11 @@ class Linearised:
         """(K, Q) how the shared numbers move with more numbers, columns (E, Q), px per unit, that are at one."""
         return -self.root @ self._projected(columns * self.weight[:, None])[1]
 
+    def left_of_column(self, column: Array) -> Array:
+        """(E,) what is left of a column, in standard deviations, once everything free followed it."""
+        rest, taken = self._projected(column[:, None])
+        return np.asarray(rest[:, 0] - self.shared @ taken[:, 0])
+
     def unabsorbed(self, shift: Array) -> Array:
         """(E,) px of a displacement (E,) px that the free numbers could not have taken up."""
         rest, taken = self._projected((shift * self.weight)[:, None])

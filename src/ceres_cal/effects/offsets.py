@@ -19,43 +19,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.effects.columns import SparseColumns
-from ceres_cal.effects.evidence import RandomEffects, logsum
+from ceres_cal.base.arrays import Array, median
+from ceres_cal.effects.columns import EffectColumns, SparseColumns
+from ceres_cal.effects.evidence import LEAST_PX, OFFSETS_SCATTER, RandomEffects, SizePrior, logsum
 from ceres_cal.effects.linearised import Linearised
 
-# Probability, before anything was seen, that some feature does not belong (lines are painted by hand), or some view.
-# From half to double the log odds change by 0.7, of a line 3 px aside they are 10 to 20. At 0.1 two of 200 sound
-# fields come into doubt; at 0.01 a quarter of the lines four standard deviations aside go unseen that need not.
-_FAULTY_FEATURE, _FAULTY_VIEW = 0.05, 0.01
-# Probability, before anything was seen, that errors do not go together along features. The log odds change by as much.
-_INDEPENDENT = 0.5
-# Standard deviations of offsets in those of one observation's noise: of what belongs; of what does not; of features
-# that do not, besides.
-_SCATTER = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 14)])
-_SCATTER_PRIOR = np.where(_SCATTER == 0.0, _INDEPENDENT, (1.0 - _INDEPENDENT) / (len(_SCATTER) - 1))
-_ASIDE = (10.0, 40.0, 160.0)
-_LEAST_ASIDE = 3.0
-_LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding is no offset
 _DETERMINED = 1e-5  # of the largest squared length of a mode: what the model leaves of directions that can be judged
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What is expected of groups that do not belong, before anything was seen.
-
-    Attributes:
-        probability: that there is one. sizes: standard deviations of its offset, each as likely, in those of one
-            observation's noise.
-    """
-
-    probability: float
-    sizes: tuple[float, ...]
-
-
-def fault_of(features: bool) -> Fault:
-    """Of features, or of views and placements."""
-    return Fault(_FAULTY_FEATURE, (_LEAST_ASIDE, *_ASIDE)) if features else Fault(_FAULTY_VIEW, _ASIDE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +33,12 @@ class Offsets:
 
     Attributes:
         effects: their modes as random effects. modes: (G, R, M) what an offset of each group does to them.
-        fault: of groups that do not belong.
+        prior: of a group that does not belong, and of its offset.
     """
 
     effects: RandomEffects
     modes: Array
-    fault: Fault
+    prior: SizePrior
 
     def log_evidence(self, wrong: Sequence[int] = ()) -> float:
         """Of these groups not belonging, all others scattering alike."""
@@ -88,21 +57,21 @@ class Offsets:
 
     def _log_evidence(self, modes: Array, count: int) -> Array:
         """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
-        sizes = self.fault.sizes[: None if count else 1]
-        logs = np.stack([self.effects.log_evidence(aside * modes, _SCATTER) for aside in sizes], axis=1)
-        every = logs.reshape(len(modes), -1)
-        priors = np.tile(_SCATTER_PRIOR / len(sizes), len(sizes))
-        total = logsum(every + np.log(priors))
-        return np.asarray(total + count * np.log(self.fault.probability / len(self.modes)))
+        sizes, scatter = self.prior.sizes[: None if count else 1], OFFSETS_SCATTER.scatter
+        logs = np.stack([self.effects.log_evidence(aside * modes, scatter) for aside in sizes], axis=1)
+        priors = np.tile(OFFSETS_SCATTER.probabilities / len(sizes), len(sizes))
+        total = logsum(logs.reshape(len(modes), -1) + np.log(priors))
+        return np.asarray(total + count * np.log((1.0 - self.prior.absent) / len(self.modes)))
 
 
-def measure_offsets(model: Linearised, columns: Array, group: Indices, fault: Fault) -> Offsets:
+def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) -> Offsets:
     """What a model's residuals say of offsets.
 
     Args:
-        columns: (E, M) of the modes, in standard deviations, of order one. group: (E,) of each equation, -1 in none.
-        fault: of groups that do not belong.
+        effect: its columns, here in standard deviations of an equation, of order one. prior: of a group that does not
+            belong.
     """
+    columns, group = effect.columns, effect.group
     groups, width = int(group.max()) + 1, columns.shape[1]
     rows = np.flatnonzero((group >= 0) & model.used)
     every = SparseColumns.of_groups(model, columns, group, groups)
@@ -111,7 +80,7 @@ def measure_offsets(model: Linearised, columns: Array, group: Indices, fault: Fa
     normal, slope = normal[np.ix_(there, there)], slope[there]
     effects = RandomEffects.of(normal, slope, _DETERMINED * float(np.bincount(group[rows]).max()))
     rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
-    least = model.spare * (_LEAST_PX * median(model.weight[rows])) ** 2
+    least = model.spare * (LEAST_PX * median(model.weight[rows])) ** 2
     modes = effects.modes(np.eye(groups * width)[there]).reshape(-1, groups, width)
     effects = replace(effects, rest=max(rest, least), freedom=float(model.spare))
-    return Offsets(effects, np.swapaxes(modes, 0, 1), fault)
+    return Offsets(effects, np.swapaxes(modes, 0, 1), prior)

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera
 
 FILE_FORMAT, VERSION = "ceres-cal/table", 1
-_COLUMNS = {
-    **{name: Column(np.str_, ()) for name in ("format", "station")},
-    **{name: Column(np.int64, ()) for name in ("version", "step_px")},
-    "image_size": Column(np.int64, (2,)),
-    "x_px": Column(float, ("X",)),
-    "y_px": Column(float, ("Y",)),
-    **{name: Column(float, ("Y", "X", 2)) for name in ("floor_m", "per_height")},
-    "error_mm": Column(float, ("heights", 3)),
-    "homography": Column(float, (3, 3)),
-    "third_column": Column(float, (3,)),
+_COLUMNS: dict[str, Column] = {
+    **dict.fromkeys(("format", "station"), (np.str_, ())),
+    **dict.fromkeys(("version", "step_px"), (np.int64, ())),
+    "image_size": (np.int64, (2,)),
+    "x_px": (float, ("X",)),
+    "y_px": (float, ("Y",)),
+    **dict.fromkeys(("floor_m", "per_height"), (float, ("Y", "X", 2))),
+    "error_mm": (float, ("heights", 3)),
+    "homography": (float, (3, 3)),
+    "third_column": (float, (3,)),
 }
 _STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
 

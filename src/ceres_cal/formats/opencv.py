@@ -192,27 +192,27 @@ def _mat(storage: Any, names: tuple[str, ...], shape: tuple[int, int] | None, *,
         node = storage.getNode(name)
         if not node.isMap():
             continue
-        matrix = _matrix(node)
-        if matrix is None:
-            raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data")
+        matrix = _matrix(node, name)
         if (shape is not None and matrix.shape != shape) or not np.all(np.abs(matrix) < LARGEST):
-            raise InputError(f"{name} must be {shape or 'finite'} numbers, not {np.asarray(matrix).tolist()}")
-        return np.asarray(matrix, dtype=float)
+            raise InputError(f"{name} must be {shape or 'finite'} numbers, not {matrix.tolist()}")
+        return matrix
     if needed:
         raise InputError(f"it has no matrix {names[0]!r}")
     return np.empty((0, 0))
 
 
-def _matrix(node: Any) -> Array | None:
-    """What a node holds; None where its rows and cols, which OpenCV takes as they are, do not fit its data."""
+def _matrix(node: Any, name: str) -> Array:
+    """What a node holds; InputError where its rows and cols, which OpenCV takes as they are, do not fit its data."""
     import cv2
 
-    rows, cols = (_real(node, (name,)) or 0.0 for name in ("rows", "cols"))
+    refused = InputError(f"{name} must be a matrix: its rows and cols do not fit its data")
+    rows, cols = (_real(node, (size,)) or 0.0 for size in ("rows", "cols"))
     try:
-        fits = rows > 0.0 and cols > 0.0 and rows * cols == node.getNode("data").size()
-        return np.asarray(node.mat(), dtype=float) if fits else None
-    except cv2.error:  # quiet: the caller refuses a matrix that is none, by its name
-        return None
+        if not (rows > 0.0 and cols > 0.0 and rows * cols == node.getNode("data").size()):
+            raise refused
+        return np.asarray(node.mat(), dtype=float)
+    except cv2.error:
+        raise refused from None
 
 
 def _recognises(content: bytes) -> bool:

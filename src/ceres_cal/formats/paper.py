@@ -13,8 +13,8 @@ from ceres_cal.base.transforms import Pose, euler_from_rotation
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
+from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.foreign import LARGEST
 from ceres_cal.scene.lens import Radial
 
 
@@ -55,13 +55,8 @@ def _read(request: ImportRequest) -> Any:
     given = dict(re.findall(r"^\s*(\w+)\s*=\s*([^#\n]*)", request.text, re.MULTILINE))
 
     def numbers(name: str, count: int) -> Array:
-        try:
-            values = np.array([float(v) for v in given[name].replace(";", " ").split()])
-        except (KeyError, ValueError):  # reads: "NAME must be N finite numbers, not ..."
-            values = np.empty(0)
-        if len(values) != count or not np.all(np.abs(values) < LARGEST):
-            raise InputError(f"{name} must be {count} finite numbers, not {given.get(name, 'missing')!r}")
-        return values
+        text = given.get(name, "missing")
+        return numbers_at(text.replace(";", " ").split(), name, count, repr(text))
 
     (a1,), (a2,), (a3,), k = numbers("a1", 1), numbers("a2", 1), numbers("a3", 1), numbers("K", 9)
     lens, phi = Radial.from_paper(a1, a2, a3, k[0])

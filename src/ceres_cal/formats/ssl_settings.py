@@ -7,7 +7,6 @@ settings.xml. ssl-vision reads it at its start and overwrites it at its end: edi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 from xml.parsers import expat
@@ -121,11 +120,14 @@ def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
 
 
 def _number(one: _Var) -> float:
-    with suppress(ValueError):  # reads: "NAME is no number, but ..."
+    refused = InputError(f"{one.path[-1]!r} is no number, but {one.text!r}")
+    try:
         number = float(one.text.replace(",", "."))  # some locales' printf
-        if abs(number) < LARGEST:
-            return number
-    raise InputError(f"{one.path[-1]!r} is no number, but {one.text!r}")
+    except ValueError:
+        raise refused from None
+    if not abs(number) < LARGEST:
+        raise refused
+    return number
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------

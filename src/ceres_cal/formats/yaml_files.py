@@ -82,16 +82,18 @@ def yaml_text(data: Mapping[str, Any]) -> str:
     return str(yaml.safe_dump(dict(data), sort_keys=False, default_flow_style=None, width=120))
 
 
-def numbers_at(values: Any, where: str, count: int | None = None) -> Array:
-    """A list of finite numbers, of lists of them, too, as one array (N,).
+def numbers_at(values: Any, where: str, count: int | None = None, given: str = "") -> Array:
+    """A list of finite numbers, of lists of them, too, as one array (N,); `given`: how the file has them.
 
     Raises:
         InputError: naming `where`: something else, or another count.
     """
+    some = count if count is not None else "some"
+    refused = InputError(f"{where} must be {some} finite numbers, not {given or values}")
     try:
         numbers = np.array(values, dtype=float).ravel()
-    except (TypeError, ValueError, OverflowError):  # reads: "NAME must be N finite numbers, not ..."
-        numbers = np.full(1, np.nan)
+    except (TypeError, ValueError, OverflowError):
+        raise refused from None
     if not np.all(np.abs(numbers) < LARGEST) or (count is not None and len(numbers) != count):
-        raise InputError(f"{where} must be {count if count is not None else 'some'} finite numbers, not {values}")
+        raise refused
     return numbers

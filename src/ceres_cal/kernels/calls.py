@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Array32, Indices
 from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 
 IN_ORDER, NO_NORMALS = np.empty(0, dtype=np.int64), np.empty((0, 2))
@@ -115,6 +115,21 @@ def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, 
 def loss_weights(loss: Loss, squared: Array, weights: Array) -> None:
     """rho' at each squared residual, to `weights` (N,): what an observation has in the solve."""
     core().loss_weights(loss, squared, weights)
+
+
+# ---- photographs ----------------------------------------------------------------------------------------------------
+
+
+def fit_saddles(levels: Array32, starts: Array, fitted: Array) -> None:
+    """The saddle of `detect.saddles` around each of N corners, least squares over the pixels of a disc.
+
+    Args:
+        levels: (height, width) grey levels. starts: (N, 7) x, y, the angles of both edges, their bends (1 / px), and
+            the disc's radius, px.
+        fitted: (N, 14), filled: the model's eleven numbers, the root mean square of what they leave, and the standard
+            deviations of x and y for one of 1 in each pixel; NaN where a disc's middle is not in the picture.
+    """
+    core().fit_saddles(levels, starts, fitted)
 
 
 # ---- the solve ------------------------------------------------------------------------------------------------------

@@ -44,13 +44,13 @@ from ceres_cal.observations.prior_files import prior_from_json, prior_to_json
 from ceres_cal.scene.targets import SIDES, Target, targets_from_specs
 
 FORMAT, VERSION = "ceres-cal/observations", 1
-_NUMBERS = {
-    f"{kind}_{name}": Column(dtype, (kind, 2) if name == "pixels" else (kind,))
+_NUMBERS: dict[str, Column] = {
+    f"{kind}_{name}": (dtype, (kind, 2) if name == "pixels" else (kind,))
     for kind in ("points", "curves")
     for name, dtype in TYPES.items()
     if (kind, name) != ("points", "side")
 }
-_COLUMNS = {"header": Column(np.uint8, ("bytes",))} | _NUMBERS
+_COLUMNS: dict[str, Column] = {"header": (np.uint8, ("bytes",)), **_NUMBERS}
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 

@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations.columns import NO_CURVES, Points, View
 from ceres_cal.observations.files import Content
-from ceres_cal.scene.targets import Target, custom
+from ceres_cal.scene.targets import Target
 
 
 def gathered(
@@ -48,6 +48,8 @@ def gathered(
 
 def _points_target(places: Any) -> Target:
     """A target of points (N, 3) or (N, 2) m, named by their numbers."""
+    from ceres_cal.scene.targets import custom
+
     given = np.asarray(places, dtype=float)
     if given.ndim != 2 or given.shape[1] not in (2, 3):
         raise InputError(f"points must have shape (N, 3) or (N, 2), in metres, not {given.shape}")

@@ -196,6 +196,11 @@ class Sights(Sequence["Sights"]):
         sizes = np.bincount(p, minlength=len(names)), np.bincount(c, minlength=len(names))
         return self._rows(names // span, np.argsort(p, kind="stable"), np.argsort(c, kind="stable"), *sizes)
 
+    def displaced(self, points: Array, curves: Array) -> Sights:
+        """With every observation shifted, (N, 2) and (M, 2) px by row of the observations."""
+        pixels, curve_pixels = self.pixels + points[self.point_rows], self.curve_pixels + curves[self.curve_rows]
+        return replace(self, pixels=pixels, curve_pixels=curve_pixels)
+
     def renumbered(self, points: Indices, curves: Indices) -> Sights:
         """The sights of some of the observations, by ascending row, as rows of these alone."""
         p, c = (np.full(int(rows.max(initial=-1)) + 1, -1) for rows in (self.point_rows, self.curve_rows))

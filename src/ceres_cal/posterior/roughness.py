@@ -23,7 +23,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.effects.evidence import agreement as agreement_of
-from ceres_cal.effects.evidence import likeliest_sizes
+from ceres_cal.effects.evidence import likeliest_sizes, shifts_by
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
@@ -166,9 +166,7 @@ def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
     loose, least = np.full((2, len(every)), [[_LOOSE_PX], [_LEAST_PX]])
     sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, _AT_REST)
     covariance = np.linalg.inv(sizes.precision)
-    values, vectors = np.linalg.eigh(covariance + np.outer(sizes.amount, sizes.amount))
-    half = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(np.linalg.qr((model.root @ taken @ half).T, mode="r"))
+    return shifts_by(model.root @ taken, covariance + np.outer(sizes.amount, sizes.amount))
 
 
 def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:

@@ -162,14 +162,12 @@ class _Watcher(pyceres.IterationCallback):
         self._accepted: list[float] = []
 
     def __call__(self, summary: Any) -> Any:
-        try:
+        with self._run:
             self._run.history.append(float(summary.cost))
             if summary.step_is_successful:
                 self._accepted.append(float(summary.cost))
             if self._progress is not None:
                 self._progress(Progress(int(summary.iteration), float(summary.cost), float(summary.step_norm)))
-        except BaseException as error:  # quiet: raised again when Ceres has returned
-            self._run.failure = self._run.failure or error
         if self._run.failure is not None:
             return pyceres.CallbackReturnType.SOLVER_ABORT
         if summary.step_is_successful and _left_to_gain(self._accepted) <= self._precision:

@@ -64,7 +64,7 @@ class ChartedCost(pyceres.CostFunction):
         self.set_parameter_block_sizes(cost.parameter_block_sizes())
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        try:
+        with self._run:
             numbers = [
                 chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
             ]
@@ -73,7 +73,5 @@ class ChartedCost(pyceres.CostFunction):
             for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
                 if chart:
                     jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
-        except BaseException as error:  # quiet: raised again when Ceres has returned
-            self._run.failure = self._run.failure or error
-            return False
-        return True
+            return True
+        return False

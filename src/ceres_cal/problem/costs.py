@@ -24,10 +24,20 @@ from ceres_cal.problem.structure import Structure
 
 @dataclass(eq=False)
 class Run:
-    """What the callbacks of one solve share: the first exception in any of them (Ctrl-C too) ends the solve."""
+    """What the callbacks of one solve share: the first exception in any of them (Ctrl-C too) ends the solve.
+
+    A context, in which each callback works: what is raised there is raised again when Ceres has returned.
+    """
 
     failure: BaseException | None = None
     history: list[float] = field(default_factory=list)
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        self.failure = self.failure or error
+        return error is not None
 
 
 class CostValue(NamedTuple):
@@ -47,19 +57,18 @@ class CachedCost(pyceres.CostFunction):
         self._known: CostValue | None = None
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        try:
+        known = None
+        with self._run:
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or not np.array_equal(self._known.at, at):
                 self._known = self._evaluated(at, parameters)
-        except BaseException as error:  # quiet: raised again when Ceres has returned
-            self._run.failure = self._run.failure or error
+            known = self._known
+        if known is None:
             return False
-        if self._known is None:
-            return False
-        residuals[:] = self._known.residuals
-        for jacobian, known in zip(jacobians or (), self._known.jacobians, strict=False):
-            jacobian[:] = known
+        residuals[:] = known.residuals
+        for jacobian, there in zip(jacobians or (), known.jacobians, strict=False):
+            jacobian[:] = there
         if jacobians is not None:
             self._accept()
         return True

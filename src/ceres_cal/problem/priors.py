@@ -71,7 +71,8 @@ class GaussianPrior:
 
     def given(self, keys: Collection[Key]) -> GaussianPrior:
         """What it says of those of its numbers that are among the keys, with all others held at their mean."""
-        return self._with(self.information.given(self.information.among(keys)))
+        own = self.information.among(keys)
+        return self if own == self.keys else self._with(self.information.given(own))
 
     def without(self, keys: Collection[Key]) -> GaussianPrior:
         """The prior with some numbers integrated out: nothing is known of them any more."""

@@ -12,7 +12,7 @@ from ceres_cal.report.document import Chapter, Gallery, PhotoFigure, Text
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
 from ceres_cal.report.pictures.files import jpeg_of_at_most, read_photograph
 from ceres_cal.report.pictures.frames import Frame, frames_of, marks_of, model_of
-from ceres_cal.report.pictures.overlay import AFTER, BEFORE, Layer, draw_overlay
+from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 
 MOST_PHOTOGRAPHS = 4
 _WIDEST_PX, _MOST_BYTES = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
@@ -61,9 +61,9 @@ def _picture(material: Material, photographs: FramePhotographs, frame: Frame, nu
     model = model_of(calibration, frame)
     owner = calibration.estimate.stations[frame.station].camera
     photograph = read_photograph(path, model.image_size, owner)
-    layers, notes = [Layer(model, "this calibration", AFTER)], []
+    layers, notes = [Layer(model, "this calibration", "after")], []
     for before, name in _before(material, photographs, frame):
-        layers.insert(0, Layer(model_of(before, frame), name, BEFORE))
+        layers.insert(0, Layer(model_of(before, frame), name, "before"))
         median, worst = model.apart_px(layers[0].model)
         notes.append(f"Cyan: {name}, {fixed(median, 2)} px away in the median and {fixed(worst, 2)} px at most.")
     marks = [one for one in marks_of(calibration, material.observations, frame) if one.crosses]  # dots would hide paint

@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _PIECES = 60
-_MARGIN, _AWAY = 0.04, 0.006  # of the target's size
-_SHORT = 15.0  # of that distance: a curve whose name would be longer than it
-_LETTERS = 4.2  # points
+_STYLE = {
+    "margin": 0.04,  # of the target's size
+    "away": 0.006,  # of its width: names from what they name
+    "short": 15.0,  # of that distance: a curve whose name would be longer than it
+    "letters": 4.2,  # points
+}
 
 
 def target_svg(target: Target, name: str) -> str:
@@ -32,12 +35,13 @@ def target_svg(target: Target, name: str) -> str:
     if not target.curves:
         raise InputError(f"{name}: a target without lines is drawn by `ceres-cal targets print`")
     low, high = target.box
-    margin = _MARGIN * float(np.max(high - low))
+    margin = _STYLE["margin"] * float(np.max(high - low))
     width, height = high - low + 2.0 * margin
 
     def draw(axes: Axes, width_in: float) -> None:
-        _draw_curves(axes, target, _AWAY * float(width))
-        _draw_points(axes, target, _AWAY * float(width))
+        away = _STYLE["away"] * float(width)
+        _draw_curves(axes, target, away)
+        _draw_points(axes, target, away)
         axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
         axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=name)
 
@@ -49,10 +53,12 @@ def _draw_curves(axes: Axes, target: Target, away: float) -> None:
         pieces = _PIECES if isinstance(curve, Arc) else 1
         border = np.concatenate([curve_points(curve, 1, pieces), curve_points(curve, -1, pieces)[::-1]])[:, :2]
         axes.fill(*np.round(border, 4).T, facecolor=PAINT, edgecolor=PAINT, linewidth=0.6)
-        if curve.length_m < _SHORT * away:
+        if curve.length_m < _STYLE["short"] * away:
             continue
         x, y, turn = _beside(curve, away)
-        axes.text(x, y, name, color=CURVE, fontsize=_LETTERS, rotation=turn, ha="center", va="center", alpha=0.9)
+        axes.text(
+            x, y, name, color=CURVE, fontsize=_STYLE["letters"], rotation=turn, ha="center", va="center", alpha=0.9
+        )
 
 
 def _beside(curve: Curve, away: float) -> Array:
@@ -68,4 +74,4 @@ def _draw_points(axes: Axes, target: Target, away: float) -> None:
     unnamed = crossings(target.curves).keys()
     for name, (x, y, _) in target.points.items():
         if name not in unnamed:
-            axes.text(x + away, y + away, name, color=INK, fontsize=_LETTERS)
+            axes.text(x + away, y + away, name, color=INK, fontsize=_STYLE["letters"])

@@ -6,7 +6,7 @@ frames, of each frame and of each placement, whether the rest is better explaine
 end of all rounds names a few suspects (see `offsets`), a solve without each of them tells what the rest says of it, and
 the more probable explanation wins.
 
-What is said of a whole that may not belong: how far it lies aside, how surely, and what else may be.
+What is said of a group that may not belong: how far it lies aside, how surely, and what else may be.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.offsets import Offsets, fault_of, measure_offsets
+from ceres_cal.effects.offsets import Offsets, measure_offsets
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.equations import write_equations
@@ -28,19 +28,21 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.conflicts import without_suspicious
-from ceres_cal.robust.robust import RobustSolution, require_fits
-from ceres_cal.robust.wholes import (
+from ceres_cal.robust.groups import (
     FEWEST,
+    FeatureGroups,
     ObservationGroups,
     Subproblem,
-    asked,
+    ViewGroups,
+    compared_part,
     excess,
+    groups_compared,
+    groups_of,
     inliers_of,
     mostly_rejected,
-    rows_looked_at,
-    wholes_looked_at,
-    wholes_of,
+    rows_compared,
 )
+from ceres_cal.robust.robust import RobustSolution, require_fits
 
 # Log odds between which both explanations are named: 19 to 1.
 DOUBTFUL = 3.0
@@ -48,10 +50,10 @@ DOUBTFUL = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """That a whole does not belong.
+    """That a group of observations does not belong.
 
     Attributes:
-        name: of the whole. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
+        name: of the group. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
             lies aside, the median. log_odds: natural logarithm of the odds that it does not belong.
         instead: what the next best explanation says. other: the estimate of the less probable one of the two.
     """
@@ -97,37 +99,37 @@ class Explanation:
         )
 
 
-# Log Bayes factor, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound
+# Log Bayes factor, by the linear model, from which on a group is looked at by a solve without it: one in thirty sound
 # scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above -4.7.
 _SUSPECT = -4.4
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
-_MOST_WRONG = 4  # wholes
+_MOST_WRONG = 4  # groups
 
 
 Solver = Callable[[Problem, Subproblem], RobustSolution]
-"""Solves a problem of some of the observations that are asked, from a start that the others had no part in."""
+"""Solves a problem of some of the observations that are compared_part, from a start that the others had no part in."""
 
 
 def compete(
     problem: Problem, observations: Observations, end: RobustSolution, solver: Solver
 ) -> tuple[RobustSolution, tuple[Explanation, ...]]:
-    """The end of all rounds without the wholes that do not belong, and these; also those that are in doubt.
+    """The end of all rounds without the groups that do not belong, and these; also those that are in doubt.
 
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    every = Subproblem(problem, observations, end, list(wholes_of(observations, problem.sights)))
+    every = Subproblem(problem, observations, end, list(groups_of(observations, problem.sights)))
     if not every.kinds:
         return end, ()
-    part = asked(every)
+    part = compared_part(every)
     some = _freed(part, solver)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
     taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
     for trial in trials:
-        wholes = every.kinds[some.kinds.index(trial.suspects.wholes)]
-        own = [wholes.among(np.array([number])) & taking_part for number in trial.suspects.numbers]
+        groups = every.kinds[some.kinds.index(trial.suspects.groups)]
+        own = [groups.among(np.array([number])) & taking_part for number in trial.suspects.numbers]
         found = trial.explanations if some is part else [_as_stated(one, part, solver) for one in trial.explanations]
         explanations += [replace(one, rows=rows) for one, rows in zip(found, own, strict=True)]
         if trial.log_odds >= 0.0:
@@ -152,7 +154,7 @@ def _freed(every: Subproblem, solver: Solver) -> Subproblem:
 
 
 def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanation:
-    """With the other estimate under all that is stated: what moves without that is no doubt about a whole."""
+    """With the other estimate under all that is stated: what moves without that is no doubt about a group."""
     if not one.is_doubtful:
         return one
     try:
@@ -164,9 +166,9 @@ def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanatio
 
 @dataclass(frozen=True, eq=False)
 class _Suspects:
-    """Wholes of one kind, by their numbers."""
+    """Groups of one kind, by their numbers."""
 
-    wholes: ObservationGroups
+    groups: ObservationGroups
     numbers: tuple[int, ...]
 
 
@@ -176,7 +178,7 @@ class _Trial:
 
     Attributes:
         end: of that solve. rows: (N + M,) theirs. log_odds: the least of theirs. explanations: of each.
-        next: the whole that does not belong either, where one is suspected.
+        next: the group that does not belong either, where one is suspected.
     """
 
     suspects: _Suspects
@@ -205,7 +207,7 @@ class _Competition:
         self._taking_part = np.ones(len(some.observations.points) + len(some.observations.curves), dtype=bool)
 
     def decided(self) -> list[_Trial]:
-        """The trials of wholes that do not belong, one after the other; the last one may be in doubt."""
+        """The trials of groups that do not belong, one after the other; the last one may be in doubt."""
         end, decided = self._some.end, list[_Trial]()
         while sum(len(one.explanations) for one in decided) < _MOST_WRONG:
             best = _best(list(self.trials(end)))
@@ -222,7 +224,7 @@ class _Competition:
         for suspects in self.suspects(end):
             trial = self.tried(end, suspects)
             if trial is not None and trial.log_odds < DOUBTFUL and trial.next is not None:
-                pair = self.tried(end, _Suspects(suspects.wholes, (*suspects.numbers, trial.next)))
+                pair = self.tried(end, _Suspects(suspects.groups, (*suspects.numbers, trial.next)))
                 trial = trial if pair is None or pair.log_odds < trial.log_odds else pair
             if trial is not None:
                 yield trial
@@ -230,33 +232,33 @@ class _Competition:
     # ---- who is looked at -------------------------------------------------------------------------------------------
 
     def suspects(self, end: RobustSolution) -> Iterator[_Suspects]:
-        """Wholes without which the rest may be better explained."""
-        for wholes in self._some.kinds:
-            for numbers in (*self._mostly_rejected(end, wholes), *self._by_offsets(end, wholes)):
-                rows = tuple(np.flatnonzero(wholes.among(np.array(numbers))).tolist())
+        """Groups without which the rest may be better explained."""
+        for groups in self._some.kinds:
+            for numbers in (*self._mostly_rejected(end, groups), *self._by_offsets(end, groups)):
+                rows = tuple(np.flatnonzero(groups.among(np.array(numbers))).tolist())
                 if rows not in self._tried:
                     self._tried.add(rows)
-                    yield _Suspects(wholes, numbers)
+                    yield _Suspects(groups, numbers)
 
-    def _mostly_rejected(self, end: RobustSolution, wholes: ObservationGroups) -> Iterator[tuple[int, ...]]:
+    def _mostly_rejected(self, end: RobustSolution, groups: ObservationGroups) -> Iterator[tuple[int, ...]]:
         """The one with most outliers, where most of its observations are."""
-        rejected = mostly_rejected(wholes, end, self._taking_part)
+        rejected = mostly_rejected(groups, end, self._taking_part)
         if np.any(rejected):
             yield (int(np.argmax(rejected)),)
 
-    def _by_offsets(self, end: RobustSolution, wholes: ObservationGroups) -> Iterator[tuple[int, ...]]:
+    def _by_offsets(self, end: RobustSolution, groups: ObservationGroups) -> Iterator[tuple[int, ...]]:
         """Those that the offsets speak against: single ones, and the pair of most evidence."""
-        if not wholes.of_features:
-            above = excess(self._some.observations, wholes, end, self._taking_part)
+        if isinstance(groups, ViewGroups):
+            above = excess(self._some.observations, groups, end, self._taking_part)
             if np.max(above) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(above)), 1))):
                 return
-        chosen, offsets = self._offsets(end, wholes, ())
+        chosen, offsets = self._offsets(end, groups, ())
         if offsets is None:
             return
         none, each = offsets.log_evidence(), offsets.log_evidence_with_each()
         first = int(np.argmax(each))
         for number in np.argsort(-each)[:2]:
-            if each[number] - none > _SUSPECT + np.log(offsets.fault.probability):
+            if each[number] - none > _SUSPECT + np.log(1.0 - offsets.prior.absent):
                 yield (int(chosen[number]),)
         both = offsets.log_evidence_with_each((first,))
         second = int(np.argmax(both))
@@ -267,33 +269,33 @@ class _Competition:
 
     def tried(self, end: RobustSolution, suspects: _Suspects) -> _Trial | None:
         """What a solve without the suspects says of them; None where there is none, or they lie here and there."""
-        wholes, numbers = suspects.wholes, suspects.numbers
-        without = self._without(wholes, numbers)
+        groups, numbers = suspects.groups, suspects.numbers
+        without = self._without(groups, numbers)
         if without is None:
             return None
         there = residuals(self._some.observations, self._some.problem.sights, without.solution.estimate)
-        chosen, offsets = self._offsets(replace(without, residuals=there), wholes, numbers)
+        chosen, offsets = self._offsets(replace(without, residuals=there), groups, numbers)
         if offsets is None:
             return None
         lengths, explanations = np.concatenate(there.lengths), []
         for number in numbers:
             odds, rival = _odds(offsets, chosen, number, numbers)
-            own = wholes.among(np.array([number])) & self._taking_part
+            own = groups.among(np.array([number])) & self._taking_part
             other = (end if odds > 0.0 else without).solution.estimate
             instead = "it belongs"
             if rival is not None and abs(odds) < DOUBTFUL:
-                instead = f"the whole of {wholes.name(rival)} does not belong"
-                rivals = self._without(wholes, tuple(rival if one == number else one for one in numbers))
+                instead = f"the whole of {groups.name(rival)} does not belong"
+                rivals = self._without(groups, tuple(rival if one == number else one for one in numbers))
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
             aside_px = float(np.nanmedian(lengths[own]))
-            explanations.append(Explanation(wholes.name(number), own, aside_px, odds, instead, other))
-        rows = wholes.among(np.array(numbers)) & self._taking_part
+            explanations.append(Explanation(groups.name(number), own, aside_px, odds, instead, other))
+        rows = groups.among(np.array(numbers)) & self._taking_part
         least = min(one.log_odds for one in explanations)
         return _Trial(suspects, without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
 
-    def _without(self, wholes: ObservationGroups, numbers: tuple[int, ...]) -> RobustSolution | None:
-        """The end of a solve without some wholes; None where the others determine nothing."""
-        gone = wholes.among(np.array(numbers))
+    def _without(self, groups: ObservationGroups, numbers: tuple[int, ...]) -> RobustSolution | None:
+        """The end of a solve without some groups; None where the others determine nothing."""
+        gone = groups.among(np.array(numbers))
         try:
             end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
             every = self._some.problem
@@ -301,22 +303,22 @@ class _Competition:
             require_fits(replace(end, residuals=there), every)
         except CalibrationError:  # quiet: what determines nothing without the suspects is no explanation
             return None
-        if wholes.of_features:
+        if isinstance(groups, FeatureGroups):
             return end
         alone = self._some.of_rows(gone).weighted(replace(end.problem.weighting, loss="cauchy"))
         estimate = with_placements_at_best(alone, end.solution.estimate)
         return replace(end, solution=replace(end.solution, estimate=estimate))
 
     def _offsets(
-        self, end: RobustSolution, wholes: ObservationGroups, back: tuple[int, ...]
+        self, end: RobustSolution, groups: ObservationGroups, back: tuple[int, ...]
     ) -> tuple[Indices, Offsets | None]:
-        """Which wholes are looked at, and what is said of their offsets, with all rows of some that were left out.
+        """Which groups are looked at, and what is said of their offsets, with all rows of some that were left out.
 
-        None where some of these lie here and there: they are no whole.
+        None where some of these lie here and there: they are no group.
         """
-        recalled = wholes.among(np.array(back, dtype=np.int64)) & self._taking_part
+        recalled = groups.among(np.array(back, dtype=np.int64)) & self._taking_part
         observations, problem = self._some.observations, self._some.problem
-        rows = rows_looked_at(observations, wholes, end, self._taking_part, recalled)
+        rows = rows_compared(observations, groups, end, self._taking_part, recalled)
         sights = self._some.of_rows(rows).sights
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
@@ -327,12 +329,12 @@ class _Competition:
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(problem, end.solution.estimate, equations, weights)
-        chosen, share = wholes_looked_at(observations, wholes, end, rows & (inliers_of(end) | recalled), back)
-        columns, group = wholes.modes(equations, chosen)
+        chosen, share = groups_compared(observations, groups, end, rows & (inliers_of(end) | recalled), back)
+        effect = groups.columns(equations, chosen)
         agreeing = model.used.copy()
         for number in back:
-            own = np.flatnonzero(group == np.searchsorted(chosen, number))
-            agree = _agreeing(model, columns, own, problem.options.reject_sigma)
+            own = np.flatnonzero(effect.group == np.searchsorted(chosen, number))
+            agree = _agreeing(model, effect.columns, own, problem.options.reject_sigma)
             if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
                 return chosen, None
             agreeing[own] = agree
@@ -340,13 +342,12 @@ class _Competition:
             model = make_linear_model(problem, end.solution.estimate, equations, replace(weights, used=agreeing))
         if len(chosen) < 2:
             return chosen, None
-        fault = fault_of(wholes.of_features)
-        fault = replace(fault, probability=share * fault.probability)  # that it is one of those that are looked at
-        return chosen, measure_offsets(model, columns, group, fault)
+        prior = groups.prior  # that it is one of those that are compared
+        return chosen, measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
 
 
 def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:
-    """Log odds that one of the wrong wholes does not belong, against that it does, or another one in its place: then
+    """Log odds that one of the wrong groups does not belong, against that it does, or another one in its place: then
     which.
     """
     at = {int(one): place for place, one in enumerate(chosen)}
@@ -359,7 +360,7 @@ def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]
 
 
 def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | None:
-    """The whole that does not belong, either, when these do not; None where there is none."""
+    """The group that does not belong, either, when these do not; None where there is none."""
     at = [int(np.flatnonzero(chosen == number)[0]) for number in wrong]
     each = offsets.log_evidence_with_each(at)
     best = int(np.argmax(each))

@@ -12,8 +12,9 @@ from functools import cache
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.start.minimal import minimal_sets
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
 _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
@@ -29,6 +30,9 @@ _WIDEST = 2.7  # of log phi from the middle: from a fisheye to a telescope
 _MOST_STEP = 0.3  # rad, and of log phi
 _BEHIND = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
 _DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
+_WRONG_LABEL = 25.0  # variances that a wrong label costs by itself
+_ROUNDING = 1e-9
+_NEAR = 0.02  # rad, and of the height: as near, cameras are on the way to one minimum
 _NOTHING = 1e-3  # variances: who gains less is there
 
 
@@ -81,17 +85,19 @@ def information(lines: Sightlines, known: Beforehand, pose: Candidates, scale_px
     return np.asarray(matrix * free[:, None] * free)
 
 
-def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int) -> Candidates:
-    """Each brought towards its minimum."""
+def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int, most_px: float = np.inf) -> Candidates:
+    """Each brought towards its minimum, at the scale of its own residuals, at most so many px."""
+    if not len(poses):
+        return poses
     damping = np.full(len(poses), _DAMPING)
     free = np.flatnonzero(~known.held)
     at = lines.equations(poses)
     for _ in range(steps):
-        scale = np.maximum(scales(at[0], len(free)), known.least_px)
-        step = _step(at, known, poses, scale, damping)
+        scale = np.clip(scales(at[0], lines.weight, len(free)), known.least_px, most_px)
+        step = _step(lines, at, known, poses, scale, damping)
         moved = poses.moved(step)
         there = lines.equations(moved)
-        gained = _cost(at[0], known, poses, scale) - _cost(there[0], known, moved, scale)
+        gained = _cost(lines, at[0], known, poses, scale) - _cost(lines, there[0], known, moved, scale)
         better = gained > 0.0
         better &= _possible(lines, known, moved)
         poses = moved.where(better, poses)
@@ -102,11 +108,13 @@ def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int)
     return poses
 
 
-def _step(at: tuple[Array, Array], known: Beforehand, poses: Candidates, scale: Array, damping: Array) -> Array:
+def _step(
+    lines: Sightlines, at: tuple[Array, Array], known: Beforehand, poses: Candidates, scale: Array, damping: Array
+) -> Array:
     """(K, 8) a damped Gauss-Newton step of each, reweighted against what does not fit."""
     r, derivatives = at
     free = np.flatnonzero(~known.held)
-    weights = 1.0 / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
+    weights = lines.weight / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
     jacobian = derivatives[:, :, free]
     weighted = jacobian * weights[..., None]
     normal = np.swapaxes(weighted, 1, 2) @ jacobian
@@ -132,16 +140,19 @@ def _bounded(vectors: Array, most: float) -> Array:
     return np.asarray(vectors * np.minimum(1.0, most / np.maximum(length, 1e-12)))
 
 
-def scales(r: Array, free: int) -> Array:
-    """(K, 1) px: the middle of the residuals that so many numbers cannot take up."""
-    count = r.shape[1]
-    middle = min((count + free) // 2, count - 1)
-    return np.asarray(np.maximum(np.partition(np.abs(r), middle, axis=1)[:, [middle]], _LEAST_PX))
+def scales(r: Array, share: Array, free: int) -> Array:
+    """(K, 1) px: the middle of the residuals (K, N) that so many numbers cannot take up; each counts by its share."""
+    order = np.argsort(np.abs(r), axis=1)
+    sums = np.cumsum(np.take_along_axis(np.broadcast_to(share, r.shape), order, 1), axis=1)
+    total = sums[:, -1:]
+    middle = np.argmax(sums >= np.minimum(0.5 * (total + free), total) - _ROUNDING, axis=1)[:, None]
+    return np.maximum(np.abs(np.take_along_axis(r, np.take_along_axis(order, middle, 1), 1)), _LEAST_PX)
 
 
-def _cost(r: Array, known: Beforehand, poses: Candidates, scale: Array | float) -> Array:
+def _cost(lines: Sightlines, r: Array, known: Beforehand, poses: Candidates, scale: Array | float) -> Array:
     said, _ = known.residuals(poses)
-    return np.asarray(np.sum(4.0 * np.log1p((r / (2.0 * scale)) ** 2), axis=1) + np.sum(said**2, axis=1))
+    robust = 4.0 * np.log1p((r / (2.0 * scale)) ** 2)
+    return np.asarray(robust @ lines.weight + np.sum(said**2, axis=1))
 
 
 def _possible(lines: Sightlines, known: Beforehand, poses: Candidates) -> Mask:
@@ -151,18 +162,39 @@ def _possible(lines: Sightlines, known: Beforehand, poses: Candidates) -> Mask:
     return np.asarray(is_lens & (poses.positions[:, 2] > floor + _LOWEST * reach))
 
 
-def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> Array:
-    """(K,) minus twice the logarithm of the likelihood of Cauchy errors, each camera's at the scale of its own
-    residuals, at least so many px; with what is seen where it cannot be.
+def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> tuple[Array, Array]:
+    """Costs (K,), minus twice the logarithm of the likelihood of Cauchy errors, each camera's at the scale (K, 1) px of
+    its own residuals, at least so many px; with what is seen where it cannot be.
+
+    A curve's label is right, or it is wrong, which is unlikely, and all of its rows then say no more than its numbers;
+    the scale is that of the rest.
     """
     r, _ = lines.equations(poses)
     r = np.nan_to_num(r, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX)
     free = int(np.count_nonzero(~known.held))
-    scale = np.maximum(scales(r, free), least_px)
+    scale = np.maximum(scales(r, lines.weight, free), least_px)
     r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), _BEHIND * scale))
-    scale = np.maximum(scales(r, free), least_px)
-    cost = _cost(r, known, poses, scale) + 4.0 * r.shape[1] * np.log(scale[:, 0])
-    return np.asarray(np.where(_possible(lines, known, poses), cost, np.inf))
+    wrong = _by_labels(lines, r, np.maximum(scales(r, lines.weight, free), least_px))[1]
+    scale = np.maximum(scales(r, np.where(wrong, 0.0, 1.0), free), least_px)
+    cost = _by_labels(lines, r, scale)[0] + np.sum(known.residuals(poses)[0] ** 2, axis=1)
+    return np.where(_possible(lines, known, poses), cost, np.inf), scale
+
+
+def _by_labels(lines: Sightlines, r: Array, scale: Array) -> tuple[Array, Mask]:
+    """Costs (K,) of residuals (K, N), and which are of curves whose labels are rather wrong."""
+    rows = 4.0 * np.log1p((r / (2.0 * scale)) ** 2) + 4.0 * np.log(scale)
+    first, wrong = lines.groups, np.zeros(r.shape, dtype=bool)
+    if not len(first):
+        return np.sum(rows, axis=1), wrong
+    right = np.add.reduceat(rows, first, axis=1)
+    otherwise = _WRONG_LABEL + lines.weight[first] * right
+    wrong[:, first[0] :] = np.repeat(otherwise < right, np.diff(np.append(first, r.shape[1])), axis=1)
+    return np.sum(rows[:, : first[0]], axis=1) + np.sum(np.minimum(right, otherwise), axis=1), wrong
+
+
+def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> Array:
+    """(K,) of `judged`."""
+    return judged(lines, known, poses, least_px)[0]
 
 
 def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates | None = None) -> Found:
@@ -174,26 +206,47 @@ def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Ca
     proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, known.least_px)
     some = _drawn(few, known)
     some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:_FIRST])
+    sets = minimal_sets(few, _logs(known, np.geomspace(_PHI_GRID[0], _PHI_GRID[-1], 60)))
+    sets = sets.take(np.argsort(costs(few, known, sets, rough_px))[:_THEN]) if len(sets) else sets
     some = refined(few, known, Candidates.joined(proposed, some), _FIRST_STEPS)
-    some = some.take(np.argsort(costs(few, known, some, rough_px))[:_THEN])
+    some = Candidates.joined(refined(few, known, sets, _FIRST_STEPS, rough_px), some)
+    some = some.take(apart(some, costs(few, known, some, rough_px), _NEAR)[:_THEN])
     return best_of(lines, known, Candidates.joined(proposed, refined(lines, known, some, _STEPS)))
 
 
 def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> Found:
     """The best of them, brought to their minima."""
     some = refined(lines, known, some, _LAST_STEPS)
-    cost = costs(lines, known, some, known.least_px)
+    cost, scale = judged(lines, known, some, known.least_px)
     order = np.argsort(cost)
-    best = some.take(order)
-    free = int(np.count_nonzero(~known.held))
-    scale = float(scales(lines.equations(best.take(np.array([0])))[0], free)[0, 0])
-    return Found(best, cost[order], scale)
+    return Found(some.take(order), cost[order], float(scale[order[0], 0]))
+
+
+def apart(poses: Candidates, costs: Array, least: float) -> Indices:
+    """(n,) numbers of those that stand elsewhere than each one that costs less, the least first.
+
+    Args:
+        least: rad by which, or share of the height by which, places are apart.
+    """
+    kept: list[int] = []
+    height = np.maximum(np.abs(poses.positions[:, 2]), 1e-9)
+    for number in np.argsort(costs, kind="stable"):
+        turned = np.linalg.norm(poses.rotations[kept] - poses.rotations[number], axis=(1, 2)) / np.sqrt(2.0)
+        moved = np.linalg.norm(poses.positions[kept] - poses.positions[number], axis=1) / height[kept]
+        if np.all((turned > least) | (moved > least)):
+            kept.append(int(number))
+    return np.array(kept, dtype=np.int64)
+
+
+def _logs(known: Beforehand, grid: Array) -> Array:
+    """Logarithms of phi to try, of a grid in half image diagonals; one where phi is told."""
+    middle, sd = known.log_phi
+    return middle + np.log(grid) - np.log(1.1) if sd > 0.2 else np.array([middle])
 
 
 def _drawn(few: Sightlines, known: Beforehand) -> Candidates:
     """A grid of rotations and phi, each with its position."""
-    middle, sd = known.log_phi
-    logs = middle + np.log(_PHI_GRID) - np.log(1.1) if sd > 0.2 else np.array([middle])
+    logs = _logs(known, np.array(_PHI_GRID))
     rotations = np.tile(_grid(), (len(logs), 1, 1))
     log_phi = np.repeat(logs, len(_grid()))
     positions, floor = few.positions(rotations, log_phi), float(few.places[:, 2].min())

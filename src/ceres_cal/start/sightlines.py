@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.cached import cached_property
 
 _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
@@ -85,6 +86,26 @@ class Sightlines:
     along: Array
     counts: tuple[int, int, int]
     curve: Indices
+
+    @cached_property
+    def groups(self) -> Indices:
+        """(F,) where each curve's rows begin, after those of points."""
+        own = self.curve[self._points.stop :]
+        return np.asarray(self._points.stop + np.flatnonzero(np.append(True, own[1:] != own[:-1])[: len(own)]))
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """First row and the one after the last of each curve."""
+        return list(zip(self.groups.tolist(), [*self.groups[1:].tolist(), len(self.curve)], strict=False))
+
+    @cached_property
+    def weight(self) -> Array:
+        """(N,) share of what each row says by itself: all rows of a line say two numbers, of an arc five."""
+        weight = np.ones(len(self.curve))
+        for first, last in self.spans:
+            says = 5.0 if first >= self._arcs.start else 2.0
+            weight[first:last] = min(1.0, says / (last - first))
+        return weight
 
     @property
     def independent(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.start.closed_forms import RadialProfile
-from ceres_cal.start.search import Beforehand, Found, best_of, information, searched
+from ceres_cal.start.search import Beforehand, Found, apart, best_of, information, searched
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
 _MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
@@ -105,7 +105,8 @@ def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, foun
     """With what the best place leaves open, and the others that fit alike."""
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
     matrix = information(lines, known, best, scale)
-    places = tuple(_place(found.poses, number, profile) for number in _alike(found)[:_MOST_PLACES])
+    alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
+    places = tuple(_place(found.poses, number, profile) for number in alike[:_MOST_PLACES])
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
@@ -146,21 +147,6 @@ def _place(poses: Candidates, number: int, profile: RadialProfile) -> Place:
     rotation = poses.rotations[number].T
     pose = np.column_stack([rotation, -rotation @ poses.positions[number]])
     return Place(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
-
-
-def _alike(found: Found) -> Sequence[int]:
-    """Numbers of those that fit about as well as the best, and stand elsewhere than each other."""
-    kept: list[int] = []
-    poses = found.poses
-    for number in np.flatnonzero(found.costs <= found.costs[0] + _ALIKE):
-        turned = [np.linalg.norm(poses.rotations[number] - poses.rotations[k]) / np.sqrt(2.0) for k in kept]
-        reach = [max(abs(float(poses.positions[k, 2])), 1e-9) for k in kept]
-        moved = [
-            np.linalg.norm(poses.positions[number] - poses.positions[k]) / r for k, r in zip(kept, reach, strict=True)
-        ]
-        if all(turn > _APART or move > _APART for turn, move in zip(turned, moved, strict=True)):
-            kept.append(int(number))
-    return kept
 
 
 def sightlines_of(sight: Sights, profile: RadialProfile, most_points: int, most_of_a_curve: int) -> Sightlines:

@@ -14,7 +14,14 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import check_header, convert, read_json
 from ceres_cal.base.transforms import Pose
-from ceres_cal.detect.photographs.refit import CAMERA, FreeIntrinsics, PointHints
+from ceres_cal.detect.photographs.refit import (
+    CAMERA,
+    NOTHING,
+    FreeIntrinsics,
+    PointHints,
+    observations_of,
+    refit_camera,
+)
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -36,14 +43,17 @@ _STRETCH = 0.03
 
 @dataclass(frozen=True)
 class Clicks:
-    """Pixels of named points of a target, good to some 15 px; they may lie outside the image."""
+    """Pixels of named points of a target, and of places somewhere on named curves, good to some 15 px; they may lie
+    outside the image.
+    """
 
     points: Mapping[str, tuple[float, float]]
+    curves: tuple[tuple[str, float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.points) < FEWEST:
             raise InputError(f"{FEWEST} points are needed to start from, not {len(self.points)}: show more corners")
-        if not np.all(np.isfinite(list(self.points.values()))):
+        if not np.all(np.isfinite([*self.points.values(), *(place[1:] for place in self.curves)])):
             raise InputError("a point to start from has a number that is not finite")
 
 
@@ -51,10 +61,12 @@ class _ClicksFile(msgspec.Struct, forbid_unknown_fields=True):
     format: str
     version: int
     points: dict[str, tuple[float, float]]
+    curves: tuple[tuple[str, float, float], ...] = ()
 
 
 def load_clicks(path: str | Path) -> Clicks:
-    """A file `{"format": "ceres-cal/corners", "version": 1, "points": {"TopLeftCorner": [x, y], ...}}`.
+    """A file `{"format": "ceres-cal/corners", "version": 1, "points": {"TopLeftCorner": [x, y], ...}}`, which may have
+    places of curves besides, `"curves": [["HalfwayLine", x, y], ...]`.
 
     Raises:
         InputError: one line that names the file.
@@ -66,7 +78,7 @@ def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
     """The clicks that a file describes; InputError that names `where`."""
     file = convert(check_header(data, where, FORMAT, VERSION), _ClicksFile, where)
     with naming(where):
-        return Clicks(file.points)
+        return Clicks(file.points, file.curves)
 
 
 def starts_from_clicks(
@@ -83,6 +95,9 @@ def starts_from_clicks(
     for name in clicks.points:
         if name not in target.point_index:
             raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    for name, *_ in clicks.curves:
+        if name not in target.curve_index:
+            raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
     index = np.array([target.point_index[name] for name in clicks.points], dtype=np.int32)
     pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 1e-6:
@@ -92,7 +107,14 @@ def starts_from_clicks(
     if not fitting:
         raise InputError(_odd_one(list(clicks.points), min((off for _, off in every), key=np.median)))
     phi = float(np.median([camera.phi for camera in fitting]))
-    hints = PointHints(index, pixels, np.full(len(index), SIGMA_PX))
+    curves = np.array([target.curve_index[name] for name, *_ in clicks.curves], dtype=np.int32)
+    places = np.array([place for _, *place in clicks.curves]).reshape(-1, 2)
+    sigmas = np.full(len(index), SIGMA_PX), np.full(len(curves), SIGMA_PX)
+    hints = PointHints(index, pixels, sigmas[0], curves, places, sigmas[1])
+    if len(curves):
+        shown = observations_of(target, image_size, *NOTHING, hints)
+        refitted = (refit_camera(camera, shown) for camera in fitting)
+        fitting = [one[0] if one is not None else camera for one, camera in zip(refitted, fitting, strict=True)]
     return fitting, unknown_optics(image_size, phi, hints, lengths)
 
 

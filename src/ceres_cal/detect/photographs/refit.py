@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,16 +20,24 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
+NOTHING: tuple[Indices32, Array, Array] = (np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
+"""Curves, pixels and sigmas of no place."""
 _QUICK = Options(max_iterations=30, threads=1)
+ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
 @dataclass(frozen=True, eq=False)
 class PointHints:
-    """Points that somebody showed: index (P,) among the target's, pixels (P, 2), sigma_px (P,)."""
+    """What somebody showed: points by their index (P,) among the target's, pixels (P, 2), sigma_px (P,), and places
+    (N, 2) px of curves (N,), with sigmas (N,).
+    """
 
     feature: Indices32
     pixels: Array
     sigma_px: Array
+    curve: Indices32 = field(default_factory=lambda: NOTHING[0])
+    places: Array = field(default_factory=lambda: NOTHING[1])
+    place_sigma_px: Array = field(default_factory=lambda: NOTHING[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +47,7 @@ class FreeIntrinsics:
     Attributes:
         names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
             the target, which are free because of that.
-        hints: points that somebody showed, which hold the camera while lines are far off.
+        hints: what somebody showed, which holds the camera while lines are far off.
         keep: whether the starts are known to be near: nothing far off is looked at.
     """
 
@@ -57,11 +65,13 @@ def observations_of(
     sigma_px: Array,
     hints: PointHints | None = None,
 ) -> Observations:
-    """One view of a field in the world: pixels (N, 2) on curves (N,), and points."""
-    count = len(curve)
+    """One view of a field in the world: pixels (N, 2) on curves (N,), and what somebody showed besides."""
     points = NO_POINTS
     if hints is not None:
         points = Points(np.zeros(len(hints.feature), np.int32), hints.feature, hints.pixels, hints.sigma_px)
+        curve, pixels = np.concatenate([curve, hints.curve]), np.concatenate([pixels, hints.places])
+        sigma_px = np.concatenate([sigma_px, hints.place_sigma_px])
+    count = len(curve)
     return Observations(
         {TARGET: target},
         {CAMERA: image_size},
@@ -72,7 +82,11 @@ def observations_of(
 
 
 def problem_of(
-    camera: Camera, observations: Observations, free: tuple[str, ...], priors: tuple[Prior, ...]
+    camera: Camera,
+    observations: Observations,
+    free: tuple[str, ...],
+    priors: tuple[Prior, ...],
+    weighting: Weighting = ROBUST,
 ) -> tuple[Problem, Estimate]:
     """What `refit_camera` solves, and where from."""
     names, solved = intrinsic_names(camera.lens), tuple(prior.dimension for prior in priors if prior.dimension)
@@ -85,20 +99,24 @@ def problem_of(
     )
     layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset())
     known = tuple(stated_prior(prior, camera.lens) for prior in priors)
-    weighting = Weighting(loss="cauchy", loss_scale=2.0)
     return Problem(gather_sights(observations), layout, known, weighting, _QUICK), estimate
 
 
 def refit_camera(
-    camera: Camera, observations: Observations, free: tuple[str, ...] = (), priors: tuple[Prior, ...] = ()
+    camera: Camera,
+    observations: Observations,
+    free: tuple[str, ...] = (),
+    priors: tuple[Prior, ...] = (),
+    weighting: Weighting = ROBUST,
 ) -> tuple[Camera, Target] | None:
     """The posed camera that one view's observations tell, from one that is near, and the target; None where they tell
     none.
 
     Args:
         free: names of the intrinsics that are free too. priors: on them, and on dimensions that are solved for.
+        weighting: noise and loss; by default one under which what is far off decides nothing.
     """
-    problem, estimate = problem_of(camera, observations, free, priors)
+    problem, estimate = problem_of(camera, observations, free, priors, weighting)
     try:
         solution = solve(problem, estimate, precision=1e-6)
         refitted = solution.estimate.camera_at(STATION)

@@ -9,12 +9,18 @@ from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.effect import Case, Effect
 
 
-def _rows() -> list[Effect]:
+def rows() -> dict[str, Effect]:
+    """The effects of every module of the folder, by kind."""
     modules = (import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__))
-    return [effect for module in modules for effect in module.EFFECTS]
+    return {effect.kind: effect for module in modules for effect in module.EFFECTS}
 
 
-EFFECTS: dict[str, Effect] = {effect.kind: effect for effect in _rows()}
+EFFECTS = rows()
+
+
+def estimated() -> list[Effect]:
+    """Those that `calibrate` solves for, and widens by."""
+    return [effect for effect in EFFECTS.values() if effect.prior is not None]
 
 
 def columns_of_all(case: Case) -> list[EffectColumns]:

@@ -1,6 +1,7 @@
 // A chunk of observations is laid out number by number, so that plain loops over it fill the SIMD registers.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 
 #if defined(__clang__)
@@ -28,6 +29,30 @@ inline void each(int n, Body body) {
     const int end = n & ~(LANES - 1);
     CERES_CAL_INDEPENDENT
     for (int i = 0; i < end; ++i) body(i);
+}
+
+// products = P P^T over the first n places of so many rows, lower triangle, each of its rows so many numbers and three
+// long. Four rows by three, to read each one less; of more sums at once than the processor has registers for each takes
+// longer.
+inline void find_products(double* const* own, int count, int n, double* products) {
+    const int last = count - 1, stride = count + 3, end = n & ~(LANES - 1);
+    for (int k = 0; k < count; k += 4) {
+        const double *a = own[k], *b = own[std::min(k + 1, last)], *c = own[std::min(k + 2, last)],
+                     *d = own[std::min(k + 3, last)];
+        for (int j = 0; j < std::min(k + 4, count); j += 3) {
+            const double *x = own[j], *y = own[std::min(j + 1, last)], *z = own[std::min(j + 2, last)];
+            double ax = 0.0, ay = 0.0, az = 0.0, bx = 0.0, by = 0.0, bz = 0.0;
+            double cx = 0.0, cy = 0.0, cz = 0.0, dx = 0.0, dy = 0.0, dz = 0.0;
+            for (int i = 0; i < end; ++i) {
+                ax += a[i] * x[i], ay += a[i] * y[i], az += a[i] * z[i];
+                bx += b[i] * x[i], by += b[i] * y[i], bz += b[i] * z[i];
+                cx += c[i] * x[i], cy += c[i] * y[i], cz += c[i] * z[i];
+                dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
+            }
+            const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
+            for (int row = 0; row < 4; ++row) std::copy_n(sums[row], 3, products + stride * (k + row) + j);
+        }
+    }
 }
 
 // Rays in the camera's frame.

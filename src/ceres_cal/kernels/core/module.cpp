@@ -4,9 +4,10 @@
 #include <windows.h>
 #endif
 
-#include "alignment.hpp"
 #include "arguments.hpp"
-#include "rows.hpp"
+#include "planes.hpp"
+#include "saddles.hpp"
+#include "sums.hpp"
 
 namespace ceres_cal {
 namespace {
@@ -208,6 +209,15 @@ bool find_rows(Tuple optics, const Poses& poses, Tuple columns, const Filled<N, 
     });
 }
 
+void fit_saddles(const Array<const float, N, N>& levels, const Read<N, Saddles::START>& starts,
+                 const Filled<N, Saddles::FITTED>& fitted) {
+    require(starts.shape(0) == fitted.shape(0), "starts and fitted are of as many corners");
+    unlocked([&] {
+        Saddles saddles({levels.data(), static_cast<int64_t>(levels.shape(0)), static_cast<int64_t>(levels.shape(1))});
+        for (size_t k = 0; k < starts.shape(0); ++k) saddles.fit(row(starts, k), row(fitted, k));
+    });
+}
+
 // Whether the other build, for processors of x86-64-v3, runs here, and there is one.
 bool has_avx2() {
 #if !defined(CERES_CAL_HAS_V3)
@@ -235,6 +245,7 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("point_residuals", &find_residuals<PointsGiven, 2>);
     m.def("curve_residuals", &find_residuals<CurvesGiven, 1>);
     m.def("point_rows", &find_rows<PointsGiven, 2>);
+    m.def("fit_saddles", &fit_saddles);
     m.def("curve_rows", &find_rows<CurvesGiven, 1>);
 }
 

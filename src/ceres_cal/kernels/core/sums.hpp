@@ -4,7 +4,7 @@
 #include <limits>
 #include <vector>
 
-#include "losses.hpp"
+#include "observations.hpp"
 #include "projection.hpp"
 
 namespace ceres_cal {
@@ -78,7 +78,7 @@ class Sums {
                 each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
         }
         if (newton_) bend_rows<code>(n, MANY);
-        add_products(MANY * filled);
+        add_rows(MANY * filled);
         for (int i = 0; i < n && seen.slots != nullptr; ++i) {
             double directions[BUILT][3] = {};
             shown_.directions(seen, start + i, i, directions);
@@ -100,28 +100,10 @@ class Sums {
             own_.push_back(shown_.rows.x(shown_.pose_row + k)), places_.push_back(unknowns_.shared() + k);
     }
 
-    // normal += P P^T over the rows' first n places, lower triangle; four rows by three, to read each one less. (Of
-    // more sums at once than the processor has registers for each takes longer.)
-    void add_products(int n) {
-        const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(), stride = size + 3,
-                  end = n & ~(LANES - 1);
-        for (int k = 0; k < count; k += 4) {
-            const double *a = own_[k], *b = own_[std::min(k + 1, last)], *c = own_[std::min(k + 2, last)],
-                         *d = own_[std::min(k + 3, last)];
-            for (int j = 0; j < std::min(k + 4, count); j += 3) {
-                const double *x = own_[j], *y = own_[std::min(j + 1, last)], *z = own_[std::min(j + 2, last)];
-                double ax = 0.0, ay = 0.0, az = 0.0, bx = 0.0, by = 0.0, bz = 0.0;
-                double cx = 0.0, cy = 0.0, cz = 0.0, dx = 0.0, dy = 0.0, dz = 0.0;
-                for (int i = 0; i < end; ++i) {
-                    ax += a[i] * x[i], ay += a[i] * y[i], az += a[i] * z[i];
-                    bx += b[i] * x[i], by += b[i] * y[i], bz += b[i] * z[i];
-                    cx += c[i] * x[i], cy += c[i] * y[i], cz += c[i] * z[i];
-                    dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
-                }
-                const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
-                for (int row = 0; row < 4; ++row) std::copy_n(sums[row], 3, products_.data() + stride * (k + row) + j);
-            }
-        }
+    // normal += P P^T over the rows' first n places, lower triangle.
+    void add_rows(int n) {
+        const int count = static_cast<int>(own_.size()), size = unknowns_.size(), stride = count + 3;
+        find_products(own_.data(), count, n, products_.data());
         for (int k = 0; k < count; ++k) {
             double* own = normal_ + size * places_[k];
             for (int j = 0; j <= k; ++j) own[places_[j]] += products_[stride * k + j];
@@ -186,5 +168,65 @@ class Sums {
     std::vector<int> places_;
     std::vector<double> products_;  // room for three rows and columns more
 };
+
+// ---- every observation for itself, in px: residuals, and the Jacobian that the sums are made of ----
+
+// The residuals of one sight, project(X) - p of points and the signed distance from pixels to their curves, to the
+// places `rows` (null: in order); NaN, and false, where there is none. s is moved to the foot.
+template <class Columns>
+inline bool residuals_of(int64_t sight, Projection& shown, const double* pose, const Columns& seen, const int64_t* rows,
+                         double* residuals) {
+    constexpr int MANY = Columns::RESIDUALS;
+    const auto place = [&](int64_t k) { return residuals + MANY * (rows != nullptr ? rows[k] : k); };
+    const auto of_chunk = [&](int64_t start, int n) {
+        if (!shown.show(start, n, pose, seen)) return false;
+        for (int i = 0; i < n; ++i) {
+            double* own = place(start + i);
+            own[0] = MANY == 2 ? shown.off_x(i) : shown.distance(i);
+            if (MANY == 2) own[1] = shown.off_y(i);
+        }
+        return true;
+    };
+    return all_chunks(seen, sight, [&](int64_t start, int n) {
+        const bool good = of_chunk(start, n);
+        for (int64_t k = start; !good && k < start + n; ++k)
+            if (!of_chunk(k, 1)) std::fill_n(place(k), MANY, NO_ANSWER);
+        return good;
+    });
+}
+
+// d residual / d [intrinsics | 6 pose | what moves the observation, BUILT] of one sight into `rows`, RESIDUALS of them
+// for each observation; false, and NaN, where a chunk of it cannot be projected. normals: of curves (M, 2), filled with
+// the image normal at the foot.
+template <class Columns>
+inline bool rows_of(int64_t sight, Projection& shown, const double* pose, const Columns& seen, double* rows,
+                    double* normals) {
+    constexpr int MANY = Columns::RESIDUALS;
+    const int numbers = shown.last_row, size = numbers + BUILT;
+    return all_chunks(seen, sight, [&](int64_t start, int n) {
+        double* row = rows + MANY * size * start;
+        if (!shown.show(start, n, pose, seen)) {
+            std::fill_n(row, static_cast<size_t>(MANY) * size * n, NO_ANSWER);
+            return false;
+        }
+        shown.differentiate(false);
+        for (int k = 0; k < shown.pose_row; ++k) shown.rows.open(k);
+        for (int i = 0; i < n; ++i) {
+            double nx = 0.0, ny = 0.0;
+            if (MANY == 1) nx = shown.normal_x[i], ny = shown.normal_y[i];
+            if (MANY == 1) normals[2 * (start + i)] = nx, normals[2 * (start + i) + 1] = ny;
+            double directions[BUILT][3] = {};
+            shown.directions(seen, start + i, i, directions);
+            for (int c = 0; c < MANY; ++c, row += size) {
+                for (int k = 0; k < numbers; ++k) {
+                    const double x = shown.rows.x(k)[i], y = shown.rows.y(k)[i];
+                    row[k] = MANY == 1 ? nx * x + ny * y : (c == 0 ? x : y);
+                }
+                for (int a = 0; a < BUILT; ++a) row[numbers + a] = along(row + numbers - 3, pose, directions[a]);
+            }
+        }
+        return true;
+    });
+}
 
 }  // namespace ceres_cal

@@ -14,7 +14,7 @@ from ceres_cal.base.words import frame_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.report.pictures.model import Model, model_seen
-from ceres_cal.report.pictures.overlay import TAKEN_OUT, USED, Marks
+from ceres_cal.report.pictures.overlay import Marks
 
 Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""
@@ -107,5 +107,8 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     here = [np.isin(columns.view, frame.views) for columns in both]
     pixels = np.concatenate([columns.pixels[rows] for columns, rows in zip(both, here, strict=True)])
     used = np.concatenate([mask[rows] for mask, rows in zip(inliers, here, strict=True)])
-    marks = Marks(pixels[used], "observed", USED), Marks(pixels[~used], "taken out", TAKEN_OUT, crosses=True)
+    marks = (
+        Marks(pixels[used], "observed", "used"),
+        Marks(pixels[~used], "taken out", "taken out", crosses=True),
+    )
     return tuple(one for one in marks if len(one.pixels))

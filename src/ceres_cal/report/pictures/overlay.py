@@ -13,38 +13,43 @@ from ceres_cal.report.pictures.model import CurveOutline, Model
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""
-BEFORE: Colour = (255, 190, 0)  # cyan: apart from magenta for colour-blind eyes, and neither is paint nor carpet
-AFTER: Colour = (200, 0, 255)
-LIFTED: Colour = (0, 220, 255)
-USED: Colour = (255, 120, 30)
-TAKEN_OUT: Colour = (0, 94, 213)
-
-_SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
-_ONE = 1 << _SHIFT
-_USUAL_PX = 1600.0  # diagonal of the image from which on everything is drawn thicker
-_POINT_PX, _DOT_PX, _LETTER_PX, _PAD_PX = 6.0, 2.2, 18.0, 8.0
+COLOURS: dict[str, Colour] = {
+    "before": (255, 190, 0),  # cyan: apart from magenta for colour-blind eyes, and neither is paint nor carpet
+    "after": (200, 0, 255),
+    "lifted": (0, 220, 255),
+    "used": (255, 120, 30),
+    "taken out": (0, 94, 213),
+    "ink": (30, 30, 30),
+}
+_STYLE = {
+    "usual_px": 1600.0,  # diagonal of the image from which on everything is drawn thicker
+    "point_px": 6.0,
+    "dot_px": 2.2,
+    "letter_px": 18.0,
+    "pad_px": 8.0,
+    "font_px": 22.0,  # height of the font's capitals at scale 1
+    "paper": 0.82,  # how much of the photograph the legend's ground hides
+}
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_FONT_PX = 22.0  # height of that font's capitals at scale 1
-_INK: Colour = (30, 30, 30)
-_PAPER = 0.82  # how much of the photograph the legend's ground hides
+_SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A model in one colour; its label stands in the legend."""
+    """A model in one of COLOURS; its label stands in the legend."""
 
     model: Model
     label: str
-    colour: Colour
+    colour: str
 
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Observed pixels (N, 2) in one colour, with what they are; dots, or crosses for what was taken out."""
+    """Observed pixels (N, 2) in one of COLOURS, with what they are; dots, or crosses for what was taken out."""
 
     pixels: Array
     what: str
-    colour: Colour
+    colour: str
     crosses: bool = False
 
 
@@ -55,19 +60,22 @@ def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Mar
     not tell.
     """
     canvas = in_8_bit_colour(photograph)
-    thick = max(1.0, float(np.hypot(*canvas.shape[:2])) / _USUAL_PX)
+    thick = max(1.0, float(np.hypot(*canvas.shape[:2])) / _STYLE["usual_px"])
+    size = _STYLE["point_px"] * thick
     for layer in layers:
+        colour = COLOURS[layer.colour]
         for line in layer.model.lines:
-            _draw_line(canvas, line, layer.colour, round(thick))
-        _draw_crosses(canvas, layer.model.points, _POINT_PX * thick, layer.colour, round(thick), upright=True)
+            _draw_line(canvas, line, colour, round(thick))
+        _draw_crosses(canvas, layer.model.points, size, colour, round(thick), upright=True)
     for mark in marks:
+        colour = COLOURS[mark.colour]
         if mark.crosses:
-            _draw_crosses(canvas, mark.pixels, _POINT_PX * thick, mark.colour, round(thick), upright=False)
+            _draw_crosses(canvas, mark.pixels, size, colour, round(thick), upright=False)
         else:
-            _draw_dots(canvas, mark.pixels, _DOT_PX * thick, mark.colour)
+            _draw_dots(canvas, mark.pixels, _STYLE["dot_px"] * thick, colour)
     return _with_legend(
         canvas,
-        [*((layer.label, layer.colour) for layer in layers), *((mark.what, mark.colour) for mark in marks)],
+        [(one.label, COLOURS[one.colour]) for one in layers] + [(one.what, COLOURS[one.colour]) for one in marks],
         thick,
     )
 
@@ -98,7 +106,7 @@ def _draw_crosses(canvas: Image8, pixels: Array, size: float, colour: Colour, th
 
 def _draw_dots(canvas: Image8, pixels: Array, radius: float, colour: Colour) -> None:
     for x, y in _fixed(pixels[_drawable(pixels, canvas)]).tolist():
-        cv2.circle(canvas, (x, y), round(radius * _ONE), colour, -1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(canvas, (x, y), round(radius * (1 << _SHIFT)), colour, -1, cv2.LINE_AA, _SHIFT)
 
 
 def _drawable(pixels: Array, canvas: Image8) -> Mask:
@@ -108,22 +116,23 @@ def _drawable(pixels: Array, canvas: Image8) -> Mask:
 
 
 def _fixed(pixels: Array) -> Indices32:
-    return np.round(_ONE * pixels).astype(np.int32)
+    return np.round((1 << _SHIFT) * pixels).astype(np.int32)
 
 
 def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: float) -> Image8:
-    scale, pad, row = _LETTER_PX * thick / _FONT_PX / 1.4, _PAD_PX * thick, 1.3 * _LETTER_PX * thick
+    letter, pad = _STYLE["letter_px"] * thick, _STYLE["pad_px"] * thick
+    scale, row = letter / _STYLE["font_px"] / 1.4, 1.3 * letter
     stroke = max(1, round(thick))
     texts = [label.encode("ascii", "replace").decode() for label, _ in entries]  # the font has no other letters
     widest = max((cv2.getTextSize(text, _FONT, scale, stroke)[0][0] for text in texts), default=0)
     sample = 2.0 * row
     top, right = int(canvas.shape[0] - row * len(texts) - 2.0 * pad), int(3.0 * pad + sample + widest)
     ground = canvas[max(top, 0) :, :right]
-    ground[:] = np.round((1.0 - _PAPER) * ground + _PAPER * 255.0)
+    ground[:] = np.round((1.0 - _STYLE["paper"]) * ground + _STYLE["paper"] * 255.0)
     for number, (text, (_, colour)) in enumerate(zip(texts, entries, strict=True)):
         middle = top + pad + (number + 0.5) * row
         ends = _fixed(np.array([[pad, middle], [pad + sample, middle]]))
         cv2.line(canvas, ends[0].tolist(), ends[1].tolist(), colour, 2 * stroke, cv2.LINE_AA, _SHIFT)
-        place = (int(2.0 * pad + sample), int(middle + 0.35 * _LETTER_PX * thick))
-        cv2.putText(canvas, text, place, _FONT, scale, _INK, stroke, cv2.LINE_AA)
+        place = (int(2.0 * pad + sample), int(middle + 0.35 * letter))
+        cv2.putText(canvas, text, place, _FONT, scale, COLOURS["ink"], stroke, cv2.LINE_AA)
     return canvas

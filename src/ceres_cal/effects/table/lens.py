@@ -1,4 +1,4 @@
-"""The radial polynomial of a lens is too short, or a lens is finer than its knots."""
+"""The lens: a polynomial that is too short, parts that are not centred, a thin prism before it."""
 
 from __future__ import annotations
 
@@ -106,4 +106,82 @@ def _waves(case: Case, camera: str, own: Mask) -> Array:
     return np.asarray(outward * np.cos(np.pi * np.array(_WAVES) * radius / np.max(radius, initial=1e-12)))
 
 
-EFFECTS = (Radius(),)
+class Decentring(Effect):
+    """Brown's tangential displacement, where the lens does not solve for it."""
+
+    kind = "decentring"
+    absorbed = True
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        columns, group = np.zeros((len(case.equations), 2)), case.camera.copy()
+        for number, name in enumerate(case.cameras):
+            own = case.camera == number
+            parts = _tangential(case.estimate.cameras[name].lens)
+            if parts and set(parts) <= case.free_coefficients(name):
+                group[own] = -1
+            else:
+                columns[own] = _decentring_columns(case, name)[own]
+        yield EffectColumns(self.kind, columns, group, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
+        lens = evidence.case.estimate.cameras[name].lens
+        own = _tangential(lens)
+        kind, names = next((kind, lens.decentring) for kind, lens in LENSES.items() if lens.decentring)
+        if own and not set(own) <= set(lens.names):
+            advice = f"calibrate with --terms tangential, which frees {' and '.join(own)}"
+        elif own:
+            advice = f"let {' and '.join(own)} free"
+        else:
+            advice = f"calibrate with --lens {kind}, which has {' and '.join(names)}"
+        return Words(
+            f"camera {name!r}: its lens is not centred: a tangential displacement of up to "
+            f"{evidence.most_px(every):.2f} px ({evidence.size})",
+            advice,
+        )
+
+
+def _tangential(lens: Lens) -> tuple[str, ...]:
+    """Names of Brown's decentring coefficients, which it has or may have."""
+    own = tuple(name for name in ("p1", "p2") if name in lens.names)
+    return own or lens.more_terms.get("tangential", ())
+
+
+def _decentring_columns(case: Case, camera: str) -> Array:
+    """(E, 2) px of Brown's tangential displacements, 1 px at half the image diagonal."""
+    x, y = case.offsets(camera).T
+    r2 = x * x + y * y
+    first = np.column_stack([2.0 * x * y, r2 + 2.0 * y * y])
+    second = np.column_stack([r2 + 2.0 * x * x, 2.0 * x * y])
+    return np.column_stack([np.sum(case.equations.direction * field, axis=1) for field in (first, second)])
+
+
+class Prism(Effect):
+    """OpenCV's thin prism, where the lens does not solve for it: all is displaced one way, by r^2 and r^4."""
+
+    kind = "prism"
+    absorbed = True
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        columns, group = np.zeros((len(case.equations), 4)), case.camera.copy()
+        for number, name in enumerate(case.cameras):
+            own, parts = case.camera == number, case.estimate.cameras[name].lens.more_terms.get("prism", ())
+            if parts and set(parts) <= case.free_coefficients(name):
+                group[own] = -1
+                continue
+            r2 = np.sum(case.offsets(name)[own] ** 2, axis=1)[:, None]
+            columns[own] = np.hstack([case.equations.direction[own] * r2, case.equations.direction[own] * r2**2])
+        yield EffectColumns(self.kind, columns, group, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
+        kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
+        own = evidence.case.estimate.cameras[name].lens.kind == kind
+        return Words(
+            f"camera {name!r}: its picture is displaced one way towards its rim, as by a thin prism, by up to "
+            f"{evidence.most_px(every):.2f} px ({evidence.size})",
+            f"calibrate with {'' if own else f'--lens {kind} '}--terms prism",
+        )
+
+
+EFFECTS = (Radius(), Decentring(), Prism())

@@ -1,21 +1,22 @@
-"""Observations that belong, or not, as a whole.
+"""Observations that belong, or not, as a group, and which of them are compared with one another.
 
-A curve in one frame, a feature over all frames of a static camera; a frame of a static camera, a placement.
-
-Which observations are looked at where it is asked whether some do not belong, as a whole.
-
-The answer rests on a few rows of a few views: of those that stand out, and of others, evenly. So of very many
-observations a part is asked, with all rows of the views that stand out.
+A curve in one frame, a feature over all frames of a static camera; a frame of a static camera, a placement. Whether one
+does not belong rests on a few rows of a few views: of those that stand out, and of others, evenly. So of very many
+observations a part is compared, with all rows of the views that stand out.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, median
+from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.evidence import FEATURE_ASIDE, VIEW_ASIDE, SizePrior
 from ceres_cal.observations import Columns, Observations, View
 from ceres_cal.observations.sights import Sights
 from ceres_cal.observations.thinning import column_of
@@ -25,24 +26,27 @@ from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.targets import Arc
 
 FEWEST_VIEWS = 4  # of which one may not belong
-FEWEST = 3  # observations of a whole: two numbers of a line's offset, and one left over
+FEWEST = 3  # observations of a group: two numbers of a line's offset, and one left over
 
 
 @dataclass(frozen=True, eq=False)
-class ObservationGroups:
-    """The wholes of one kind, by number; there are numbers of which nothing was observed.
+class ObservationGroups(ABC):
+    """The groups of one kind, by number, each of which may lie aside: an effect whose size is large. There are numbers
+    of which nothing was observed.
 
     Attributes:
-        observations: all of them. of: (N + M,) number of the whole of each, points by row and then curves by row; -1
+        kind: of the effect. prior: of one that lies aside. most_views: that are compared with one another.
+        observations: all of them. of: (N + M,) number of the group of each, points by row and then curves by row; -1
             for none. size: how many numbers there are. frames: (V,) how many go with each view.
-        of_features: whether they are features, or views and placements.
     """
 
+    kind: ClassVar[str]
+    prior: ClassVar[SizePrior]
+    most_views: ClassVar[int]
     observations: Observations
     of: Indices32
     size: int
     frames: Indices
-    of_features: bool = True
 
     def count(self, rows: Mask) -> Indices:
         """(size,) how many of these observations (N + M,) each has."""
@@ -54,29 +58,50 @@ class ObservationGroups:
         chosen[numbers] = True
         return np.asarray(chosen[self.of])
 
-    def modes(self, equations: Equations, chosen: Indices) -> tuple[Array, Indices]:
-        """How each of the chosen may lie aside, columns (E, K) of order one; its place among them (E,), -1 for none.
-
-        A line may lie aside along its image's normal and be turned, an arc also be bent, a point lie aside either way;
-        a view may be one from elsewhere, or of a target that is longer, wider, askew or bowed.
-        """
+    def columns(self, equations: Equations, chosen: Indices) -> EffectColumns:
+        """How each of the chosen may lie aside, in standard deviations of an equation, columns of order one."""
         place = np.full(self.size + 1, -1)
         place[chosen] = np.arange(len(chosen))
         group = place[self.of[equations.observation]]
-        every = np.zeros((len(equations), 3)) if self.of_features else _view_modes(equations)
+        every = self.modes(equations, group)
         for number in range(len(chosen)):
             rows = np.flatnonzero(group == number)
-            if self.of_features and len(rows):
-                every[rows] = _feature_modes(equations, rows)
             sizes = np.sqrt(np.mean(every[rows] ** 2, axis=0)) if len(rows) else np.ones(every.shape[1])
             every[rows] /= np.where(sizes > 0.0, sizes, 1.0)
-        return every, np.asarray(group)
+        return EffectColumns(self.kind, every, np.asarray(group), tuple(map(str, chosen.tolist())))
 
+    @abstractmethod
+    def modes(self, equations: Equations, group: Indices) -> Array:
+        """(E, K) the ways to lie aside, by group (E,), -1 for none."""
+
+    @abstractmethod
     def name(self, number: int) -> str:
         """What one of them is, as in "line 'HalfwayLine' in frame '0003'"."""
+
+    @abstractmethod
+    def standing_out(self, end: RobustSolution, taking_part: Mask) -> Array:
+        """(V,) how far what they are, or have, in each view stands out."""
+
+
+class FeatureGroups(ObservationGroups):
+    """Features, in a frame or in all frames of a static camera.
+
+    A line may lie aside along its image's normal and be turned, an arc also be bent, a point lie aside either way.
+    """
+
+    kind = "feature aside"
+    prior = FEATURE_ASIDE
+    most_views = 8
+
+    def modes(self, equations: Equations, group: Indices) -> Array:
+        every = np.zeros((len(equations), 3))
+        for number in distinct(group[group >= 0]):
+            rows = np.flatnonzero(group == number)
+            every[rows] = _feature_modes(equations, rows)
+        return every
+
+    def name(self, number: int) -> str:
         observations, row = self.observations, int(np.argmax(self.of == number))
-        if not self.of_features:
-            return self._view_name(row)
         points = len(observations.points)
         kind, row = ("curve", row - points) if row >= points else ("point", row)
         at = int((observations.curves if kind == "curve" else observations.points).view[row])
@@ -86,14 +111,34 @@ class ObservationGroups:
         where = f"frame {view.frame!r}" if self.frames[at] == 1 else f"all {self.frames[at]} frames"
         return f"{kind} {feature!r} in {where}{_seen_by(observations, view)}"
 
-    def _view_name(self, row: int) -> str:
-        observations = self.observations
+    def standing_out(self, end: RobustSolution, taking_part: Mask) -> Array:
+        return _largest(self.observations, end)
+
+
+class ViewGroups(ObservationGroups):
+    """Frames of a static camera, and placements.
+
+    One may be a view from elsewhere, or of a target that is longer, wider, askew or bowed.
+    """
+
+    kind = "view aside"
+    prior = VIEW_ASIDE
+    most_views = 24
+
+    def modes(self, equations: Equations, group: Indices) -> Array:
+        return _view_modes(equations)
+
+    def name(self, number: int) -> str:
+        observations, row = self.observations, int(np.argmax(self.of == number))
         points = len(observations.points)
         column: Columns = observations.curves if row >= points else observations.points
         view = observations.views[int(column.view[row - points if row >= points else row])]
         if view.placement is not None:
             return f"placement {view.placement!r}"
         return f"frame {view.frame!r}{_seen_by(observations, view)}"
+
+    def standing_out(self, end: RobustSolution, taking_part: Mask) -> Array:
+        return excess(self.observations, self, end, taking_part)[_owner(self, column_of(self.observations, "view"))]
 
 
 def _seen_by(observations: Observations, view: View) -> str:
@@ -126,7 +171,7 @@ def _view_modes(equations: Equations) -> Array:
     return np.hstack([equations.pose, stretch, bows])
 
 
-def wholes_of(observations: Observations, sights: Sights) -> Iterator[ObservationGroups]:
+def groups_of(observations: Observations, sights: Sights) -> Iterator[ObservationGroups]:
     """Curves in single frames; where a static camera has several, curves and points over all of them; then frames and
     placements, where there are enough.
     """
@@ -136,9 +181,9 @@ def wholes_of(observations: Observations, sights: Sights) -> Iterator[Observatio
         if key.placement is None and len(own) > 1:
             together[list(own)], frames[list(own)] = number, len(own)
     if len(observations.curves):
-        yield _wholes(observations, views, np.ones_like(views))
+        yield _features(observations, views, np.ones_like(views))
         if np.any(frames):
-            yield _wholes(observations, together, frames)
+            yield _features(observations, together, frames)
     placed: dict[str, int] = {}
     owner = views.copy()
     for number, view in enumerate(observations.views):
@@ -147,10 +192,10 @@ def wholes_of(observations: Observations, sights: Sights) -> Iterator[Observatio
     owner[(owner < len(views)) & (frames == 0)] = -1
     if len(distinct(owner[owner >= 0])) >= FEWEST_VIEWS:
         of = owner[np.concatenate([observations.points.view, observations.curves.view])]
-        yield ObservationGroups(observations, of.astype(np.int32), len(views) + len(placed), frames, of_features=False)
+        yield ViewGroups(observations, of.astype(np.int32), len(views) + len(placed), frames)
 
 
-def _wholes(observations: Observations, owner: Indices, frames: Indices) -> ObservationGroups:
+def _features(observations: Observations, owner: Indices, frames: Indices) -> FeatureGroups:
     """Of features by owner (V,) of their views, -1 for none; of single frames only curves."""
     columns = (observations.points, observations.curves)
     view, feature = (
@@ -162,7 +207,7 @@ def _wholes(observations: Observations, owner: Indices, frames: Indices) -> Obse
     target = np.array([targets[one.target] for one in observations.views])
     names = int(feature.max(initial=0)) + 1
     number = ((owner[view] * 2 + is_curve) * len(targets) + target[view]) * names + feature
-    return ObservationGroups(
+    return FeatureGroups(
         observations,
         np.where(takes_part, number, -1).astype(np.int32),
         (int(owner.max()) + 1) * 2 * len(targets) * names,
@@ -170,15 +215,14 @@ def _wholes(observations: Observations, owner: Indices, frames: Indices) -> Obse
     )
 
 
-_MOST_VIEWS, _MOST_WHOLE_VIEWS = 8, 24  # whose features, or which, are looked at together: at the cube of the number
 _MOST_OTHERS = 16  # views besides, which tell the lens
-_MOST_TOGETHER = 256  # wholes, at the cube of the number: 8 views of a field of 32 lines; 1350 took 25 s
-_MOST_ROWS = 40  # of a whole in one view
-# Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
+_MOST_TOGETHER = 256  # groups, at the cube of the number: 8 views of a field of 32 lines; 1350 took 25 s
+_MOST_ROWS = 40  # of a group in one view
+# Share of a group's observations in use below which it is compared in any case: its other rows are good by chance.
 _LEFT = 0.5
-_MOST_REJECTED = 4  # such wholes of a kind, whose views are asked
+_MOST_REJECTED = 4  # such groups of a kind, whose views are asked
 # Observations that are asked, and views of them: what the free numbers take up is projected out of the few rows that
-# are looked at, so a solve has but to end in the right valley.
+# are compared, so a solve has but to end in the right valley.
 _MOST_ASKED, _FEWEST_ASKED = 200_000, 200
 
 
@@ -187,7 +231,7 @@ class Subproblem:
     """The observations that are asked, with their problem and its end.
 
     Attributes:
-        kinds: of wholes, numbered as among all of them.
+        kinds: of groups, numbered as among all of them.
     """
 
     problem: Problem
@@ -206,7 +250,7 @@ class Subproblem:
         return replace(others, layout=others.layout.of(others.sights.keys))
 
 
-def asked(every: Subproblem) -> Subproblem:
+def compared_part(every: Subproblem) -> Subproblem:
     """All observations, or of very many some: of views that stand out, and of others evenly."""
     observations, sights = every.observations, every.problem.sights
     if len(sights.point_rows) + len(sights.curve_rows) <= _MOST_ASKED:
@@ -216,10 +260,10 @@ def asked(every: Subproblem) -> Subproblem:
     there[sights.point_rows] = there[points + sights.curve_rows] = True
     view = column_of(observations, "view")
     chosen = _some_views(np.bincount(view[there], minlength=len(observations.views)))
-    for wholes in every.kinds:
-        gone = mostly_rejected(wholes, every.end, there)
+    for groups in every.kinds:
+        gone = mostly_rejected(groups, every.end, there)
         worst = np.argsort(-gone, kind="stable")[: min(_MOST_REJECTED, np.count_nonzero(gone))]
-        chosen |= views_looked_at(observations, wholes, every.end, there, wholes.among(worst) & there)
+        chosen |= views_compared(observations, groups, every.end, there, groups.among(worst) & there)
     there &= chosen[view]
     rows = np.flatnonzero(there)[:: max(1, int(np.count_nonzero(there)) // (2 * _MOST_ASKED))]
     return _part(every, rows, int(np.searchsorted(rows, points)))
@@ -242,39 +286,36 @@ def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
     weighting = every.end.problem.weighting
     used = replace(problem.used(inliers.points, inliers.curves), weighting=weighting, feet=there.feet)
     end = replace(every.end, problem=used, inliers=inliers, residuals=there)
-    kinds = [replace(wholes, observations=observations, of=wholes.of[rows]) for wholes in every.kinds]
+    kinds = [replace(groups, observations=observations, of=groups.of[rows]) for groups in every.kinds]
     return Subproblem(problem, observations, end, kinds)
 
 
-# ---- what is looked at ----------------------------------------------------------------------------------------------
+# ---- what is compared ----------------------------------------------------------------------------------------------
 
 
-def rows_looked_at(
-    observations: Observations, wholes: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
+def rows_compared(
+    observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
 ) -> Mask:
-    """(N + M,) of some views, and of each whole in them some.
+    """(N + M,) of some views, and of each group in them some.
 
     Args:
-        taking_part: (N + M,) all that may be. recalled: (N + M,) what is looked at whether or not it is an inlier.
+        taking_part: (N + M,) all that may be. recalled: (N + M,) what is compared whether or not it is an inlier.
     """
     inside, view = taking_part & (inliers_of(end) | recalled), column_of(observations, "view")
-    rows = np.flatnonzero(inside & views_looked_at(observations, wholes, end, inside, recalled)[view])
+    rows = np.flatnonzero(inside & views_compared(observations, groups, end, inside, recalled)[view])
     inside[:] = False
-    key = wholes.of[rows].astype(np.int64) * len(observations.views) + view[rows]
-    inside[_thinned(rows, key, wholes.of[rows] >= 0)] = True
+    key = groups.of[rows].astype(np.int64) * len(observations.views) + view[rows]
+    inside[_thinned(rows, key, groups.of[rows] >= 0)] = True
     return inside
 
 
-def views_looked_at(
-    observations: Observations, wholes: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
+def views_compared(
+    observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
 ) -> Mask:
-    """(V,) those with what is recalled, those that stand out, some of the others, and some without any whole."""
+    """(V,) those with what is recalled, those that stand out, some of the others, and some without any group."""
     view = column_of(observations, "view")
-    shows_some = np.bincount(view[taking_part & (wholes.of >= 0)], minlength=len(observations.views))
-    if wholes.of_features:
-        largest, most = _largest(observations, end), _MOST_VIEWS
-    else:
-        largest, most = excess(observations, wholes, end, taking_part)[_owner(wholes, view)], _MOST_WHOLE_VIEWS
+    shows_some = np.bincount(view[taking_part & (groups.of >= 0)], minlength=len(observations.views))
+    largest, most = groups.standing_out(end, taking_part), groups.most_views
     with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
     chosen = np.zeros(len(shows_some), dtype=bool)
     chosen[distinct(view[recalled])[:most]] = True
@@ -284,17 +325,17 @@ def views_looked_at(
     return chosen
 
 
-def wholes_looked_at(
-    observations: Observations, wholes: ObservationGroups, end: RobustSolution, rows: Mask, recalled: Sequence[int]
+def groups_compared(
+    observations: Observations, groups: ObservationGroups, end: RobustSolution, rows: Mask, recalled: Sequence[int]
 ) -> tuple[Indices, float]:
     """The numbers of those that have enough of the rows (N + M,), and which share of them that is.
 
     Of very many those that are recalled, those that stand out, and others evenly.
     """
-    every = np.flatnonzero(wholes.count(rows) >= FEWEST)
+    every = np.flatnonzero(groups.count(rows) >= FEWEST)
     if len(every) <= _MOST_TOGETHER:
         return every, 1.0
-    standing_out = every[np.argsort(-excess(observations, wholes, end, rows)[every], kind="stable")]
+    standing_out = every[np.argsort(-excess(observations, groups, end, rows)[every], kind="stable")]
     some = every[:: -(-2 * len(every) // _MOST_TOGETHER)]
     back = np.intersect1d(every, np.array(recalled, dtype=np.int64))
     chosen = distinct(np.concatenate([back, standing_out[: _MOST_TOGETHER // 2], some]))
@@ -306,19 +347,19 @@ def inliers_of(end: RobustSolution) -> Mask:
     return np.concatenate([end.inliers.points, end.inliers.curves])
 
 
-def mostly_rejected(wholes: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Indices:
-    """(size,) how many observations of each whole are outliers, where most of them are; else 0."""
-    counts, used = wholes.count(taking_part), wholes.count(inliers_of(end) & taking_part)
+def mostly_rejected(groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Indices:
+    """(size,) how many observations of each group are outliers, where most of them are; else 0."""
+    counts, used = groups.count(taking_part), groups.count(inliers_of(end) & taking_part)
     return np.where((counts > FEWEST) & (used < _LEFT * counts), counts - used, 0)
 
 
-def excess(observations: Observations, wholes: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Array:
+def excess(observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Array:
     """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
     median one.
     """
     lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
-    points, size = len(observations.points), wholes.size + 1
-    of = np.where(inliers_of(end) & taking_part & (wholes.of >= 0), wholes.of, np.int64(wholes.size))
+    points, size = len(observations.points), groups.size + 1
+    of = np.where(inliers_of(end) & taking_part & (groups.of >= 0), groups.of, np.int64(groups.size))
     spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
     square = np.bincount(of, lengths**2, minlength=size)
     spare[-1] = square[-1] = 0.0  # of what is in none
@@ -327,10 +368,10 @@ def excess(observations: Observations, wholes: ObservationGroups, end: RobustSol
     return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
 
 
-def _owner(wholes: ObservationGroups, view: AnyArray) -> Indices:
-    """(V,) number of the whole that each view is of; the last for none."""
-    owner = np.full(len(wholes.frames), wholes.size)
-    owner[view[wholes.of >= 0]] = wholes.of[wholes.of >= 0]
+def _owner(groups: ObservationGroups, view: AnyArray) -> Indices:
+    """(V,) number of the group that each view is of; the last for none."""
+    owner = np.full(len(groups.frames), groups.size)
+    owner[view[groups.of >= 0]] = groups.of[groups.of >= 0]
     return owner
 
 
@@ -346,10 +387,10 @@ def _largest(observations: Observations, end: RobustSolution) -> Array:
     return np.asarray(mean.reshape(-1, names).max(axis=1))
 
 
-def _thinned(rows: Indices, key: Indices, of_whole: Mask) -> Indices:
-    """Of rows with the same key some, evenly, where they are of a whole."""
+def _thinned(rows: Indices, key: Indices, of_group: Mask) -> Indices:
+    """Of rows with the same key some, evenly, where they are of a group."""
     order = np.argsort(key, kind="stable")
     _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
     place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)
-    most = np.where(of_whole[order], np.minimum(size, _MOST_ROWS), size)
+    most = np.where(of_group[order], np.minimum(size, _MOST_ROWS), size)
     return np.asarray(rows[order[(place * most) // size != ((place - 1) * most) // size]])

@@ -1,0 +1,122 @@
+"""`ceres-cal open`: photographs and their calibration in the browser, to be seen, dragged and trusted."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import plural
+from ceres_cal.cli.arguments import output_option, parse_board, prior_option
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import image_files, json_object, read_target
+from ceres_cal.cli.options import Arguments, argument, option, switch
+from ceres_cal.report.document import Document, Section
+
+if TYPE_CHECKING:
+    from ceres_cal.page.session import Session
+    from ceres_cal.page.state import Sitting, State
+
+_MOST_CALIBRATIONS = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenArguments(Arguments):
+    """What is looked at, and where results go."""
+
+    files: tuple[str, ...] = argument(
+        "PHOTO|CALIBRATION",
+        "photographs of one camera at one station, or folders of them; and a calibration to start from, or two to be "
+        "compared over one picture",
+    )
+    target: str | None = option("the field, as of `detect field`; the page has a list of them, too", "TARGET")
+    board: str | None = option("a chessboard, as of `run`", "COLUMNSxROWSxMM")
+    prior: tuple[str, ...] = prior_option()
+    output: Path = output_option("what is made", Path("camera"), "FOLDER")
+    port: int = option("of the page's address; default: one that is free", "N", 0)
+    browser: bool = switch("print the address alone, and open no browser", default=True, flags=("--no-browser",))
+
+
+@command(
+    "open",
+    "see photographs with the model on them, drag it, and calibrate: a page in the browser",
+    "0001.png --target ssl-b -o camera/",
+    "photographs/ --target ssl-b --board 9x6x25mm --prior height_m=4.02:20mm -o camera/",
+    "calibration.json new.png",
+    "old.json calibration.json new.png",
+)
+def _run(args: OpenArguments) -> Document:
+    try:
+        import aiohttp  # noqa: F401 what `ceres_cal.page.server` serves with
+    except ImportError:
+        raise InputError("open needs aiohttp: pip install 'ceres-cal[page]'") from None
+    sitting = _sitting(args)
+    state = _state(args, sitting)
+    from ceres_cal.cli.open_steps import PageCommands
+    from ceres_cal.page.session import opened
+
+    session = opened(sitting, PageCommands(sitting), state)
+    _serve(session, args)
+    return Document(tuple(_sections(session)))
+
+
+def _serve(session: Session, args: OpenArguments) -> None:
+    import asyncio
+    import webbrowser
+
+    from ceres_cal.page.server import serve
+
+    def show(address: str) -> None:
+        print(f"{address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+        if args.browser:
+            webbrowser.open(address)
+
+    asyncio.run(serve(session, args.port, show))
+
+
+def _sitting(args: OpenArguments) -> Sitting:
+    """What was named, each file once: nothing else is read later."""
+    from ceres_cal.detect.images import read_colour
+    from ceres_cal.page.state import Sitting
+
+    named = image_files(args.files)
+    calibrations = [path for path in named if path.suffix.lower() == ".json"]
+    photographs = tuple(dict.fromkeys(path for path in named if path not in calibrations))
+    if len(calibrations) > _MOST_CALIBRATIONS:
+        raise InputError(f"{calibrations[_MOST_CALIBRATIONS]}: at most two calibrations are looked at over one picture")
+    if not photographs:
+        raise InputError(f"{calibrations[0]}: a calibration holds no picture: name a photograph, too")
+    names = [path.name for path in photographs]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{twice}: two photographs have this name: give the images of one folder")
+    sizes = tuple((image.shape[1], image.shape[0]) for image in map(read_colour, photographs))
+    if different := next((n for n, size in enumerate(sizes) if size != sizes[0]), None):
+        (a, b), (c, d) = sizes[different], sizes[0]
+        raise InputError(f"{photographs[different]}: {a} x {b} px, and the first has {c} x {d}: one camera at a time")
+    return Sitting(photographs, sizes, args.output, args.target or "", *calibrations)
+
+
+def _state(args: OpenArguments, sitting: Sitting) -> State:
+    from ceres_cal.page.state import State
+
+    if args.board is not None:
+        parse_board(args.board)
+    if args.target is not None:
+        read_target(args.target, "field")
+    for path in (sitting.start, sitting.other):
+        if path is not None:
+            json_object(path)
+    return State(target=args.target or "", board=args.board or "", priors=args.prior)
+
+
+def _sections(session: Session) -> Iterator[Section]:
+    folder = session.sitting.folder
+    yield Section("", [], {"folder": str(folder), "commands": list(session.written)})
+    if not session.written:
+        yield Section("written", [f"nothing but what was shown by hand: {folder}/page.json"])
+        return
+    yield Section("written", [f"{folder}/, by {plural(len(session.written), 'command')}:"])
+    yield Section("", session.written)

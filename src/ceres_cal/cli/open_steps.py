@@ -1,0 +1,178 @@
+"""The commands that a state of the page stands for, as one would type them, and the files that they need."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import read_bytes, write_bytes, write_json
+from ceres_cal.cli.command import COMMANDS
+from ceres_cal.cli.files import read_target
+from ceres_cal.detect.images import encoded
+from ceres_cal.detect.photographs.clicks import FEWEST, FORMAT, VERSION
+from ceres_cal.formats import export_format
+from ceres_cal.page.state import Made, Region, Sitting, State, target_words
+from ceres_cal.report.document import Document
+from ceres_cal.scene.targets import Target
+
+CAMERA = "camera"
+_BLACK, _WHITE = 0, 255
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command with its arguments, and what it writes."""
+
+    name: str
+    arguments: tuple[str, ...]
+    output: Path
+
+    @property
+    def typed(self) -> str:
+        return shlex.join(["ceres-cal", *self.name.split(), *self.arguments])
+
+
+@dataclass(frozen=True)
+class PageCommands:
+    """The commands behind one sitting of the page."""
+
+    sitting: Sitting
+
+    def target(self, text: str) -> Target:
+        return read_target(text, "field")
+
+    def make(self, state: State, target: Target | None, folder: Path, *, auto: bool, known: Made | None) -> Made:
+        """See `page.state.Commands`.
+
+        Raises:
+            CalibrationError: what a command raises, or there is nothing to look for.
+        """
+        write_inputs(state, self.sitting, folder, auto=auto)
+        done: list[Step] = []
+        boards = () if known is None else known.boards
+
+        def observe(step: Step) -> Any:
+            done.append(step)
+            if known is None:
+                return _answer(step).data["found"]
+            return write_bytes(step.output, known.observed[step.output.name])  # what it wrote when the lines were found
+
+        if state.board:
+            boards = tuple(map(Path, observe(board_step(state, self.sitting, folder)) or boards))
+        if target is not None:
+            for step in field_steps(state, target, self.sitting, folder, boards, auto=auto):
+                observe(step)
+        if not done:
+            raise InputError("say what the photographs show: choose a field, or give the size of a board")
+        outputs = [step.output for step in done]
+        calibrated = calibrate_step(state, outputs, folder, report=known is not None)
+        for step in (calibrated, *(export_steps(state, folder) if known is not None else ())):
+            _answer(step)
+            done.append(step)
+        observed = {path.name: read_bytes(path) for path in outputs}
+        return Made(tuple(step.typed for step in done), observed, calibrated.output, boards)
+
+
+def _answer(step: Step) -> Document:
+    """What the command answers; nothing of how far it is."""
+    quiet = [] if step.name == "export" else ["--quiet"]
+    return COMMANDS[step.name].run(COMMANDS[step.name].parse([*step.arguments, *quiet]))
+
+
+def board_step(state: State, sitting: Sitting, folder: Path) -> Step:
+    """Boards in all photographs."""
+    size = state.board.lower().split("x")
+    if len(size) != 3:
+        raise InputError("a board is COLUMNSxROWSxMM, its inner corners and the side of a square, such as 9x6x25mm")
+    square = size[2] if size[2][-1:].isalpha() else f"{size[2]}mm"
+    images = [str(path) for path in sitting.photographs]
+    output = folder / "board.json"
+    words = ["--columns", size[0], "--rows", size[1], "--square", square, "--camera", CAMERA, "-o", str(output)]
+    return Step("detect board", (*images, *words), output)
+
+
+def field_steps(
+    state: State, target: Target, sitting: Sitting, folder: Path, boards: Collection[Path], *, auto: bool
+) -> Iterator[Step]:
+    """The field in the photographs that show no board: those with a mask of their own one by one.
+
+    Raises:
+        InputError: there is nothing to start from, or no photograph is left.
+    """
+    images = [path for path in sitting.photographs if path not in boards]
+    if not images:
+        raise InputError("every photograph shows the board, and none is left for the field: take one without it")
+    masked = {one.photograph for one in state.regions}
+    groups = [[path for path in images if path.name not in masked]]
+    groups += [[path] for path in images if path.name in masked]
+    for number, group in enumerate(filter(None, groups), start=1):
+        words = ["--target", target_words(state, target)] if state.target else []
+        if auto:
+            words += ["--auto", *(["--facing", state.facing] if state.facing else [])]
+            words += [] if sitting.start is None else ["--start", str(sitting.start)]
+        elif len(state.points) >= FEWEST:
+            words += ["--start", str(folder / "corners.json")]
+        elif sitting.start is not None and not state.points and not state.places:
+            words += ["--start", str(sitting.start)]
+        else:
+            raise InputError(f"show {FEWEST} corners or crossings first, or let the field be found by itself")
+        if state.not_painted:
+            words += ["--not-painted", ",".join(state.not_painted)]
+        if state.solved:
+            words += ["--estimate", ",".join(state.solved)]
+        if group[0].name in masked:
+            words += ["--mask", str(folder / _mask_name(group[0]))]
+        output = folder / (f"field-{number}.json" if number > 1 else "field.json")
+        words += [] if sitting.start is not None else ["--camera", CAMERA]  # else by the names of the calibration
+        yield Step("detect field", (*map(str, group), *words, "-o", str(output)), output)
+
+
+def calibrate_step(state: State, observed: Sequence[Path], folder: Path, report: bool) -> Step:
+    """One calibration of all that was observed."""
+    priors = [word for prior in state.priors for word in ("--prior", prior)]
+    lengths = ["--estimate", ",".join(state.solved)] if state.solved else []
+    page = ["--report", str(folder / "report.html")] if report else []
+    output = folder / "calibration.json"
+    return Step("calibrate", (*map(str, observed), *priors, *lengths, "-o", str(output), *page), output)
+
+
+def export_steps(state: State, folder: Path) -> Iterator[Step]:
+    """Each format that was chosen."""
+    for name in state.exports:
+        output = folder / f"{name}{(export_format(name).endings or ('',))[0]}"
+        yield Step("export", (str(folder / "calibration.json"), "--to", name, "-o", str(output)), output)
+
+
+# ---- what commands read ---------------------------------------------------------------------------------------------
+
+
+def write_inputs(state: State, sitting: Sitting, folder: Path, *, auto: bool) -> None:
+    """Clicks and masks as files that the commands take."""
+    if not auto and len(state.points) >= FEWEST:
+        points = {name: (one.x, one.y) for name, one in state.points.items()}
+        curves = [(one.curve, one.x, one.y) for one in state.places]
+        data = {"format": FORMAT, "version": VERSION, "points": points, "curves": curves}
+        write_json(folder / "corners.json", data)
+    for path, size in zip(sitting.photographs, sitting.sizes, strict=True):
+        regions = [one for one in state.regions if one.photograph == path.name]
+        if regions:
+            write_bytes(folder / _mask_name(path), _mask(regions, size))
+
+
+def _mask_name(path: Path) -> str:
+    return f"mask-{path.stem}.png"
+
+
+def _mask(regions: Sequence[Region], size: tuple[int, int]) -> bytes:
+    """A picture, black where nothing of the field is."""
+    picture = np.full(size[::-1], _WHITE, np.uint8)
+    for one in regions:
+        x0, y0, x1, y1 = np.round(one.box).astype(int).tolist()
+        picture[max(min(y0, y1), 0) : max(y0, y1, 0) + 1, max(min(x0, x1), 0) : max(x0, x1, 0) + 1] = _BLACK
+    return encoded(picture, ".png", 100)

@@ -1,0 +1,251 @@
+"""The camera that points and lines tell which somebody shows by hand: from the first on, fast enough to follow it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices32
+from ceres_cal.base.errors import answer_or_reason
+from ceres_cal.base.transforms import Pose
+from ceres_cal.detect.photographs.clicks import FEWEST, Clicks, starts_from_clicks, unknown_optics
+from ceres_cal.detect.photographs.refit import NOTHING, ROBUST, PointHints, observations_of, refit_camera
+from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import intrinsic_names
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Target
+from ceres_cal.start.initialise import USUAL_PHI
+
+_FILLED = 0.8  # of the picture, by a field of which nothing is known yet
+_HELD_PX = 300.0  # how loosely points that nobody showed stay where they were
+_AS_SHOWN = Weighting(loss="trivial")
+# How many equations free which intrinsics; fewer leave the lens as it was.
+_FREED = ((8, ("phi",)), (12, ("phi", "a3")), (24, ("phi", "a3", "cx", "cy")), (36, ("phi", "a3", "a2", "cx", "cy")))
+_AGAINST = 4.0  # standard deviations of a hand by which a click contradicts the others
+_FAR = 10.0  # of them: no camera near puts it there
+_ENOUGH = 10  # equations from which on a contradiction can be seen
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What somebody showed, as rows.
+
+    Attributes:
+        names, index, pixels, sigma_px: of points. curve, places, place_sigma_px: of places of curves.
+    """
+
+    names: tuple[str, ...]
+    index: Indices32
+    pixels: Array
+    sigma_px: Array
+    curve: Indices32
+    places: Array
+    place_sigma_px: Array
+
+    @classmethod
+    def of(
+        cls,
+        target: Target,
+        points: Mapping[str, tuple[float, float, float]],
+        places: Sequence[tuple[str, float, float, float]],
+    ) -> Shown:
+        """Points by name and places with their curve, each x, y and sigma in px; without what the target has not."""
+        points = {name: place for name, place in points.items() if name in target.point_index}
+        places = [place for place in places if place[0] in target.curve_index]
+        at, on = (
+            np.array(rows, dtype=float).reshape(-1, 3) for rows in (list(points.values()), [p[1:] for p in places])
+        )
+        return cls(
+            tuple(points),
+            np.array([target.point_index[name] for name in points], dtype=np.int32),
+            at[:, :2],
+            at[:, 2],
+            np.array([target.curve_index[place[0]] for place in places], dtype=np.int32),
+            on[:, :2],
+            on[:, 2],
+        )
+
+    @property
+    def equations(self) -> int:
+        return 2 * len(self.names) + len(self.curve)
+
+
+def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera:
+    """A camera straight above the middle of a target, which fills most of the picture.
+
+    Args:
+        side: of the picture, towards which the field's left end lies.
+    """
+    low, high = target.box
+    size, (width, height) = high - low, image_size
+    turns = {"left": 0, "top": 1, "right": 2, "bottom": 3}
+    default = 0 if (size[0] >= size[1]) == (width >= height) else 1
+    turn = 0.5 * np.pi * turns.get(side.rpartition("-")[2], default)
+    across = size if round(turn / (0.5 * np.pi)) % 2 == 0 else size[::-1]
+    phi = USUAL_PHI * 0.5 * float(np.hypot(*image_size))
+    above = phi * float(np.max(across / (_FILLED * np.array(image_size))))
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])
+    position = np.array([*(0.5 * (low + high)), above])
+    middle = 0.5 * (width - 1.0), 0.5 * (height - 1.0)
+    return Camera(image_size, phi, middle, Radial((0.0,) * 4, (2, 3, 4, 5)), 1.0, Pose(rotation, -rotation @ position))
+
+
+def solved(target: Target, shown: Shown, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
+    """The camera by all clicks, each as well as a hand hits it; what nobody showed goes along with them.
+
+    Args:
+        before: where to start from. base: the camera before anything was shown. quickly: another start is tried only
+            where this one leads nowhere.
+    """
+    if not shown.equations:
+        return base
+    best: Camera | None = None
+    base = _turned(target, shown, base)
+    for start in (before, base) if shown.equations >= _FREED[0][0] else (base, before):
+        there = _fitted(target, shown, start, base, _AS_SHOWN)
+        if there is not None and (best is None or _cost(target, shown, there) < _cost(target, shown, best)):
+            best = there
+        if best is not None and (quickly or _cost(target, shown, best) < _AGAINST**2):
+            break
+    return best or before
+
+
+def _fitted(target: Target, shown: Shown, start: Camera, base: Camera, weighting: Weighting) -> Camera | None:
+    """The camera that suits best what was shown, with as much of it free as that can tell."""
+    wanted: tuple[str, ...] = next((names for least, names in reversed(_FREED) if shown.equations >= least), ())
+    free = tuple(name for name in wanted if name in intrinsic_names(base.lens))
+    optics, hints = unknown_optics(base.image_size, base.phi, None), _hints(target, shown, base)
+    observed = observations_of(target, base.image_size, *NOTHING, hints)
+    fitted = refit_camera(start, observed, free, optics.priors, weighting)
+    return None if fitted is None else fitted[0]
+
+
+def settled(target: Target, shown: Shown, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
+    """The camera once nothing is dragged any more, the clicks that contradict the others (see `judged`), and what is
+    wrong with them all.
+    """
+    camera, wrong = solved(target, shown, before, base), ""
+    off_px, sigma_px = off(target, shown, camera)
+    if len(shown.names) >= FEWEST and np.any(off_px > _FAR * sigma_px):
+        other, wrong = answer_or_reason(lambda: anew(target, shown, base.image_size))
+        camera = other or camera
+    return *judged(target, shown, camera, base), wrong
+
+
+def observed(target: Target, shown: Shown, image_size: tuple[int, int]) -> Observations:
+    """What was shown, as observations."""
+    every = shown.index, shown.pixels, shown.sigma_px, shown.curve, shown.places, shown.place_sigma_px
+    return observations_of(target, image_size, *NOTHING, PointHints(*every))
+
+
+def judged(target: Target, shown: Shown, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
+    """The camera without the clicks that contradict the others, and by how many px those are off, by name or "#2" of a
+    place of a curve.
+    """
+    off_px, sigma_px = off(target, shown, camera)
+    if shown.equations < _ENOUGH or np.all(off_px <= 0.5 * _AGAINST * sigma_px):  # others take a share of it
+        return camera, {}
+    robust = _fitted(target, shown, camera, _turned(target, shown, base), ROBUST) or camera
+    off_px, sigma_px = off(target, shown, robust)
+    names = (*shown.names, *(f"#{number}" for number in range(len(shown.curve))))
+    rows = zip(names, off_px.tolist(), (off_px > _AGAINST * sigma_px).tolist(), strict=True)
+    return robust, {name: distance for name, distance, against in rows if against}
+
+
+def anew(target: Target, shown: Shown, image_size: tuple[int, int]) -> Camera:
+    """The camera that the named points tell from nothing, as `detect_field` starts from them.
+
+    Raises:
+        InputError: fewer than four, or none can be right, and why.
+    """
+    points = dict(zip(shown.names, map(tuple, shown.pixels.tolist()), strict=True))
+    curves = tuple((target.curve_names[n], x, y) for n, (x, y) in zip(shown.curve, shown.places.tolist(), strict=True))
+    cameras, _ = starts_from_clicks(Clicks(points, curves), target, image_size)
+    return min(cameras, key=lambda camera: _cost(target, shown, camera))
+
+
+def off(target: Target, shown: Shown, camera: Camera) -> tuple[Array, Array]:
+    """(N,) how far each click is from its point or curve, px, and how well a hand hits it."""
+    ends = np.concatenate([shown.pixels, shown.places]) - feet(target, shown, camera)
+    return np.nan_to_num(np.linalg.norm(ends, axis=1), nan=1e6), np.concatenate([shown.sigma_px, shown.place_sigma_px])
+
+
+def feet(target: Target, shown: Shown, camera: Camera) -> Array:
+    """(N, 2) px where the model has what each click shows."""
+    points = camera.project(target.point_array[shown.index]) if len(shown.index) else np.empty((0, 2))
+    lines = curves_in_image(target, camera)
+    nearest = []
+    for curve, place in zip(shown.curve, shown.places, strict=True):
+        line = lines[target.curve_names[curve]]
+        apart = np.nan_to_num(np.linalg.norm(line - place, axis=1), nan=np.inf)
+        nearest.append(_foot(line, int(np.argmin(apart)), place))
+    return np.concatenate([points, np.array(nearest).reshape(-1, 2)])
+
+
+def _foot(line: Array, number: int, place: Array) -> Array:
+    """The nearest place of the two pieces of a line that meet at one of its corners."""
+    best = line[number]
+    for other in (number - 1, number + 1):
+        if 0 <= other < len(line) and np.all(np.isfinite(line[other])):
+            along = line[other] - line[number]
+            share = np.clip((place - line[number]) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+            foot = line[number] + share * along
+            if np.linalg.norm(foot - place) < np.linalg.norm(best - place):
+                best = foot
+    return np.asarray(best)
+
+
+def curves_in_image(target: Target, camera: Camera, steps: int = 60) -> Mapping[str, Array]:
+    """Each curve's middle (S, 2) px; NaN where the camera does not show it."""
+    return {name: camera.project(curve_points(curve, 0, steps)) for name, curve in target.curves.items()}
+
+
+def _cost(target: Target, shown: Shown, camera: Camera) -> float:
+    """Of the clicks, the largest square of how far one is off, in standard deviations."""
+    off_px, sigma_px = off(target, shown, camera)
+    return float(np.max((off_px / sigma_px) ** 2, initial=0.0))
+
+
+def _hints(target: Target, shown: Shown, base: Camera) -> PointHints:
+    """What was shown, and loosely the other points where they were."""
+    rest = np.setdiff1d(np.arange(len(target.points), dtype=np.int32), shown.index)
+    there = base.project(target.point_array[rest])
+    rest, there = rest[np.isfinite(there[:, 0])], there[np.isfinite(there[:, 0])]
+    return PointHints(
+        np.concatenate([shown.index, rest]),
+        np.concatenate([shown.pixels, there]),
+        np.concatenate([shown.sigma_px, np.full(len(rest), _HELD_PX)]),
+        shown.curve,
+        shown.places,
+        shown.place_sigma_px,
+    )
+
+
+def _turned(target: Target, shown: Shown, base: Camera) -> Camera:
+    """The base shifted, and from two points on turned about its axis and lifted, so that they come near their place."""
+    if not len(shown.index):
+        return base
+    axis = np.array(base.principal_point)
+    seen, wanted = base.project(target.point_array[shown.index]) - axis, shown.pixels - axis
+    if not np.all(np.isfinite(seen)):
+        return base
+    a, b = seen @ (1.0, 1.0j), wanted @ (1.0, 1.0j)
+    away = a - a.mean()
+    factor = np.vdot(away, b - b.mean()) / max(float(np.vdot(away, away).real), 1e-12) if len(a) > 1 else 1.0
+    if not abs(factor) > 1e-3:
+        return base
+    turn, scale = np.angle(factor), abs(factor)
+    cos, sin = np.cos(turn), np.sin(turn)
+    about = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    pose = base.cam_from_world
+    translation = about @ pose.translation
+    translation[2] /= scale
+    shift = b.mean() - factor * a.mean()
+    translation[:2] += np.array([shift.real, shift.imag]) * translation[2] / base.phi
+    return replace(base, cam_from_world=Pose(about @ pose.rotation, translation))

@@ -1,0 +1,179 @@
+// The saddles around corners of a chessboard, each fitted to the pixels of a disc: see detect/saddles.py, which has the
+// model. What edges are in the picture, tanh makes of their distances.
+#pragma once
+
+#include <limits>
+#include <vector>
+
+#include "chunk.hpp"
+#include "dense.hpp"
+
+namespace ceres_cal {
+
+struct Picture {
+    const float* levels;
+    int64_t height, width;
+};
+
+// By Lambert's continued fraction of an eighth, doubled three times: right to 1e-9, in SIMD registers.
+inline double smooth_step(double x) {
+    constexpr double END = 10.0;
+    const double y = 0.125 * std::max(-END, std::min(x, END)), y2 = y * y;
+    double p = y * (10395.0 + y2 * (1260.0 + y2 * 21.0)) / 10395.0;
+    double q = (10395.0 + y2 * (4725.0 + y2 * (210.0 + y2))) / 10395.0;
+    for (int k = 0; k < 3; ++k) {
+        const double twice = 2.0 * p * q;
+        q = p * p + q * q, p = twice;
+    }
+    return p / q;
+}
+
+class Saddles {
+  public:
+    // Numbers of a start: x, y, the angles and bends of both edges, the disc's radius. Of a fit: see SIZE's places,
+    // then the root mean square of what is left, and the standard deviations of x and y where noise in a pixel has one
+    // of 1.
+    static constexpr int START = 7, SIZE = 11, FITTED = SIZE + 3;
+
+    explicit Saddles(const Picture& picture) : picture_(picture) {}
+
+    // Levenberg and Marquardt's steps until one hardly moves the corner.
+    void fit(const double* start, double* fitted) {
+        constexpr int STEPS = 20;
+        constexpr double SETTLED_PX = 1e-3, BLUNTEST = 0.05, SHARPEST = 3.0, DIFFUSE = 0.7;
+        std::fill_n(fitted, FITTED, NO_CORNER);
+        if (!cut(start)) return;
+        double now[SIZE] = {start[0], start[1], start[2], start[3], DIFFUSE}, trial[SIZE], step[SIZE];
+        double cost = guess(now), damping = 1e-3;
+        for (int round = 0; round < STEPS; ++round) {
+            solve(damping, step);
+            for (int k = 0; k < SIZE; ++k) trial[k] = now[k] + step[k];
+            trial[SHARP] = std::max(BLUNTEST, std::min(trial[SHARP], SHARPEST));
+            normal_.swap(kept_);
+            const double found = add_up(trial);
+            if (found < cost) {
+                std::copy_n(trial, SIZE, now);
+                cost = found, damping = std::max(0.1 * damping, 1e-9);
+            } else {
+                normal_.swap(kept_), damping *= 10.0;
+            }
+            if (std::abs(step[X]) < SETTLED_PX && std::abs(step[Y]) < SETTLED_PX) break;
+        }
+        std::copy_n(now, SIZE, fitted);
+        fitted[SIZE] = std::sqrt(cost / static_cast<double>(level_.size()));
+        for (int k = 0; k < 2; ++k) {
+            std::fill_n(step, SIZE, 0.0), step[k] = 1.0;
+            factor(0.0), substitute(SIZE, upper_, step);
+            fitted[SIZE + 1 + k] = std::sqrt(step[k]);
+        }
+    }
+
+  private:
+    enum Place { X, Y, ANGLE, SHARP = 4, MEAN, MEAN_X, MEAN_Y, CONTRAST, CONTRAST_X, CONTRAST_Y, LEFT };
+    static constexpr int STRIDE = SIZE + 4;
+    static constexpr double FARTHEST_PX = 1e3, NO_CORNER = std::numeric_limits<double>::quiet_NaN();
+
+    // The pixels of the disc; false where its middle is not in the picture.
+    bool cut(const double* start) {
+        const double radius = start[6];
+        const auto is_in = [](double place, int64_t size) {
+            return place > -0.5 && place < static_cast<double>(size) - 0.5;
+        };
+        if (!(is_in(start[0], picture_.width) && is_in(start[1], picture_.height) && radius >= 1.0 &&
+              radius <= FARTHEST_PX))
+            return false;
+        const int64_t middle_x = std::llrint(start[0]), middle_y = std::llrint(start[1]),
+                      half = std::llrint(std::ceil(radius));
+        x_.clear(), y_.clear(), level_.clear();
+        for (int64_t y = std::max<int64_t>(middle_y - half, 0); y <= std::min(middle_y + half, picture_.height - 1);
+             ++y)
+            for (int64_t x = std::max<int64_t>(middle_x - half, 0); x <= std::min(middle_x + half, picture_.width - 1);
+                 ++x) {
+                const double dx = static_cast<double>(x) - start[0], dy = static_cast<double>(y) - start[1];
+                if (dx * dx + dy * dy > radius * radius) continue;
+                x_.push_back(static_cast<double>(x)), y_.push_back(static_cast<double>(y));
+                level_.push_back(picture_.levels[picture_.width * y + x]);
+            }
+        std::copy_n(start + 4, 2, bend_);
+        return true;
+    }
+
+    // Mean and contrast of the disc, and the equations there.
+    double guess(double* now) {
+        add_up(now);
+        const double count = at(MEAN, MEAN), shape = at(CONTRAST, MEAN);
+        now[MEAN] = at(LEFT, MEAN) / count;
+        now[CONTRAST] = (at(LEFT, CONTRAST) - now[MEAN] * shape) / at(CONTRAST, CONTRAST);
+        return add_up(now);
+    }
+
+    double at(int row, int column) const { return normal_[static_cast<size_t>(STRIDE * row + column)]; }
+
+    // The equations of what is left at `now`; the answer is its square.
+    double add_up(const double* now) {
+        double* own[SIZE + 1];
+        for (int k = 0; k <= SIZE; ++k) own[k] = rows_[k].value;
+        std::fill(normal_.begin(), normal_.end(), 0.0);
+        const size_t many = level_.size();
+        for (size_t start = 0; start < many; start += CHUNK) {
+            const int n = static_cast<int>(std::min<size_t>(many - start, CHUNK));
+            differentiate(start, n, now);
+            find_products(own, SIZE + 1, (n + LANES - 1) / LANES * LANES, products_);
+            for (int k = 0; k <= SIZE; ++k)
+                for (int j = 0; j <= k; ++j) normal_[static_cast<size_t>(STRIDE * k + j)] += products_[STRIDE * k + j];
+        }
+        return at(LEFT, LEFT);
+    }
+
+    // The rows of n pixels: derivatives of the model, and what it leaves.
+    void differentiate(size_t start, int n, const double* now) {
+        const int filled = (n + LANES - 1) / LANES * LANES;
+        for (int i = 0; i < filled; ++i) {
+            const size_t k = start + static_cast<size_t>(std::min(i, n - 1));
+            dx_[i] = x_[k] - now[X], dy_[i] = y_[k] - now[Y], left_[i] = level_[k], weight_[i] = i < n ? 1.0 : 0.0;
+        }
+        const double sharp = now[SHARP], c1 = std::cos(now[ANGLE]), s1 = std::sin(now[ANGLE]);
+        const double c2 = std::cos(now[ANGLE + 1]), s2 = std::sin(now[ANGLE + 1]), b1 = bend_[0], b2 = bend_[1];
+        const double mean = now[MEAN], mean_x = now[MEAN_X], mean_y = now[MEAN_Y];
+        const double contrast = now[CONTRAST], contrast_x = now[CONTRAST_X], contrast_y = now[CONTRAST_Y];
+        each(filled, [&](int i) {
+            const double dx = dx_[i], dy = dy_[i], w = weight_[i];
+            const double l1 = c1 * dx + s1 * dy, a1 = c1 * dy - s1 * dx, t1 = b1 * l1;
+            const double l2 = c2 * dx + s2 * dy, a2 = c2 * dy - s2 * dx, t2 = b2 * l2;
+            const double d1 = a1 - 0.5 * t1 * l1, d2 = a2 - 0.5 * t2 * l2;
+            const double e1 = smooth_step(sharp * d1), e2 = smooth_step(sharp * d2), shape = e1 * e2;
+            const double here = contrast + contrast_x * dx + contrast_y * dy;
+            const double g1 = here * e2 * (1.0 - e1 * e1), g2 = here * e1 * (1.0 - e2 * e2);
+            const double by_x = sharp * (g1 * (s1 + t1 * c1) + g2 * (s2 + t2 * c2));
+            const double by_y = sharp * (g1 * (t1 * s1 - c1) + g2 * (t2 * s2 - c2));
+            rows_[X][i] = w * (by_x - mean_x - contrast_x * shape),
+            rows_[Y][i] = w * (by_y - mean_y - contrast_y * shape);
+            rows_[ANGLE][i] = -w * sharp * g1 * (l1 + t1 * a1), rows_[ANGLE + 1][i] = -w * sharp * g2 * (l2 + t2 * a2);
+            rows_[SHARP][i] = w * (g1 * d1 + g2 * d2);
+            rows_[MEAN][i] = w, rows_[MEAN_X][i] = w * dx, rows_[MEAN_Y][i] = w * dy;
+            rows_[CONTRAST][i] = w * shape, rows_[CONTRAST_X][i] = w * shape * dx,
+            rows_[CONTRAST_Y][i] = w * shape * dy;
+            rows_[LEFT][i] = w * (left_[i] - mean - mean_x * dx - mean_y * dy - here * shape);
+        });
+    }
+
+    void factor(double damping) {
+        std::copy(normal_.begin(), normal_.end(), products_);
+        // The last term keeps a disc without any contrast solvable; it then stays where it is.
+        for (int k = 0; k < SIZE; ++k) products_[(STRIDE + 1) * k] += damping * products_[(STRIDE + 1) * k] + 1e-12;
+        cholesky(SIZE, products_, STRIDE, upper_);
+    }
+
+    void solve(double damping, double* step) {
+        factor(damping);
+        for (int k = 0; k < SIZE; ++k) step[k] = at(LEFT, k);
+        substitute(SIZE, upper_, step);
+    }
+
+    const Picture picture_;
+    std::vector<double> x_, y_, level_, normal_ = std::vector<double>(STRIDE * STRIDE), kept_ = normal_;
+    double bend_[2], products_[STRIDE * STRIDE], upper_[SIZE * SIZE];
+    Lane dx_, dy_, left_, weight_, rows_[SIZE + 1];
+};
+
+}  // namespace ceres_cal

@@ -1,0 +1,190 @@
+"""Effects that `calibrate` solves for: their sizes, their best amounts, and by how much they widen.
+
+Such an effect displaces the observations by amounts that are the same in all views. Its size is read off the residuals
+(`effects.evidence`); where it is likelier that there is one than not, its best amounts are taken off the observations
+and everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
+without the effect as far as it is probable, go into the covariance; an effect that is in doubt, but not solved for,
+does with all of its amounts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
+from ceres_cal.effects.columns import EffectColumns, SparseColumns
+from ceres_cal.effects.effect import Case, Effect, EffectEstimate
+from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
+from ceres_cal.effects.linearised import equation_weights, make_linear_model
+from ceres_cal.effects.score_tests import ScoreTest
+from ceres_cal.effects.table import estimated
+from ceres_cal.observations import Observations
+from ceres_cal.problem.equations import write_equations
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import free_keys
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+
+# Probability below which an effect is nothing: by as much of its amounts' variance nothing is visibly wider.
+_NEGLIGIBLE = 0.01
+_MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
+
+
+@dataclass(frozen=True, eq=False)
+class EffectsEnd:
+    """The end of a solve beside effects.
+
+    Attributes:
+        problem: of all the observations, the effects' best amounts taken off. end: of its rounds.
+        estimates: of what was solved for. keys, shifts: shared numbers, and shifts of them whose products with
+            themselves, added up, are what the effects add to their covariance.
+    """
+
+    problem: Problem
+    end: RobustSolution
+    estimates: tuple[EffectEstimate, ...] = ()
+    keys: Sequence[Key] = ()
+    shifts: Sequence[Array] = ()
+
+
+def solve_beside_effects(
+    problem: Problem, part: Problem, observations: Observations, end: RobustSolution
+) -> EffectsEnd:
+    """The end with everything solved for that likely displaces the observations.
+
+    Args:
+        problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
+    """
+    points, off = len(observations.points), np.zeros((len(observations.points) + len(observations.curves), 2))
+    amounts = _Amounts.of(part, observations, end, off)
+    for _ in range(_MOST_ROUNDS):
+        if not len(amounts.likely):
+            break
+        off = amounts.displacement(len(off))
+        shifts = -off[:points], -off[points:]
+        displaced = replace(part, sights=part.sights.displaced(*shifts))
+        end = solve_robustly(displaced, observations, end.solution.estimate, is_near=True)
+        before, amounts = amounts, _Amounts.of(displaced, observations, end, off)
+        if amounts.stay(before):
+            break
+    keys = free_keys(end.solution.estimate, part.layout, part.private)
+    if np.any(off):
+        problem = replace(problem, sights=problem.sights.displaced(-off[:points], -off[points:]))
+        end = end.moved_to(end.solution.estimate, observations, problem)
+    return EffectsEnd(problem, end, tuple(amounts.estimates()), keys, list(amounts.shifts()))
+
+
+@dataclass(frozen=True, eq=False)
+class _EffectGroup:
+    """A group of an effect, and which amounts are its own."""
+
+    effect: Effect
+    columns: EffectColumns
+    number: int
+    own: Indices
+
+
+@dataclass(frozen=True, eq=False)
+class _Amounts:
+    """What the residuals say of the amounts of all effects.
+
+    Attributes:
+        taken: (K, Q) how the shared numbers move with each amount. groups: by number. sizes: of each group, its sigma
+            and probability.
+    """
+
+    case: Case
+    repeated: RepeatedAmounts
+    taken: Array
+    groups: Sequence[_EffectGroup]
+    sizes: Sequence[tuple[float, float]]
+
+    @classmethod
+    def of(cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array) -> _Amounts:
+        """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
+        estimate = end.solution.estimate
+        equations = write_equations(observations, problem.sights, estimate, end.residuals)
+        along = np.sum(off[equations.observation] * equations.direction, axis=1)
+        equations = replace(equations, residual=equations.residual - along)
+        taking_part = end.inliers.points, end.inliers.curves
+        weights = equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
+        model = make_linear_model(problem, estimate, equations, weights)
+        case = Case(observations, problem, estimate, model)
+        groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
+        for effect in estimated():
+            for columns in effect.columns(case):
+                width, count = columns.columns.shape[1], len(columns.subjects)
+                scaled = columns.columns * model.weight[:, None]
+                parts.append(SparseColumns.of_groups(model, scaled, columns.group, count))
+                for number in range(count):
+                    own = size + width * number + np.arange(width)
+                    groups.append(_EffectGroup(effect, columns, number, own))
+                size += parts[-1].size
+        every = SparseColumns.side_by_side(parts, len(equations))
+        repeated = RepeatedAmounts.of(model, every)
+        numbers = {number: group.own for number, group in enumerate(groups)}
+        priors = {number: group.effect.prior for number, group in enumerate(groups) if group.effect.prior is not None}
+        sizes = repeated.sizes(numbers, priors)
+        taken = -model.root @ every.in_shared(model)
+        return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers])
+
+    @cached_property
+    def likely(self) -> list[int]:
+        """Numbers of the groups that are solved for."""
+        return [number for number, (_, probability) in enumerate(self.sizes) if probability > LIKELY]
+
+    @cached_property
+    def _best(self) -> tuple[Array, Array]:
+        """Amounts (Q,) of the likely groups, 0 of the others, and their covariance (Q, Q)."""
+        amounts, covariance = np.zeros(len(self.repeated.score)), np.zeros_like(self.repeated.information)
+        if self.likely:
+            at = np.concatenate([self.groups[number].own for number in self.likely])
+            sigmas = np.concatenate([np.full(len(self.groups[n].own), self.sizes[n][0]) for n in self.likely])
+            amounts[at], covariance[np.ix_(at, at)] = self.repeated.amounts(at, sigmas)
+        return amounts, covariance
+
+    def stay(self, before: _Amounts) -> bool:
+        """Whether they are nearly the same as before, of the same groups."""
+        amounts, covariance = self._best
+        moved, sd = amounts - before._best[0], np.sqrt(np.diagonal(covariance))
+        return self.likely == before.likely and bool(np.all(np.abs(moved) <= _AT_REST * sd))
+
+    def _shift(self, group: _EffectGroup) -> Array:
+        """(E,) px by which a group's best amounts move the model."""
+        return np.asarray(group.columns.of(group.number) @ self._best[0][group.own])
+
+    def displacement(self, observations: int) -> Array:
+        """(N + M, 2) px by which the best amounts displace the observations."""
+        equations, off = self.case.equations, np.zeros((observations, 2))
+        for number in self.likely:
+            along = self._shift(self.groups[number])[:, None] * equations.direction
+            np.add.at(off, equations.observation, along)
+        return off
+
+    def estimates(self) -> Iterator[EffectEstimate]:
+        """Of what is solved for."""
+        case, (amounts, covariance) = self.case, self._best
+        explained = sum((self._shift(self.groups[number]) for number in self.likely), np.zeros(len(case.equations)))
+        left = case.model.left_over + case.model.left_of_column(explained * case.model.weight)
+        for number in self.likely:
+            group, (sigma, probability) = self.groups[number], self.sizes[number]
+            own, sd = amounts[group.own], np.sqrt(np.diagonal(covariance)[group.own])
+            score = ScoreTest(group.columns, group.number, float(np.sum((own / sd) ** 2)), len(own), 0.0, own, sd)
+            sentence, _, mending = group.effect.words(group.effect.evidence(case, score, case.model, left))
+            yield EffectEstimate(group.effect.kind, score.subject, score.frame, sigma, probability, sentence, mending)
+
+    def shifts(self) -> Iterator[Array]:
+        """(K,) each, see `EffectsEnd`."""
+        amounts, covariance = self._best
+        yield from shifts_by(self.taken, covariance)
+        for number, group in enumerate(self.groups):
+            (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
+            if probability > LIKELY:
+                yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
+            elif probability > _NEGLIGIBLE:
+                alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))
+                yield from np.sqrt(probability) * shifts_by(taken, open_ + np.outer(alone, alone))
