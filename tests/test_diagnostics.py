@@ -389,7 +389,7 @@ def test_a_single_frame_cannot_be_held_out() -> None:
 def test_two_coefficients_are_too_few_for_the_wide_camera_and_three_enough(gopro_boards: BoardDetections) -> None:
     seen = gopro_boards.observations
     fixed = {"p1": 0.0, "p2": 0.0}
-    whole = {"loss": "trivial", "reject_sigma": 1e9}
+    whole = {"loss": "trivial", "reject_sigma": 1e9, "as_built": "as drawn"}
     two = Options(lens="brown", fixed={**fixed, "k3": 0.0}, **whole)  # type: ignore[arg-type]
     three = Options(lens="brown", fixed=fixed, **whole)  # type: ignore[arg-type]
     radius = {}
