@@ -101,7 +101,7 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def wait_for(self, condition: str, seconds: float = 60.0) -> None:
+    def wait_for(self, condition: str, seconds: float = 300.0) -> None:
         """Until an expression in the page is true."""
         end = time.monotonic() + seconds
         while not self.run(f"Boolean({condition})"):

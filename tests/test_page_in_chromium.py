@@ -171,7 +171,7 @@ def test_four_corners_of_a_photograph_that_is_not_found_by_itself(
         press(window, "find")
         keep(window, "3-found")
         assert window.run("document.querySelector('.verdict').textContent") == window.run("page.now.known.headline")
-        window.wait_for("page.now.known.advice && document.querySelector('.advice')", 90.0)
+        window.wait_for("page.now.known.advice && document.querySelector('.advice')")
         window.run("document.querySelector('.advice').click()")
         assert window.run("page.view.shapes.map(one => one.label)")[0] in ("a board here", "measure the height here")
         keep(window, "3b-advised")
