@@ -57,14 +57,13 @@ def picture_of(path: Path) -> bytes:
 
 
 class Server:
-    """Windows that show one session. Drags have a thread of their own, work that takes seconds has another."""
+    """Windows that show one session. All that solves is done in one thread, photographs are read in another."""
 
     def __init__(self, session: Session, token: str) -> None:
         self.session, self.token = session, token
         self.ended = asyncio.Event()
         self._windows: set[web.WebSocketResponse] = set()
-        self._drags = ThreadPoolExecutor(1, "drags")
-        self._work = ThreadPoolExecutor(1, "work")
+        self._work = self._drags = ThreadPoolExecutor(1, "work")  # one: two solves at a time may wait for each other
         self._pictures = ThreadPoolExecutor(1, "pictures")
         self._busy = ""
         self._weighing: asyncio.Handle = asyncio.get_running_loop().call_soon(lambda: None)
@@ -182,7 +181,7 @@ class Server:
 
         async def wait() -> None:
             loop = asyncio.get_running_loop()
-            told, _ = await loop.run_in_executor(self._pictures, answer_or_reason, self.session.weigh)
+            told, _ = await loop.run_in_executor(self._work, answer_or_reason, self.session.weigh)
             if told:
                 await self._show()
 
@@ -230,7 +229,7 @@ class Server:
         """Say good-bye to every window."""
         for window in list(self._windows):
             await self._patiently(window, window.close(code=WSCloseCode.GOING_AWAY, message=b"ended"))
-        for threads in (self._drags, self._work, self._pictures):
+        for threads in (self._work, self._pictures):
             threads.shutdown(wait=False, cancel_futures=True)
 
 
