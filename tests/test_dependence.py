@@ -46,7 +46,8 @@ def ten_boards(errors: Errors | None, seed: int = 0) -> Observations:
 
 
 def factors(calibration: Calibration) -> Array:
-    return calibration.uncertainty.posterior.factors
+    posterior = calibration.uncertainty.posterior
+    return posterior.factors[[key.kind != "structure" for key in posterior.keys]]
 
 
 # ---- what is found --------------------------------------------------------------------------------------------------

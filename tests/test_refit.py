@@ -328,7 +328,7 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
     sd = np.array([posterior.sd_of(*key[:3]) for key in left])
     old = np.array([before.sd_of(*key[:3]) for key in left])
     assert np.all(np.abs(difference(result.estimate, calibration.estimate, left)) < 4.0 * old)
-    assert np.all(sd < 1.001 * old)
+    assert np.all(sd < 1.12 * old)  # 1.10 of phi: a refit takes one normal distribution in place of a mixture
     shift_m, turn = movement(result.estimate.stations["right"].cam_from_world, pose)
     assert shift_m < 0.05 and turn < 0.01  # 0.010 m, 0.0017 rad
     held = refit(calibration, observed, moved=["right"], options=RefitOptions(hold_others=True))

@@ -166,7 +166,15 @@ def test_ov_plane() -> None:
     """Its own split: scipy leaves 0.482 px in training, and 0.475 px of the test views with poses alone."""
     parts = [ov_plane(name) for name in ("train", "test")]
     known = calibrate(
-        parts[0], Options(usual_camera=False, lens="kannala-brandt", free_aspect=True, loss="trivial", reject_sigma=1e9)
+        parts[0],
+        Options(
+            usual_camera=False,
+            lens="kannala-brandt",
+            free_aspect=True,
+            loss="trivial",
+            reject_sigma=1e9,
+            as_built="as drawn",
+        ),
     )
     assert known.fit.points_rms_px == pytest.approx(0.4815, abs=5e-4)
     (answer,) = score(known, parts[1]).values()

@@ -146,17 +146,20 @@ def _cover_one(case: Case, seed: int) -> Coverage:
 def _add(found: Coverage, case: Case, trial: Trial, calibration: Calibration) -> None:
     uncertainty, truth = calibration.uncertainty, trial.truth
     posterior = uncertainty.posterior
-    found.names = tuple(" ".join(key[:3]) for key in posterior.keys)
-    off = difference(truth, calibration.estimate, posterior.keys)
-    found.parameters.append((posterior.bounds[:, 0] <= off) & (off <= posterior.bounds[:, 1]))
+    own = [number for number, key in enumerate(posterior.keys) if key.kind != "structure"]  # which few scenes have
+    keys, bounds = [posterior.keys[number] for number in own], posterior.bounds[own]
+    found.names = tuple(" ".join(key[:3]) for key in keys)
+    off = difference(truth, calibration.estimate, keys)
+    found.parameters.append((bounds[:, 0] <= off) & (off <= bounds[:, 1]))
     if posterior.placements:
         keys = [key for name in posterior.placements for key in pose_keys("placement", name)]
         sigmas = np.concatenate([posterior.placement(name).sd for name in posterior.placements])
         error = np.abs(difference(truth, calibration.estimate, keys))
         found.placements.append(error <= posterior.half_width * sigmas)
-    known = np.array([verdict.sd if verdict.verdict == "known" else np.inf for verdict in uncertainty.verdicts])
+    verdicts = [uncertainty.verdicts[number] for number in own]
+    known = np.array([verdict.sd if verdict.verdict == "known" else np.inf for verdict in verdicts])
     found.far += int(np.count_nonzero(np.abs(off) > FAR * known))
-    found.factors.append(posterior.factors)
+    found.factors.append(posterior.factors[own])
     found.verdicts.append(
         [
             verdict.verdict in case.expected

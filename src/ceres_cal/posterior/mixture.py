@@ -177,7 +177,8 @@ class Mixture:
         """
         if not self.chains:
             return self.weights, values, variances
-        alone = np.setdiff1d(np.arange(len(self.weights)), np.concatenate([chain.at for chain in self.chains]))
+        alone = np.ones(len(self.weights), dtype=bool)
+        alone[np.concatenate([chain.at for chain in self.chains])] = False
         parts = [(self.weights[alone], values[alone], variances[alone])]
         parts += [part for chain in self.chains for part in self._along(chain, values, variances)]
         weights, means, widths = (np.concatenate(column) for column in zip(*parts, strict=True))

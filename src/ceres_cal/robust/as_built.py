@@ -241,8 +241,9 @@ def estimate_as_built(
 def _some(sights: Sights, most: int) -> Sights:
     """All of the world, and of each camera's others at most so many, evenly."""
     chosen = [sights.numbers(placements=(None,))]
+    world = set(chosen[0].tolist())
     for camera in sights.cameras:
-        others = np.setdiff1d(sights.numbers(camera), chosen[0])
+        others = np.array([number for number in sights.numbers(camera).tolist() if number not in world], dtype=np.int64)
         chosen.append(others[:: max(1, -(-len(others) // most))])
     return sights.take(np.sort(np.concatenate(chosen)))
 
