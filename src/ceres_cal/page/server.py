@@ -63,7 +63,7 @@ class Server:
         self.session, self.token = session, token
         self.ended = asyncio.Event()
         self._windows: set[web.WebSocketResponse] = set()
-        self._work = self._drags = ThreadPoolExecutor(1, "work")  # one: two solves at a time may wait for each other
+        self._work = self._drags = ThreadPoolExecutor(1, "work")  # one solve at a time
         self._pictures = ThreadPoolExecutor(1, "pictures")
         self._busy = ""
         self._weighing: asyncio.Handle = asyncio.get_running_loop().call_soon(lambda: None)

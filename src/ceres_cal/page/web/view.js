@@ -106,7 +106,8 @@ export class View {
     this.canvas.setPointerCapture(event.pointerId);
     const at = this.at(event), pixel = this.pixel(...at);
     const handle = this.tool || event.button === 1 ? null : this.handle(at);
-    this.hold = { at, pixel, last: at, handle, moved: false };
+    const again = handle?.what === "point" && handle.name === this.selected; // a click on what was chosen says that it is right
+    this.hold = { at, pixel, last: at, handle, again, moved: false };
     if (handle && handle.what === "point") this.act.select(handle.name);
   }
   move(event) {
@@ -129,7 +130,7 @@ export class View {
     if (!hold) return;
     if (hold.handle && hold.moved) this.act.drag(hold.handle, pixel, true);
     else if (this.tool === "mask" && hold.moved) this.act.region([...hold.pixel, ...pixel]);
-    else if (!hold.moved && !hold.handle) this.act.click(pixel);
+    else if (!hold.moved && (!hold.handle || hold.again)) this.act.click(pixel);
     this.draw();
   }
 
