@@ -13,6 +13,7 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import (
     came_out,
     of_all,
@@ -31,13 +32,13 @@ from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.posterior.assess import assess, with_doubts, with_other_lenses, with_roughness
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress
-from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options
+from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.ranges import require_possible_numbers
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.structure import EXACT
+from ceres_cal.problem.structure import EXACT, make_structure
 from ceres_cal.robust.as_built import free_dimensions, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
@@ -45,6 +46,7 @@ from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
 from ceres_cal.robust.usable import require_possible, require_usable
+from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
@@ -98,6 +100,21 @@ def calibrate(
                 raise
             words = _contradicted(observations, options, free)
             raise SolutionError(words or _OTHERWISE) from None
+
+
+def calibrate_near(camera: Camera, observations: Observations, options: Options) -> Calibration:
+    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be.
+
+    Raises:
+        CalibrationError: see `calibrate`.
+    """
+    observations, options = free_dimensions(observations, options)
+    sights, (name,), (station,) = gather_sights(observations), observations.cameras, observations.stations
+    structure = make_structure(observations.targets, options.tolerances, options.dimensions)
+    there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
+    start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
+    with single_threaded_blas(), at_most(options.threads):
+        return _of_lens(start, observations, sights, options, Watched()).redrawn()
 
 
 def _measured(

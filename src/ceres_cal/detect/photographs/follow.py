@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice, product
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate_near
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_built
@@ -34,6 +36,7 @@ _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 _SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
 _ASPECTS = (1.0, 0.94, 0.97, 1.03, 1.06)  # that a picture which was stretched may have, to start from
+_KEPT = 0.95  # of the measured rows: where the plain picture's lens keeps as many, it was not stretched
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
 _FEWEST = 12
@@ -284,19 +287,24 @@ class _Tracker:
         A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
         does so where nothing was measured.
         """
-        lines, fits = followed.lines, []
+        lines, fits = followed.lines, list[tuple[float, Calibration]]()
         known = tuple(prior for prior in self.free.priors if prior.dimension)
         observations = self._observed(lines, followed.camera)
+        near = followed.camera
+        stretched = [near, *(replace(near, phi=near.phi / one**0.5, aspect=near.aspect * one) for one in _ASPECTS[1:])]
         for kind, lens in LENSES.items():
             if lens.set_at_start:
                 continue  # a few lines do not tell a lens without a formula
-            try:
-                powers = (lens.trial_powers or ((),))[-1]
-                calibration = calibrate(observations, Options(lens=kind, powers=powers, priors=known))
-            except CalibrationError:
-                # quiet: a lens of several that does not fit these lines; where none does, they are judged as found
-                continue
-            fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
+            powers = (lens.trial_powers or ((),))[-1]
+            own = Options(lens=kind, powers=powers, priors=known, as_built="as drawn")  # which is judged beside it
+            # From square pixels lines of a stretched picture are taken out instead; one lens shows how it is stretched.
+            for camera in [near] if fits else stretched:  # of which the first is as it is
+                if camera is not near and fits and fits[0][1].fit.curves > _KEPT * len(lines.found):
+                    break
+                with suppress(CalibrationError):  # quiet: where none fits these lines, they are judged as found
+                    calibration = calibrate_near(camera, observations, own)
+                    fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
+            near = min(fits, key=lambda fit: fit[0])[1].station() if fits else near
         if not fits:
             return followed
         best = min(fits, key=lambda fit: (fit[1].station().folds, fit[0]))[1]
