@@ -50,7 +50,9 @@ def observed(name: str, seed: int = 0) -> Observations:
 @cache
 def calibrated(name: str, seed: int = 0) -> Calibration:
     tolerances = {"field": Tolerance(lines_m=0.01)} if name == "as built" else {}
-    return calibrate(observed(name, seed), replace(PROBLEMS[name]().options, tolerances=tolerances))
+    # As drawn: else one calibration may solve for a board's points that the next one, with more to see, does not.
+    options = replace(PROBLEMS[name]().options, tolerances=tolerances, as_built="as drawn")
+    return calibrate(observed(name, seed), options)
 
 
 @cache
@@ -201,11 +203,11 @@ def test_a_promise_is_kept(name: str) -> None:
         stated = found.uncertainty.map_sd_mm(None, 0.15)
         worst, mean = promised_for(promise, found.cameras["overhead"].phi)
         scale = _noise(found) / _noise(calibration)  # more observations find another noise, and another dependence
-        limit = 0.05 if kind in ("tape", "board", "pole") else 0.2  # 0.16 measured: advice takes one normal for all
+        limit = 0.05 if kind in ("tape", "board", "pole") else 0.1
         assert stated.worst_mm == pytest.approx(worst * scale, rel=limit), kind
         assert stated.mean_mm == pytest.approx(mean * scale, rel=limit), kind
         low, high = promise.worst_range_mm
-        assert 0.85 * low * scale <= stated.worst_mm <= 1.2 * high * scale, kind
+        assert 0.9 * low * scale <= stated.worst_mm <= 1.1 * high * scale, kind
 
 
 def _noise(calibration: Calibration) -> float:
