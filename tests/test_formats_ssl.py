@@ -278,47 +278,55 @@ def test_what_ssl_vision_would_clamp_is_refused(tmp_path: Path) -> None:
 
 # ---- over the network -----------------------------------------------------------------------------------------------
 
-LOOPBACK = Group("224.5.23.9", 31006, "127.0.0.1")
+
+@pytest.fixture
+def loopback() -> Group:
+    """A group on a port of its own: who joins a group hears all who send to it, the senders of other tests too."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("", 0))
+        return Group("224.5.23.9", free.getsockname()[1], "127.0.0.1")
 
 
-def in_background(packet: bytes) -> threading.Thread:
-    sender = threading.Thread(target=publish, args=(packet, LOOPBACK, 20, 0.1), daemon=True)
+def in_background(packet: bytes, group: Group) -> threading.Thread:
+    sender = threading.Thread(target=publish, args=(packet, group, 20, 0.1), daemon=True)
     sender.start()
     return sender
 
 
-def test_published_and_heard_over_the_loopback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_published_and_heard_over_the_loopback(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], loopback: Group
+) -> None:
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
-    sender = in_background(packet)
-    heard = received_geometry(LOOPBACK, 10.0)
+    sender = in_background(packet, loopback)
+    heard = received_geometry(loopback, 10.0)
     assert [calib["camera_id"] for calib in heard.geometry["calib"]] == [0, 1]
     assert len(heard.field.curves) == 13
-    group = ["--address", LOOPBACK.address, "--port", str(LOOPBACK.port), "--interface", LOOPBACK.interface]
+    group = ["--address", loopback.address, "--port", str(loopback.port), "--interface", loopback.interface]
     assert main(["listen", "-o", str(tmp_path / "field.json"), *group]) == 0
     sender.join()
     assert "ssl-field with 25 points and 13 curves from 127.0.0.1:" in capsys.readouterr().out
     two_cameras(SSL_LENS).save(tmp_path / "c.json")
     assert main(["publish", str(tmp_path / "c.json"), "--once", *group]) == 0
-    assert "1 times to 224.5.23.9:31006" in capsys.readouterr().out
+    assert f"1 times to 224.5.23.9:{loopback.port}" in capsys.readouterr().out
     assert main(["listen", "-o", str(tmp_path / "field.pb"), "--seconds", "0.2", *group]) == 2
     assert "no geometry of a field within 0.2 s, but nothing at all" in capsys.readouterr().err
 
 
-def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float) -> Heard:
+def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float, group: Group) -> Heard:
     """What is received while each packet is sent to an address again and again."""
     ends = threading.Event()
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK.interface))
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(group.interface))
             while not ends.wait(0.01):
                 for packet, address in packets.items():
-                    sender.sendto(packet, (address, LOOPBACK.port))
+                    sender.sendto(packet, (address, group.port))
 
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        return received_geometry(LOOPBACK, seconds)
+        return received_geometry(group, seconds)
     finally:
         ends.set()
         thread.join()
@@ -332,20 +340,20 @@ def no_field() -> bytes:
     return to_bytes("SSL_WrapperPacket", data)
 
 
-def test_a_packet_that_makes_no_field_does_not_end_listening() -> None:
+def test_a_packet_that_makes_no_field_does_not_end_listening(loopback: Group) -> None:
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
     heard = sent_while_it_listens(
-        {b"junk": LOOPBACK.address, no_field(): LOOPBACK.address, packet: LOOPBACK.address}, 5
+        {b"junk": loopback.address, no_field(): loopback.address, packet: loopback.address}, 5, loopback
     )
     assert len(heard.field.curves) == 13 and heard.sender.startswith("127.0.0.1:")
     with pytest.raises(InputError, match=r"within 0.2 s, but from 127\.0\.0\.1:\d+ .*field_length"):
-        sent_while_it_listens({no_field(): LOOPBACK.address}, 0.2)
+        sent_while_it_listens({no_field(): loopback.address}, 0.2, loopback)
 
 
-def test_only_what_is_sent_to_the_group_is_heard() -> None:
+def test_only_what_is_sent_to_the_group_is_heard(loopback: Group) -> None:
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
     with pytest.raises(InputError, match="but nothing at all"):
-        sent_while_it_listens({packet: "127.0.0.1"}, 0.2)
+        sent_while_it_listens({packet: "127.0.0.1"}, 0.2, loopback)
 
 
 @pytest.mark.parametrize("group", [("10.0.0.1", 10006), ("224.5.23.2", 70000), ("bogus", 10006)])
@@ -354,16 +362,16 @@ def test_groups_that_cannot_be(group: tuple[str, int]) -> None:
         Group(*group)
 
 
-def test_sigterm_ends_publishing_as_it_ends_other_commands(tmp_path: Path) -> None:
+def test_sigterm_ends_publishing_as_it_ends_other_commands(tmp_path: Path, loopback: Group) -> None:
     two_cameras(SSL_LENS).save(tmp_path / "c.json")
     program = "import sys; from ceres_cal.cli import main; sys.exit(main())"
-    group = ["--address", LOOPBACK.address, "--port", "31007", "--interface", LOOPBACK.interface]
+    group = ["--address", loopback.address, "--port", str(loopback.port), "--interface", loopback.interface]
     words = [sys.executable, "-c", program, "publish", str(tmp_path / "c.json"), *group]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    received_geometry(Group(LOOPBACK.address, 31007, LOOPBACK.interface), 20.0)
+    received_geometry(loopback, 20.0)
     time.sleep(0.3)  # it sleeps too, once it has counted the packet
     process.send_signal(signal.SIGTERM)
-    assert "written were 1 packet to 224.5.23.9:31007" in process.communicate(timeout=20)[1]
+    assert f"written were 1 packet to 224.5.23.9:{loopback.port}" in process.communicate(timeout=20)[1]
     assert process.returncode == 143
 
 
