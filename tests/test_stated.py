@@ -94,8 +94,8 @@ def test_ends_are_no_farther_than_stated(seed: int) -> None:
     rows = rng.standard_normal((8, len(KEYS))) / units
     seen, stated = Information(KEYS, rows.T @ rows), Information.of_sigmas({KEYS[1]: float(0.1 * units[1])})
     excesses = 3.0 * units * rng.standard_normal((3, len(KEYS)))
-    both, none = np.concatenate([excesses, -excesses]), np.zeros((0, len(KEYS)))
-    raw = Ends(KEYS, np.zeros_like(both), 2.0 * both, 2.0, seen + stated, none, none[:, 0])
+    both = np.concatenate([excesses, -excesses])
+    raw = Ends(KEYS, np.zeros_like(both), 2.0 * both, 2.0, seen + stated)
     assert raw.beside(Information.nothing(KEYS)) is raw
     ends = raw.beside(stated.over(KEYS))
     variance = (seen + stated).spread.sd ** 2 + np.sum(ends.excesses**2, axis=0)
@@ -114,8 +114,8 @@ def test_straight_curves_are_the_normal_distribution(seed: int) -> None:
     known = Information(KEYS, rows.T @ rows)
     values, vectors = np.linalg.eigh(known.spread.covariance / units[:, None] / units)
     axes = 2.0 * (vectors * np.sqrt(values)).T[:count] * units
-    both, none = np.concatenate([axes, -axes]), np.zeros((0, len(KEYS)))
-    mixture = Ends(KEYS, both, both, 2.0, known, none, none[:, 0]).mixture(known)
+    both = np.concatenate([axes, -axes])
+    mixture = Ends(KEYS, both, both, 2.0, known).mixture(known)
     assert mixture.sd == pytest.approx(known.spread.sd, rel=1e-5)
     assert np.abs(mixture.bounds(NORMAL_95)) == pytest.approx(
         NORMAL_95 * np.column_stack([known.spread.sd] * 2),

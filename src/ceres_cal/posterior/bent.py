@@ -33,9 +33,6 @@ _FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter
 _FEW = 300  # equations beside which other minima are sought: not measured; the cases mended had under 200
 _MOST_ITERATIONS = 30  # of each end: along a flat valley the solver creeps for hundreds that change nothing here
 _FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
-# Another minimum lies so far off, of the rise at an end, by what the normal equations say, and costs less than so much
-# of that: the same one, not quite reached, costs all of it.
-_OTHER, _SAME = 0.25, 0.25
 _WITHIN = 0.25  # share of a weak direction's variance that each component along its curve has by itself
 _LEAST_PAIRS = 12  # of components
 
@@ -48,7 +45,7 @@ class Ends:
         keys: (K). steps: (2 B, K) as far as the quadratic picture has the ends of the 95 % interval along each
             direction, upper ones first. ends: (2 B, K) where the least cost has risen there as much.
         half_width: standard deviations that a step is long. information: of the quadratic picture.
-        minima: (M, K) others that fit as well. odds: (M,) theirs.
+        others: where solves ended that began far out, with what they cost beyond the least.
     """
 
     keys: tuple[Key, ...]
@@ -56,8 +53,7 @@ class Ends:
     ends: Array
     half_width: float
     information: Information
-    minima: Array
-    odds: Array
+    others: tuple[Solution, ...] = ()
 
     @property
     def excesses(self) -> Array:
@@ -142,7 +138,7 @@ def ends_of(
     if not axes.shape[1]:
         return None
     least = 2.0 * solve(problem, estimate).cost
-    few, minima = problem.sights.equations < _FEW, _Minima(by_model, sizes, least)
+    few, others = problem.sights.equations < _FEW, list[Solution]()
     steps, excesses = [], []
     for sign in (half_width, -half_width):
         for axis in axes.T:
@@ -154,7 +150,8 @@ def ends_of(
             found = [_excess(end, step, least, rise)]
             far = _end(problem, estimate, keys, _FAR_OUT * along) if few else None
             if far is not None:
-                minima.look(_solved(problem, far.estimate), estimate, rise, half_width)
+                if (other := _solved(problem, far.estimate)) is not None:
+                    others.append(replace(other, cost=other.cost - 0.5 * least))
                 # Where the cost rises ever less, the interval ends between; far ends by themselves tell nothing.
                 nearer = _FAR_OUT * _reach(far, least, rise)
                 if nearer > 1.0:
@@ -162,33 +159,7 @@ def ends_of(
             steps.append(step)
             excesses.append(max(found, key=lambda one: float(np.linalg.norm(np.clip(one, -1.0, 1.0)))))
     reached = np.array(steps)
-    return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, *minima.found)
-
-
-class _Minima:
-    """Other minima that fit as well, each once, with their odds."""
-
-    def __init__(self, information: Information, sizes: Array, least: float) -> None:
-        self._information, self._sizes, self._least = information, sizes, least
-        self._steps: list[Array] = []
-        self._odds: list[float] = []
-
-    def look(self, other: Solution | None, estimate: Estimate, rise: float, half_width: float) -> None:
-        """Keep it where it costs no more than an end of an interval, and is no part of the same one."""
-        if other is None:
-            return
-        step = difference(other.estimate, estimate, self._information.keys)
-        above = max(2.0 * other.cost - self._least, 0.0)
-        apart = float(step @ self._information.matrix @ step)
-        known = any(np.max(np.abs(step - one) / self._sizes) < BENDING for one in self._steps)
-        if above <= rise and apart > max(_OTHER * rise, above / _SAME) and not known:
-            self._steps.append(step)
-            self._odds.append(float(np.exp(-0.5 * above * half_width**2 / rise)))
-
-    @property
-    def found(self) -> tuple[Array, Array]:
-        """(M, K) from the estimate, and (M,) odds against it."""
-        return np.array(self._steps).reshape(-1, len(self._sizes)), np.array(self._odds)
+    return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, tuple(others))
 
 
 @dataclass(frozen=True, eq=False)

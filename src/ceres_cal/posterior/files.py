@@ -157,9 +157,7 @@ class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
         mixture, own = None, information.marginal(self.keys)
         if bent.any():
             near, far = (np.concatenate([part[bent], -part[bent]]) for part in (steps, ends))
-            none = np.zeros((0, len(self.keys)))
-            curves = Ends(tuple(self.keys), near, far, self.half_width, own, none, none[:, 0])
-            mixture = curves.mixture(information)
+            mixture = Ends(tuple(self.keys), near, far, self.half_width, own).mixture(information)
         minima = over(ends[~bent], self.keys, information.keys)
         if len(minima):
             likely = np.full(len(minima), 1.0 / (len(minima) + 1.0))

@@ -65,12 +65,12 @@ def minima_of(
         half_width: standard deviations from the middle to an end of an interval.
     """
     sizes = natural_sizes(estimate, information.keys)
-    shifts: list[Array] = []
-    odds: list[float] = []
+    shifts, odds = list[Array](), list[float]()
+    here = np.zeros(len(sizes))
     for one in sorted(others, key=lambda other: other.cost):
         shift = difference(one.estimate, estimate, information.keys)
         least = min(half_width**2, _OTHER * float(shift @ information.matrix @ shift))
-        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > _ALIKE for d in shifts):
+        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > _ALIKE for d in (here, *shifts)):
             shifts.append(shift)
             odds.append(float(np.exp(-max(one.cost, 0.0))))
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
