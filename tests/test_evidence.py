@@ -18,13 +18,13 @@ from ceres_cal.effects.evidence import (
     RandomEffects,
     SizePrior,
     agreement,
-    likeliest_sizes,
     logsum,
+    measure_offsets,
 )
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.offsets import measure_offsets
 from ceres_cal.effects.score_tests import score_all
+from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.effects.strands import decay, distances_of, families_of, views_or_placements
 from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations

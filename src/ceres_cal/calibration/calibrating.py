@@ -31,7 +31,7 @@ from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.posterior.assess import assess, with_doubts, with_other_lenses, with_roughness
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.bundle import Progress, Solution
 from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, problem_of
@@ -292,7 +292,11 @@ def solved_from(
 
         beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
         problem, end = beside.problem, beside.end
-    end, others = least_of_few(problem, observations, end, start.others) if again is None else (end, ())
+    others: tuple[Solution, ...] = ()
+    if again is None and end.problem.sights.equations == problem.sights.equations:
+        least, others = least_of_few(end.problem, end.solution.estimate, start.others)
+        if least is not end.solution.estimate:
+            end = replace(end.moved_to(least, observations, problem), reduced=None)
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     posterior, conflicts, settled = None, Conflicts(), None

@@ -16,15 +16,20 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
+    COPY,
     FORMAT,
     VERSION,
     CalibrationFile,
+    Fit,
+    LensChoice,
+    Refitted,
     RefittedFile,
+    Rejected,
     StationFile,
     options_from_json,
     options_to_json,
+    package_versions,
 )
-from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights

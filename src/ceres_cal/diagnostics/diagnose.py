@@ -28,7 +28,7 @@ from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge,
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.robust.poses import with_lost_boards_posed
+from ceres_cal.robust.other_minima import with_lost_boards_posed
 from ceres_cal.robust.stated import Conflict
 
 FALSE_ALARM_RATE = 0.01

@@ -15,10 +15,9 @@ import numpy as np
 from ceres_cal.base.numerical import numerical
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.observations import Observations
-from ceres_cal.posterior.bent import ends_of
+from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
-from ceres_cal.posterior.profile import Node, profile, valley
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Information, over
 from ceres_cal.problem.parameters import Estimate, unit_px

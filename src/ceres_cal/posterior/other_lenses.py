@@ -16,8 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.transforms import Pose
-from ceres_cal.posterior.image import Picture, picture_slopes
-from ceres_cal.posterior.maps import locate_slopes
+from ceres_cal.posterior.maps import Picture, locate_slopes, picture_slopes
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes

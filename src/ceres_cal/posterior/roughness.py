@@ -23,8 +23,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.effects.evidence import agreement as agreement_of
-from ceres_cal.effects.evidence import likeliest_sizes, shifts_by
+from ceres_cal.effects.evidence import shifts_by
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
+from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.equations import Equations, equations_of

@@ -15,8 +15,7 @@ from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.charts import Chart, ChartedCost, chart_of
-from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
+from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, Chart, ChartedCost, EliminatedCost, Run, SightCost, chart_of
 from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.prior_cost import PriorCost
 from ceres_cal.problem.problem import Problem, Weighting

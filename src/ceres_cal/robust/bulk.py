@@ -18,18 +18,16 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.bundle import Progress, Solution, solve
-from ceres_cal.problem.engines import Engine, InProcess, OnWorkers
+from ceres_cal.problem.engines import Engine, InProcess, OnWorkers, SharedObservations, of_world
 from ceres_cal.problem.noise import SAME, Inliers, NoiseScales, Redundancy, noise_of, relative_lengths
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.shared_cost import SharedObservations, of_world
 from ceres_cal.problem.shares import Share, ShareRequest, cut
 from ceres_cal.problem.sums import Histogram, Looked, Used
 from ceres_cal.robust.competing import Explanation
-from ceres_cal.robust.robust import RobustSolution
-from ceres_cal.robust.rounds import Rounds
+from ceres_cal.robust.robust import RobustSolution, Rounds
 
 # Observations of the part, and views of it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200

@@ -19,8 +19,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.words import two_digits
+from ceres_cal.effects.evidence import Offsets, measure_offsets
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.offsets import Offsets, measure_offsets
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.equations import write_equations
