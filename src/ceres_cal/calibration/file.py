@@ -189,7 +189,6 @@ def package_versions() -> dict[str, str]:
 
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
-_ALIKE = 1e-5  # somebody who edits a file rounds
 
 _ALSO_WARPED = tuple(f"/{part}" for part in WARP[2:])
 
@@ -212,10 +211,11 @@ class StationFile(PoseFile, forbid_unknown_fields=True):
 
     def station(self) -> Station:
         """The station; InputError where what is there for people says something else than the pose."""
+        alike = 1e-5  # somebody who edits a file rounds
         station = Station(self.camera, self.pose())
         again, reach_m = StationFile.of_station(station), 1.0 + float(np.linalg.norm(self.translation_m))
         turned = np.max(np.abs(rotation_from_euler(*self.euler_rad) - station.cam_from_world.rotation))
-        if not np.allclose(again.position_m, self.position_m, rtol=0.0, atol=_ALIKE * reach_m) or turned > _ALIKE:
+        if not np.allclose(again.position_m, self.position_m, rtol=0.0, atol=alike * reach_m) or turned > alike:
             raise InputError("position_m or euler_rad is another one than that of rotation and translation_m")
         return station
 

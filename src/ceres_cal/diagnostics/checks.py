@@ -141,9 +141,6 @@ def _correlation(model: Linearised, pairs: tuple[Indices, Indices], variance: fl
     return float(total / (variance * max(float(np.sum(np.sqrt(kept))), 1e-9))), float(log_p)
 
 
-_MOST_NAMED = 5
-
-
 @dataclass(frozen=True, eq=False)
 class DiagnosisCase(Case):
     """What is diagnosed.
@@ -209,6 +206,7 @@ class WrongLabel(Check):
             yield self._finding(tested, target, labels)
 
     def _finding(self, tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
+        most_named = 5
         observations, table, one = tested.case.observations, tested.case.table, labels[0]
         described = observations.targets[target]
         names = described.curve_names if one.is_curve else described.point_names
@@ -216,7 +214,7 @@ class WrongLabel(Check):
         rows = np.concatenate([label.rows for label in labels])
         at = rows + (len(observations.points) if one.is_curve else 0)
         frames = list(dict.fromkeys(observations.views[label.view].frame for label in labels))
-        listing = ", ".join(map(repr, frames[:_MOST_NAMED])) + (" ..." if len(frames) > _MOST_NAMED else "")
+        listing = ", ".join(map(repr, frames[:most_named])) + (" ..." if len(frames) > most_named else "")
         away = float(np.mean(np.concatenate([label.distance_px for label in labels])))
         px, mm = _mean(np.abs(table.distance_px[at])), _mean(np.abs(table.error_mm[at]))
         sentence = (

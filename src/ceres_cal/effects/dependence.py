@@ -45,9 +45,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Residuals
 
-_FEWEST_ROWS = 12
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
-_NEGLIGIBLE = 1e-3  # weight below which a place on the grid is left out
 
 
 @dataclass(frozen=True)
@@ -89,10 +87,11 @@ def correlated(model: Linearised, group: Indices, informations: Array) -> Covari
         model: of some views, in directions in which everything is known to one. group: (E,) of the G views or
             placements that are compared. informations: (G, P, P) of each, were errors independent.
     """
+    fewest_rows = 12
     scores, private, inverse, kinds = informations.copy(), [1.0], 0.0, []
     for is_curve, kind in ((False, "points"), (True, "curves")):
         rows = model.equations.is_curve == is_curve
-        if np.count_nonzero(rows) < _FEWEST_ROWS:
+        if np.count_nonzero(rows) < fewest_rows:
             continue
         families = families_of(model, group, is_curve)
         if not any(map(is_loud, families)):
@@ -124,12 +123,13 @@ class _Average:
     @classmethod
     def of(cls, shared: Array, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
         """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
+        negligible = 1e-3  # weight below which a place on the grid is left out
         own = np.sum(shared[rows] ** 2)
         at = likelihoods(families, may_be_smooth, float(own))
         variance = at.variance / at.variance[0]  # the noise scale is that of independent errors
         weight = DEPENDENCE.over(len(at.share) - 1) * np.exp(at.log - at.log.max())
         weight /= weight.sum()
-        weight[weight < _NEGLIGIBLE] = 0.0
+        weight[weight < negligible] = 0.0
         weight /= weight.sum()
         used, rest = weight > 0.0, shared.shape[1] - own  # what all other rows say
         mixed = 1.0 / _freedom_of_mixture(weight[used], (rest + variance * at.trace)[used])

@@ -90,7 +90,6 @@ independent in four of five calibrations. The sizes are those of a grid, or of a
 _FEWEST = 4
 LIKELY = 0.5
 """Probability from which on an effect is solved for: it is then the more likely explanation."""
-_SWEEPS = 2  # over the effects, each beside the others
 LEAST_PX = 1e-3
 """Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
@@ -293,8 +292,9 @@ class RepeatedAmounts:
         self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior]
     ) -> dict[_Name, tuple[float, float]]:
         """Sigma and probability of each effect by name, beside those of the others that are likely."""
+        sweeps = 2  # over the effects, each beside the others
         found: dict[_Name, tuple[float, float]] = {}
-        for name, own in [*numbers.items()] * _SWEEPS if self.spare >= _FEWEST else ():
+        for name, own in [*numbers.items()] * sweeps if self.spare >= _FEWEST else ():
             others = [one for one, (_, probability) in found.items() if one != name and probability > LIKELY]
             at = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[one] for one in others)])
             sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[one]), found[one][0]) for one in others)])

@@ -27,14 +27,14 @@ ASIDE = 20.0
 # The likelihood is asked from so many standard deviations of a score test on (one in five of white noise), if the
 # correlation that is likely by it would widen the variance of what is shared by so much.
 _LOUD, _MATTERS = 0.85, 0.08
-_NO_NOISE = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
 
 
 def is_loud(family: StrandFamily) -> bool:
     """Whether neighbours, nearby rows or whole strands agree more than they do in one of five sets of white noise."""
+    no_noise = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
     gap, longest, sums = family.gap, family.longest, np.diagonal(family.products)
     noise = sums[-1] / max(np.count_nonzero(family.filled) - np.sum(sums[:-1]), 1.0)
-    if gap == 0.0 or noise < _NO_NOISE:
+    if gap == 0.0 or noise < no_noise:
         return False
     residuals, private, shared = (family.squared(s) for s in (slice(-1, None), slice(6), slice(6, -1)))
     agreement, count = residuals / noise + private + shared, np.diff(family.bounds)
@@ -61,8 +61,6 @@ def _variance(family: StrandFamily, together: Array, squares: float) -> float:
 # To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %. In parts: the next one is left out
 # where the likelihood falls over the one before it to nothing.
 _SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
-_NOTHING = 6.0  # nats below the best: less than the share of a place that is left out
-_FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
 
 _Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
 
@@ -94,6 +92,7 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
         may_be_smooth: whether errors without edges are looked for, too.
         squared: sum of the squared shared columns over all rows, of which the families show some.
     """
+    nothing = 6.0  # nats below the best: less than the share of a place that is left out
     parts = [_independent(families[0], squared)]
     best = float(parts[0].log[0])
     for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
@@ -104,7 +103,7 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
                 part = (_impossible if falls else _of_shares)(family, at, shares, squared, place)
                 parts.append(part)
                 best = max(best, float(part.log.max()))
-                falls = bool(part.log[-1] < min(best - _NOTHING, part.log[-2]))
+                falls = bool(part.log[-1] < min(best - nothing, part.log[-2]))
     return Likelihoods(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
@@ -151,12 +150,13 @@ def _independent(family: StrandFamily, squared: float) -> Likelihoods:
 
 def _of_shares(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """The restricted likelihood at one place for some shares (A,)."""
+    fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
     diagonal = 1.0 - shares[:, None, None] * (1.0 - at.values)
     logs, reduced, taken = _without_private(at.columns / np.sqrt(diagonal)[..., None], family.group)
     size, count = at.columns.shape[2] - 7, int(np.count_nonzero(family.filled))
     log, variance, freedom = _restricted(family, reduced, count - taken)
     parts = (1.0 - shares) * at.white.sum(), shares * np.sum(at.white * at.values)
-    few = max(count**2 / float(np.sum(at.values**2)) - (0 if taken else size), _FEWEST_FREEDOM)
+    few = max(count**2 / float(np.sum(at.values**2)) - (0 if taken else size), fewest_freedom)
     inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
     scale = squared / max(float(at.white.sum()), 1e-300)  # of all rows to those looked at
     number, smooth, length_m = (np.full(len(shares), one) for one in place)

@@ -18,10 +18,6 @@ from ceres_cal.problem.quantities import values_of
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.scene.lens.base import Roughness
 
-_STEPS = 200  # of the search for sizes
-_ONE = 1.0  # directions of the least size that count along, so that few data do not make a size zero
-_AT_REST = 1e-3  # relative change of a standard deviation
-
 
 @dataclass(frozen=True, eq=False)
 class Sizes:
@@ -50,14 +46,16 @@ def likeliest_sizes(
             each. sigmas: (K,) to begin from. least: (K,) what data cannot talk a size below. at_rest: relative change
             of a size that ends the search.
     """
+    one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
+    steps = 200  # of the search for sizes
     ranks, unlimited = np.array([_rank(form) for form in forms]), np.full(len(slope), np.inf)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         precision = normal + sum(form / sigma**2 for form, sigma in zip(forms, sigmas, strict=True))
         covariance = known_inverses(precision, unlimited)
         amount = covariance @ slope
         known = ranks - np.array([np.sum(covariance * form) for form in forms]) / sigmas**2
         squares = np.array([amount @ form @ amount for form in forms])
-        moved = np.sqrt((np.maximum(squares, 0.0) + _ONE * least**2) / (np.maximum(known, 0.0) + _ONE))
+        moved = np.sqrt((np.maximum(squares, 0.0) + one * least**2) / (np.maximum(known, 0.0) + one))
         done = np.max(np.abs(np.log(moved / sigmas))) < at_rest
         sigmas = moved
         if done:
@@ -110,12 +108,13 @@ def _sigmas(
     reduced: ReducedInformation,
 ) -> tuple[tuple[float, ...], float]:
     """The standard deviation of each form, px, and the squared step to the least cost under them, in variances."""
+    at_rest = 1e-3  # relative change of a standard deviation
     own = tuple(keys[quantity] for form in forms for quantity in form.names)
     every = [Information(tuple(keys[q] for q in form.names), form.matrix).over(own).matrix for form in forms]
     whole = reduced.shared.marginal(own).matrix
     data = whole - sum(form / sigma**2 for form, sigma in zip(every, before, strict=True))
     here = values_of(estimate, own)
     least = np.array([form.least for form in forms])
-    sizes = likeliest_sizes(data, whole @ here, every, np.array(before), least, _AT_REST)
+    sizes = likeliest_sizes(data, whole @ here, every, np.array(before), least, at_rest)
     away = sizes.amount - here
     return tuple(sizes.sigmas.tolist()), float(away @ sizes.precision @ away)

@@ -106,7 +106,7 @@ def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> P
         for name, mixture in posterior.mixtures.items()
     }
     own = ends.beside(posterior.stated.over(posterior.keys).marginal(held)).mixture(posterior.information)
-    bent = posterior.known_by(posterior.wider(posterior.information, ends.widened), {**mixtures, "": own})
+    bent = replace(posterior, mixtures={**mixtures, "": own})
     return bent.with_alternatives(held, *minima_of(ends.others, estimate, by_model.given(held), posterior.half_width))
 
 

@@ -32,13 +32,12 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference, moved, natural_sizes
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.reduced import information
+from ceres_cal.robust.other_minima import FEW, solved_soon
 
 # Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
 # changes from half to double.
 _FAR = 9.0
 _STEPS = (0.02, 0.35)  # of log phi
-_MOST_RISE = 1.5  # from one node to the next
-_MOST_NODES = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,23 +133,25 @@ def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
 
 def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float) -> Iterator[Node]:
     """Nodes on one side, each found from the one before by a step along the valley's slope."""
+    most_nodes = 60
+    most_rise = 1.5  # from one node to the next
     unit = unit_px(first.estimate.cameras[camera])
     low, high = (unit * limit for limit in PHI_RANGE)
     node, step = first, _first_step(camera, first)
     lowest = first.cost
-    for _ in range(_MOST_NODES):
+    for _ in range(most_nodes):
         phi = node.estimate.cameras[camera].phi
         wanted = float(np.clip(phi * np.exp(direction * step), low, high))
         if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
             return
         following = _node(camera, problem, _ahead(camera, node, wanted), inflation)
         change = np.inf if following is None else abs(following.cost - node.cost)
-        if following is None or (change > _MOST_RISE and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
+        if following is None or (change > most_rise and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
             step *= 0.5  # too far to find, or to interpolate where the bounds will lie
             if step < 0.5 * _STEPS[0]:
                 return
             continue
-        step = float(np.clip(step * (1.5 if change < 0.5 * _MOST_RISE else 1.0), *_STEPS))
+        step = float(np.clip(step * (1.5 if change < 0.5 * most_rise else 1.0), *_STEPS))
         node, lowest = following, min(lowest, following.cost)
         yield node
 
@@ -195,11 +196,6 @@ def _across(information: Information, keys: tuple[Key, ...]) -> Information:
 BENDING = 0.01
 _HELD = 0.005  # of a step: how closely its end is held
 _FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
-_FEW = 300  # equations beside which other minima are sought: not measured; the cases mended had under 200
-_MOST_ITERATIONS = 30  # of each end: along a flat valley the solver creeps for hundreds that change nothing here
-_FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
-_WITHIN = 0.25  # share of a weak direction's variance that each component along its curve has by itself
-_LEAST_PAIRS = 12  # of components
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,20 +246,22 @@ class Ends:
         Args:
             information: of everything that is shared.
         """
+        within = 0.25  # share of a weak direction's variance that each component along its curve has by itself
         up, down = np.split(self.ends / self.half_width, 2)
         linear, square = 0.5 * (up - down), 0.5 * (up + down) / self.half_width
-        along = np.sqrt(1.0 - _WITHIN) * _drawn(len(up))
+        along = np.sqrt(1.0 - within) * _drawn(len(up))
         along = along[np.argsort(np.linalg.norm(along, axis=1), kind="stable")]
         keys, steps = information.keys, over(along @ linear + along**2 @ square, self.keys, information.keys)
         rows = np.split(self.steps / self.half_width, 2)[0] @ self.information.matrix
         rows = over(rows, self.keys, keys)
-        known = Information(keys, information.matrix + (1.0 / _WITHIN - 1.0) * rows.T @ rows)
+        known = Information(keys, information.matrix + (1.0 / within - 1.0) * rows.T @ rows)
         return Mixture(keys, np.full(len(steps), 1.0 / len(steps)), steps, (known,) * len(steps))
 
 
 def _drawn(count: int) -> Array:
     """(2 H, count) normal variables, uncorrelated and of variance one: H and their mirror images."""
-    half = max(_LEAST_PAIRS, 2 * count)
+    least_pairs = 12  # of components
+    half = max(least_pairs, 2 * count)
     grid = np.linspace(0.0, 4.0, 401)
     each = np.interp((np.arange(half) + 0.5) / half, 2.0 * normal_cdf(grid) - 1.0, grid)
     rng = np.random.default_rng(0)
@@ -298,12 +296,13 @@ def ends_of(
     Args:
         problem: whose cost is least at the estimate. information: as the data scatter. by_model: as that cost says.
     """
+    far_out = 3.0  # times 95 %: where a search for another minimum starts
     keys, sizes = information.keys, natural_sizes(estimate, information.keys)
     axes = weak_axes(information, estimate, keys)
     if not axes.shape[1]:
         return None
     least = 2.0 * solve(problem, estimate).cost
-    few, others = problem.sights.equations < _FEW, list[Solution]()
+    few, others = problem.sights.equations < FEW, list[Solution]()
     steps, excesses = [], []
     for sign in (half_width, -half_width):
         for axis in axes.T:
@@ -313,12 +312,12 @@ def ends_of(
             along, step = sign * axis, sign * (information.spread.covariance @ slopes) / sizes
             end = _end(problem, estimate, keys, along)
             found = [_excess(end, step, least, rise)]
-            far = _end(problem, estimate, keys, _FAR_OUT * along) if few else None
+            far = _end(problem, estimate, keys, far_out * along) if few else None
             if far is not None:
-                if (other := _solved(problem, far.estimate)) is not None:
+                if (other := solved_soon(problem, far.estimate)) is not None:
                     others.append(replace(other, cost=other.cost - 0.5 * least))
                 # Where the cost rises ever less, the interval ends between; far ends by themselves tell nothing.
-                nearer = _FAR_OUT * _reach(far, least, rise)
+                nearer = far_out * _reach(far, least, rise)
                 if nearer > 1.0:
                     found.append(_excess(_end(problem, estimate, keys, nearer * along), step, least, rise, nearer))
             steps.append(step)
@@ -342,21 +341,12 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
     with suppress(InputError):  # quiet: no camera there; the end counts as far away as any
         held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
-        solution = _solved(replace(problem, priors=(*problem.priors, held)), estimate)
+        solution = solved_soon(replace(problem, priors=(*problem.priors, held)), estimate)
         if solution is not None:
             pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
             off = difference(solution.estimate, estimate, keys) / sizes
             return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
     return None
-
-
-def _solved(problem: Problem, start: Estimate) -> Solution | None:
-    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
-    try:
-        solution = solve(replace(problem, options=short), start)
-    except CalibrationError:  # quiet: the end counts as far away as any
-        return None
-    return None if solution.failed else solution
 
 
 def _reach(end: _End, least: float, rise: float) -> float:

@@ -22,11 +22,9 @@ from ceres_cal.problem.information import Information, Key, over
 FARTHER = 3.0
 """Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
 and radii, not only what lies within 95 %."""
-_FINE = 0.125  # standard deviations from one interpolated place to the next
 # Share of a flat prior on log phi in how the weight lies along a valley; the rest is the signed root of the rise, which
 # is normal whatever the valley is measured in. Where the valley is flat the root says nothing.
 _FLAT = 0.1
-_OVERLAP = 0.5  # standard deviation of each interpolated place, of the way to the next: so there are no steps
 _TWICE = (np.log(2.0), np.log(4.0))
 # Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
 # from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
@@ -34,7 +32,6 @@ _BOUNDED = 1.0
 # Ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0, 1 of what goes on for ever.
 # Nothing changes from 0.6 to 0.86.
 _SHRINKING = 0.75
-_HALVINGS = 28  # of an interval that holds a quantile: to 1e-7 standard deviations
 _REACH = 8.0  # standard deviations beyond which no quantile lies
 
 
@@ -186,13 +183,14 @@ class Mixture:
 
     def _along(self, chain: Chain, values: Array, variances: Array) -> Iterator[tuple[Array, Array, Array]]:
         """Parts of what `refined` gives."""
+        overlap = 0.5  # standard deviation of each interpolated place, of the way to the next: so there are no steps
         whole = float(self.weights[chain.at].sum())
         weights, between, across = self._between(chain)
         share = whole / weights.sum()
         own, widths = values[chain.at], variances[chain.at]
         ends = ((self.open_below, 0), (self.open_above, -1))
         kept = np.array([not ends[0][0], *[True] * (len(weights) - 2), not ends[1][0]])
-        jump = _OVERLAP * _mixed(across[kept], own)
+        jump = overlap * _mixed(across[kept], own)
         jumps = jump[..., :, None] * jump[..., None, :] if widths.ndim > own.ndim else jump**2
         yield share * weights[kept], _mixed(between[kept], own), _mixed(between[kept], widths) + jumps
         for is_open, end in ends:
@@ -204,8 +202,9 @@ class Mixture:
         """Weights (F,) of places along the valley, its ends first and last; of which nodes (F, N) each is, and by how
         much of them (F, N) the next one differs.
         """
+        fine = 0.125  # standard deviations from one interpolated place to the next
         roots, log_phi = chain.roots, np.log(self.phi[chain.at])
-        counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / _FINE), 2).astype(int)
+        counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / fine), 2).astype(int)
         node = np.repeat(np.arange(len(counts)), counts)
         part = np.concatenate([(np.arange(n) + 0.5) / n for n in counts])
         places = np.zeros((len(node), len(roots)))
@@ -282,7 +281,8 @@ def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Ar
 
 def _root(above: Callable[[Array], Array], low: Array, high: Array, tail: float) -> Array:
     """(...) where a falling function is so much, between two places."""
-    for _ in range(_HALVINGS):
+    halvings = 28  # of an interval that holds a quantile: to 1e-7 standard deviations
+    for _ in range(halvings):
         middle = 0.5 * (low + high)
         over_it = above(middle) > tail
         low, high = np.where(over_it, middle, low), np.where(over_it, high, middle)

@@ -27,11 +27,9 @@ _PLACES = 12  # along each side of the picture
 # followed as closely, what lenses with another phi show there ruins the floor; not at all, one map in ten was 2.5
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
-_FOLLOWED = 1e-4  # of the largest singular value: directions that show less are not moved along
 # Of the weights. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
 # a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
 _COUNTED = 0.5
-_MOST = 0.8  # of all of them together
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +80,9 @@ class OtherLenses:
 
 def counted(weights: Sequence[float]) -> Array:
     """(L,) probabilities of other lenses as far as they count, together less than all."""
+    most = 0.8  # of all of them together
     each = _COUNTED * np.asarray(weights, dtype=float)
-    return np.asarray(each / max(1.0, float(each.sum()) / _MOST))
+    return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> list[Array]:
@@ -92,6 +91,7 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     Args:
         there: with the chosen lens, at its best or elsewhere in a valley along phi.
     """
+    followed = 1e-4  # of the largest singular value: directions that show less are not moved along
     every = list(_compared(lenses, keys, there))
     if not every:
         return []
@@ -101,7 +101,7 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     for number in range(len(lenses.others)):
         offset = np.concatenate([one[number].ravel() for one in offsets])
         known = np.isfinite(slope).all(axis=1) & np.isfinite(offset)
-        step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=_FOLLOWED)[0]
+        step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=followed)[0]
         shifts.append(step * sizes)
     return shifts
 

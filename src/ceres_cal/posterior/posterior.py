@@ -29,9 +29,8 @@ class Posterior:
     painted amiss, is not in it.
 
     Attributes:
-        information: about the P numbers that are shared: the normal distribution with the second moments of what maps
-            read (`mixture`), that a refit, a check and advice take; along a valley of phi, which none describes, as the
-            normal equations have it.
+        information: about the P numbers that are shared: the normal distribution that a refit, a check and advice take,
+            as the normal equations have it, with the second moments of what else may be true.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         mixtures: camera -> what it and its stations may be, where its phi was followed along its profile; "" -> what
@@ -87,7 +86,7 @@ class Posterior:
             off = mine.off_valley(over(limited, self.keys, mine.keys))
             mixtures[name] = mine.shifted_also(likely, off[:, None])
         information = self.wider(self.information, lambda seen: seen.widened(np.sqrt(likely)[:, None] * whole))
-        return replace(self.known_by(information, mixtures), lenses=self.lenses or lenses)
+        return replace(self._known_by(information, mixtures), lenses=self.lenses or lenses)
 
     def widened(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
         """The posterior whose numbers scatter by shifts (S, K) of some of them as well: each goes into the covariance
@@ -101,9 +100,9 @@ class Posterior:
             return self.wider(one, lambda seen: seen.widened(over(whole, self.keys, seen.keys)))
 
         mixtures = {name: mixture.with_information(wider) for name, mixture in self.mixtures.items()}
-        return self.known_by(wider(self.information), mixtures)
+        return self._known_by(wider(self.information), mixtures)
 
-    def known_by(self, information: Information, mixtures: Mapping[str, Mixture]) -> Posterior:
+    def _known_by(self, information: Information, mixtures: Mapping[str, Mixture]) -> Posterior:
         """The same with other mixtures, and the information that has their second moments."""
         placements = self.placements
         if isinstance(placements, _Placements):

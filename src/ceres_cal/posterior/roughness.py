@@ -38,9 +38,6 @@ AGREES = 3.0
 """From how many standard deviations on a lens leaves something: of one that leaves nothing one in a thousand does."""
 # Observations on average; cells along the image: some show what is long, many what a surface's nodes do not follow.
 _IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
-_RINGS = 24  # from the middle to the farthest observation
-_MOST_COMPARED = 50_000  # of more, those of some sights
-_MOST_GROUPS = 200  # of sights: products within one do not count, a half of a percent
 
 
 def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> float:
@@ -59,27 +56,30 @@ def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> floa
 
 def agreement_in_rings(end: RobustSolution) -> float:
     """The same of sums over rings about the principal point, of what points lie farther out; of cameras the most."""
+    rings = 24  # from the middle to the farthest observation
     agree, some = 0.0, _some(end)
     for name, camera in end.solution.estimate.cameras.items():
         sights = some.of_camera(name)
         offsets = camera.offsets(sights.pixels)
         radius = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
-        ring = (_RINGS / np.max(radius, initial=1e-12) * radius).astype(int)
+        ring = (rings / np.max(radius, initial=1e-12) * radius).astype(int)
         outward = np.einsum("ij,ij->i", offsets, _in_sigmas(end, sights)[0]) / radius
         agree = max(agree, _agreement(ring, _sight_of(sights.point_bounds), outward))
     return agree
 
 
 def _some(end: RobustSolution) -> Sights:
+    most_compared = 50_000  # of more, those of some sights
     sights = end.problem.sights
-    every = -(-sights.equations // _MOST_COMPARED)
+    every = -(-sights.equations // most_compared)
     return sights if every <= 1 else sights[::every]
 
 
 def _sight_of(bounds: Indices) -> Indices:
     """Of each observation its sight's number; of very many sights, that of some beside each other."""
+    most_groups = 200  # of sights: products within one do not count, a half of a percent
     sights = len(bounds) - 1
-    return np.repeat(np.arange(sights) * min(sights, _MOST_GROUPS) // max(sights, 1), np.diff(bounds))
+    return np.repeat(np.arange(sights) * min(sights, most_groups) // max(sights, 1), np.diff(bounds))
 
 
 def _in_sigmas(end: RobustSolution, sights: Sights) -> tuple[Array, Array]:
@@ -117,13 +117,10 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
     return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
 
 
-_MOST_EQUATIONS = 12_000  # that tell how rough a lens is: of more, those of some views
 _ALONG, _OVER = (
     36,
     (6, 12, 24),
 )  # bumps from the middle to the farthest observation, or along the longer side of the image
-_LOOSE_PX, _LEAST_PX = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
-_AT_REST = 0.02  # relative change of a size
 
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
@@ -140,8 +137,9 @@ def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tupl
 
 def _linearised(end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> Linearised:
     """Some sights' equations, beside their share of what was known before."""
+    most_equations = 12_000  # that tell how rough a lens is: of more, those of some views
     problem, estimate = end.problem, end.solution.estimate
-    every = max(1, -(-problem.sights.equations // _MOST_EQUATIONS))
+    every = max(1, -(-problem.sights.equations // most_equations))
     sights = problem.sights[::every]
     equations = equations_of(observations, sights, estimate, end.residuals)
     weights = equation_weights(observations, problem.weighting, equations, end.residuals).within_sigma
@@ -152,6 +150,8 @@ def _linearised(end: RobustSolution, observations: Observations, reduced: Reduce
 
 def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
     """(R, K) by the bumps of a camera's image."""
+    at_rest = 0.02  # relative change of a size
+    loose_px, least_px = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
     equations, rows = model.equations, model.equations.bounds[:-1]
     own = equations.of_sights(np.array([key.camera == name for key in equations.sights.keys]))
     every = list(_bumps(equations, camera, own))
@@ -159,13 +159,13 @@ def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
     inside = model.beyond_private(np.hstack(every) * (own * model.weight)[:, None])
     taken = model.shared.T @ inside
     normal, slope = inside.T @ inside - taken.T @ taken, inside.T @ model.left_over
-    best = np.linalg.solve(normal + np.eye(len(kind)) / _LOOSE_PX**2, slope)
+    best = np.linalg.solve(normal + np.eye(len(kind)) / loose_px**2, slope)
     rest = model.left_over - inside @ best + model.shared @ (taken @ best)
     scatter = np.add.reduceat(inside * rest[:, None], rows), np.add.reduceat(inside**2, rows)
     within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
     forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
-    loose, least = np.full((2, len(every)), [[_LOOSE_PX], [_LEAST_PX]])
-    sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, _AT_REST)
+    loose, least = np.full((2, len(every)), [[loose_px], [least_px]])
+    sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, at_rest)
     covariance = np.linalg.inv(sizes.precision)
     return shifts_by(model.root @ taken, covariance + np.outer(sizes.amount, sizes.amount))
 

@@ -190,10 +190,6 @@ def ratio_sd(estimate: Estimate, posterior: Posterior, camera: str, station: str
     return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
 
-_GRID = 36  # steps along the longer side
-_WIDENED = 1.1  # factor on standard deviations that is worth a word
-
-
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """How well a calibration is known. It holds as far as the model does: see `Posterior`.
@@ -255,8 +251,9 @@ class Uncertainty:
     @property
     def widening(self) -> str:
         """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
+        widened = 1.1  # factor on standard deviations that is worth a word
         dependence, factor = self.posterior.dependence, median(self.posterior.factors)
-        if dependence is None or not dependence.causes or factor < _WIDENED:
+        if dependence is None or not dependence.causes or factor < widened:
             return ""
         return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
@@ -332,11 +329,12 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
     Raises:
         InputError: there is nothing that does not move.
     """
+    grid = 36  # steps along the longer side
     box = [target.box for target in targets.values() if not target.movable]
     if not box:
         raise InputError("no field to draw a map of: give x_m and y_m")
     low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)
-    spacing = float(np.max(high - low)) / _GRID
+    spacing = float(np.max(high - low)) / grid
     counts = np.maximum(np.round((high - low) / spacing).astype(int) + 1, 2)
     x, y = (np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True))
     return x, y

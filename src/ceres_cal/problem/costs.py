@@ -89,7 +89,6 @@ class CachedCost(pyceres.CostFunction):
         """Jacobians are asked for where a step was accepted, and nowhere else."""
 
 
-_STRUCTURE = 3  # slot
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
@@ -133,10 +132,11 @@ class SightCost(CachedCost):
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+        structure = 3  # slot
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
         for place, slot in enumerate(self.slots):
-            size = self._unknowns.structure if slot == _STRUCTURE else len(parameters[place])
+            size = self._unknowns.structure if slot == structure else len(parameters[place])
             numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * size)
         residuals = np.empty(rows)
         points, curves = as_built(self._points, self._curves, self._sight, self._structure.with_values(numbers[3]))
@@ -145,7 +145,7 @@ class SightCost(CachedCost):
             kernels.Blocks(*jacobians),
         )  # fmt: skip
         if mixing is not None:
-            jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
+            jacobians[structure] = (jacobians[structure].reshape(rows, -1) @ mixing).reshape(-1)
         return CostValue(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
 
 

@@ -29,7 +29,6 @@ from ceres_cal.problem.shares import Share, ShareRequest, owners_of
 
 _A = TypeVar("_A")
 _RETRIES = 3  # of what a worker that was lost had to do
-_GROUPS = 16  # workers up to which sums are the same to the last bit; what is sent for each answer grows with it
 _PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
 _NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
 _NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
@@ -64,7 +63,8 @@ def _groups_of(shares: Sequence[Share], workers: int = 1) -> list[Sequence[Share
     """Consecutive shares that are added up by themselves, where they are: the same ones for any number of workers up
     to so many, and so are all sums, to the last bit.
     """
-    count = min(len(shares), max(_GROUPS, workers))
+    groups = 16  # workers up to which sums are the same to the last bit; what is sent for each answer grows with it
+    count = min(len(shares), max(groups, workers))
     return [shares[len(shares) * n // count : len(shares) * (n + 1) // count] for n in range(count)]
 
 

@@ -19,7 +19,6 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.problem.residuals import Residuals
 
-_BEYOND = 100.0  # an exponent: no observation is so rare
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
 _LEAST_SPARE = 8.0
@@ -32,11 +31,9 @@ USUAL_EQUATIONS = 10.0
 # Share by which rows kept may outnumber those that their scale was taken from, and still be the tail of the same noise:
 # of Student's t with two degrees of freedom it is 1 %, of outliers more.
 _TAIL = 0.02
-_MOST_WIDER = 5
 # Of the root of how many there are: so many outliers more or fewer, at the bound, move what is shared by no 0.05 sd.
 # None of fewer than 60 000.
 SAME = 4e-3
-_ENOUGH = 5_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _BLOCK = 1 << 16  # lengths at once: what is made of them stays where the processor is quick
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
@@ -170,7 +167,8 @@ def _median_scale(lengths: Lengths, median_of_one: float) -> float:
 
 def _middle(lengths: Array) -> float:
     """The median, of some of very many."""
-    some = lengths[:: max(1, len(lengths) // _ENOUGH)]  # its median is that of all within two hundredths
+    enough = 5_000
+    some = lengths[:: max(1, len(lengths) // enough)]  # its median is that of all within two hundredths
     middle = len(some) // 2
     return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
@@ -259,9 +257,10 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     `sigmas` is over a known one: (1 + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), that of Student's t in
     two dimensions. Where the stated sigmas are taken it is `sigmas`.
     """
+    beyond = 100.0  # an exponent: no observation is so rare
     if degrees < _LEAST_SPARE:
         return sigmas
-    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, _BEYOND))))
+    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
 @dataclass(frozen=True)
@@ -314,9 +313,10 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
     Args:
         least: a scale that theirs is no smaller than. degrees: spare equations of each.
     """
+    most_wider = 5
     first = _median_scale(lengths, median_of_one)
     spread = lengths.within(reject_sigma * max(first, least))
-    for _ in range(_MOST_WIDER):
+    for _ in range(most_wider):
         if degrees <= 0.0 or not spread.count:
             break
         wider = lengths.within(reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))

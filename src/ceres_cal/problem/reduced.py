@@ -27,7 +27,6 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 
-_ROUNDING = 1e-13  # of a sum over a sight's rows
 _BATCH = 250_000  # numbers of normal equations worked on at once: they stay where the processor is quick
 
 
@@ -252,9 +251,10 @@ def _limits(own: Array) -> Array:
     """(S, 6) sigmas beyond which a placement's number is unknown: what remains of a turn about the middle of rings, in
     sums over all of their rows, is rounding of its other turns.
     """
+    rounding = 1e-13  # of a sum over a sight's rows
     turns, shifts = np.max(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3), axis=2).T
     largest = np.repeat(np.column_stack([turns, shifts]), 3, axis=1)
-    return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (_ROUNDING * largest + 1e-300) ** -0.5))
+    return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (rounding * largest + 1e-300) ** -0.5))
 
 
 class _KernelNormals:

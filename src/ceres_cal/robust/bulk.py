@@ -31,10 +31,7 @@ from ceres_cal.robust.robust import RobustSolution, Rounds
 
 # Observations of the part, and views of it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200
-# Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
-_TO_THE_LAST = 1e-17
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
-_MOST_ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,8 +266,10 @@ class _SumRounds(Rounds[_SumRound]):
 
     def next(self, state: _SumRound) -> _SumRound:
         """One more solve of what was judged to take part, judged."""
+        # Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
+        to_the_last = 1e-17
         problem = self._judged(state.seen, state.noise)
-        solution = solve(problem, state.seen.estimate, self._progress, precision=_TO_THE_LAST)
+        solution = solve(problem, state.seen.estimate, self._progress, precision=to_the_last)
         seen = self._look(solution.estimate, state.noise.bounds, problem.weighting)
         noise = seen.noise(Redundancy.by_count(problem.equations, self._unknowns), self._problem)
         return _SumRound(problem, solution, seen, noise, state.rounds + 1)
@@ -287,10 +286,11 @@ class _SumRounds(Rounds[_SumRound]):
 
     def end(self) -> RobustSolution:
         """The end of the rounds, with what all observations say there."""
+        most_rounds = 8
         before = self._before
         seen = self._look(before.solution.estimate, _bounds(before), before.problem.weighting)
         noise = seen.noise(Redundancy.by_count(sum(seen.looked.equations), self._unknowns), self._problem)
-        state = self.to_rest(_SumRound(self._problem, before.solution, seen, noise, 0), _MOST_ROUNDS)
+        state = self.to_rest(_SumRound(self._problem, before.solution, seen, noise, 0), most_rounds)
         state = state if state.reduced is not None else self.with_leverages(state)
         self._seen, self._noise = state.seen, state.noise
         inliers = Inliers.by_noise(*state.seen.lengths, state.noise)

@@ -105,7 +105,6 @@ _SUSPECT = -4.4
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
-_MOST_WRONG = 4  # groups
 
 
 Solver = Callable[[Problem, Subproblem], RobustSolution]
@@ -208,8 +207,9 @@ class _Competition:
 
     def decided(self) -> list[_Trial]:
         """The trials of groups that do not belong, one after the other; the last one may be in doubt."""
+        most_wrong = 4  # groups
         end, decided = self._some.end, list[_Trial]()
-        while sum(len(one.explanations) for one in decided) < _MOST_WRONG:
+        while sum(len(one.explanations) for one in decided) < most_wrong:
             best = _best(list(self.trials(end)))
             if best is None or best.log_odds < -DOUBTFUL:
                 break

@@ -193,7 +193,6 @@ def log_probability(squared: float, rest: Rest) -> float:
 
 # Probability of a linear picture from which on it is worth another solve: 2.5 sigma.
 _SUSPICIOUS = 0.0124
-_MOST = 4  # solves
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
@@ -220,12 +219,13 @@ def find_conflicts(
     Args:
         problem: of all the observations. end: its solution. usual: noise scales that were seen before.
     """
+    most = 4  # solves
     every = tuple(statements(problem, observations, end.solution.estimate))
     if not every:
         return Conflicts()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     search = _ForwardSelection(problem, end, observations, usual, every)
-    while search.solves < _MOST and search.leave_out_the_worst():
+    while search.solves < most and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
     shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.shifts]

@@ -13,8 +13,7 @@ minima is the least, nor that there are two.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -168,14 +167,10 @@ def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Ar
     return np.column_stack([pose.rotation, translation])[None]
 
 
-_FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
-_FACTORS = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
-_MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hundreds that change nothing here
+FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
 # Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
 _OTHER = 0.25
 _APART = 0.05  # of the height: places that are no farther apart are one valley, which the standard deviations show
-_ALIKE = 0.01  # of natural sizes: two solves that ended no farther apart are one minimum
-_LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
 
 
 def least_of_few(
@@ -188,12 +183,14 @@ def least_of_few(
         problem: of all the observations, none of which was taken out: that belongs to the minimum it was judged in.
             elsewhere: starts that showed the observations alike.
     """
-    if problem.sights.equations >= _FEW:
+    lower = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
+    if problem.sights.equations >= FEW:
         return estimate, ()
     least = solve(problem, estimate)
-    others = list(_ends(problem, (*_at_other_phi(problem, least.estimate), *elsewhere)))
+    starts = (*_at_other_phi(problem, least.estimate), *elsewhere)
+    others = [end for start in starts if (end := solved_soon(problem, start, is_near=False)) is not None]
     lowest = min(others, key=lambda one: one.cost, default=least)
-    if 2.0 * (least.cost - lowest.cost) > _LOWER:
+    if 2.0 * (least.cost - lowest.cost) > lower:
         others.append(least)
         least = solve(problem, lowest.estimate)
         estimate = least.estimate
@@ -210,13 +207,14 @@ def minima_of(
         others: with what they cost beyond the estimate. information: by the model, about the K numbers.
         half_width: standard deviations from the middle to an end of an interval.
     """
+    alike = 0.01  # of natural sizes: two solves that ended no farther apart are one minimum
     sizes = natural_sizes(estimate, information.keys)
     shifts, odds = list[Array](), list[float]()
     here = np.zeros(len(sizes))
     for one in sorted(others, key=lambda other: other.cost):
         shift = difference(one.estimate, estimate, information.keys)
         least = min(half_width**2, _OTHER * float(shift @ information.matrix @ shift))
-        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > _ALIKE for d in (here, *shifts)):
+        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > alike for d in (here, *shifts)):
             shifts.append(shift)
             odds.append(float(np.exp(-max(one.cost, 0.0))))
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
@@ -242,18 +240,21 @@ def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float
                 break
 
 
-def _ends(problem: Problem, starts: Iterable[Estimate]) -> Iterator[Solution]:
-    """Where solves end; the same minimum may come again."""
-    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
-    for start in starts:
-        with suppress(CalibrationError):  # quiet: nothing is seen from there, so no minimum is
-            solution = solve(replace(problem, options=short), start, is_near=False)
-            if not solution.failed:
-                yield solution
+def solved_soon(problem: Problem, start: Estimate, *, is_near: bool = True) -> Solution | None:
+    """Where a short solve ends; None where it finds nothing. Along a flat valley the solver creeps for hundreds of
+    iterations that change nothing here.
+    """
+    short = replace(problem.options, max_iterations=min(30, problem.options.max_iterations))
+    try:
+        solution = solve(replace(problem, options=short), start, is_near=is_near)
+    except CalibrationError:  # quiet: nothing is seen from there, so no minimum is
+        return None
+    return None if solution.failed else solution
 
 
 def _at_other_phi(problem: Problem, estimate: Estimate) -> Iterator[Estimate]:
+    factors = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
-        for factor in _FACTORS:
+        for factor in factors:
             camera = estimate.cameras[name]
             yield replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})

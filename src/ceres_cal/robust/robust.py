@@ -100,18 +100,6 @@ class Rounds(ABC, Generic[_Round]):
 # Of a camera: with them it is known well enough to place all others; fewer cost another round, more cost time.
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
-# Of very many: a camera of 20 has so many others' rows on the wrong side of the bound that another solve follows.
-_SHARE_OF_PLACEMENTS = 25
-# Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
-_ENOUGH_WITHOUT_FORMULA = 100
-_STILL = 0.05  # variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd
-# Relative change of the cost at which the first solve ends; of a lens without a formula less: from farther off the next
-# one, whose lens is as smooth as the data say, begins with steps in vain.
-_ROUGH, _ROUGH_WITHOUT_FORMULA = 1e-3, 1e-4
-_TO_THE_END = 1e-14  # the same of every further one
-# Of a lens that is as smooth as the data say, sigmas of a tenth, less is near enough: so many variances may be left,
-# and no number is off by 0.1 of its standard deviations. Measured are a hundredth of that and 0.01.
-_LEFT_OF_SMOOTH = 1e-2
 _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
 # is painted aside is told from noise only at a scale near the noise's own.
@@ -200,10 +188,14 @@ class _RowRounds(Rounds[RobustSolution]):
         self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
         self._last: tuple[Inliers, Sights] | None = None
         self.no_change = AT_REST if usual is None else AT_REST_AGAIN
-        self._rough_end, self._end = _ROUGH, _TO_THE_END
+        # Relative change of the cost at which the first solve ends, and every further one.
+        self._rough_end, self._end = 1e-3, 1e-14
         lens = problem.options.blank_lens
         if lens.roughness and not any(problem.knows_lens(name, lens) for name in problem.layout.free):
-            self._rough_end, self._end = _ROUGH_WITHOUT_FORMULA, _LEFT_OF_SMOOTH / max(problem.equations, 1)
+            # From farther off the next solve, whose lens is as smooth as the data say, begins with steps in vain. With
+            # sigmas of a tenth a hundredth of a variance may be left, and no number is off by 0.1 of its sd.
+            # Measured are a hundredth of that and 0.01.
+            self._rough_end, self._end = 1e-4, 1e-2 / max(problem.equations, 1)
 
     def first(self, estimate: Estimate) -> RobustSolution:
         """The rough solve from a start."""
@@ -305,8 +297,10 @@ class _RowRounds(Rounds[RobustSolution]):
         """The state with what its problem says there, where the noise is judged no other by the leverages, and nothing
         moves by how smooth lenses are; else judged by them, for another round.
         """
+        # Variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd.
+        still = 0.05
         anew, reduced = self._anew(state)
-        if self._moving > _STILL or not anew.same_as(state.inliers, self.no_change):
+        if self._moving > still or not anew.same_as(state.inliers, self.no_change):
             return self._with(anew, state.solution, state.residuals, state.rounds)
         problem = replace(state.problem, smoothness=self._problem.smoothness)
         inliers = replace(state.inliers, degrees_of_freedom=anew.degrees_of_freedom)
@@ -356,12 +350,16 @@ def _much_below(scales: tuple[float, float], before: tuple[float, float]) -> boo
 
 def _evenly(problem: Problem) -> Indices:
     """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
+    # Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
+    enough_without_formula = 100
+    # Of very many: a camera of 20 has so many others' rows on the wrong side of the bound that another solve follows.
+    share_of_placements = 25
     private = problem.private
     chosen: list[int] = []
     for camera in problem.sights.cameras:
         boards = problem.sights.numbers(camera, placements=private).tolist()
-        enough = _ENOUGH_WITHOUT_FORMULA if problem.options.blank_lens.roughness else _ENOUGH_PLACEMENTS
-        chosen += boards[:: max(1, min(len(boards) // enough, _SHARE_OF_PLACEMENTS))]
+        enough = enough_without_formula if problem.options.blank_lens.roughness else _ENOUGH_PLACEMENTS
+        chosen += boards[:: max(1, min(len(boards) // enough, share_of_placements))]
         chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
     return np.array(sorted(chosen), dtype=np.int64)
 
