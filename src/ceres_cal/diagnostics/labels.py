@@ -50,18 +50,10 @@ class Mislabelled:
     log_p: float
 
 
-@dataclass(frozen=True, eq=False)
-class Mislabelling:
-    """All such groups, and how many groups were looked at."""
-
-    mislabelled: tuple[Mislabelled, ...]
-    tried: int
-
-
 def find_mislabelled(
     observations: Observations, estimate: Estimate, inliers: Inliers, reject_sigma: float
-) -> Mislabelling:
-    """Every group of observations that another feature explains within the noise."""
+) -> tuple[list[Mislabelled], int]:
+    """Every group of observations that another feature explains within the noise, and how many were looked at."""
     most = 20_000  # rejected observations looked at: of more, evenly spread ones
     mislabelled: list[Mislabelled] = []
     tried = 0
@@ -87,7 +79,7 @@ def find_mislabelled(
                 groups = _of_view(seen, column, int(number), own, bound)
                 tried += len(distinct(column.feature[own[rejected[own]]]))
                 mislabelled += groups
-    return Mislabelling(tuple(mislabelled), tried)
+    return mislabelled, tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,12 +223,8 @@ def renamings(observations: Observations, calibration: Calibration) -> Iterator[
     points, curves = calibration.inlier_masks(observations)
     nothing, fit = np.empty(0), calibration.fit
     inliers = Inliers(points, curves, fit.point_scale, fit.curve_scale, nothing, nothing)
-    found = find_mislabelled(observations, calibration.estimate, inliers, calibration.options.reject_sigma)
-    whole = {
-        (one.is_curve, one.view, one.feature): one
-        for one in found.mislabelled
-        if _is_whole(one, observations, calibration)
-    }
+    found, _ = find_mislabelled(observations, calibration.estimate, inliers, calibration.options.reject_sigma)
+    whole = {(one.is_curve, one.view, one.feature): one for one in found if _is_whole(one, observations, calibration)}
     for one in whole.values():
         back = whole.get((one.is_curve, one.view, one.instead))
         exchanged = back is not None and back.instead == one.feature

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,23 +65,8 @@ class Correlation:
     lasting: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Covariances:
-    """What correlated errors make of the scores.
-
-    Attributes:
-        scores: (G, P, P) covariance of each group's score. private: factor on the variance of private placements.
-        inverse_freedom: 1 / degrees of freedom of these covariances. kinds: those that are correlated.
-    """
-
-    scores: Array
-    private: float
-    inverse_freedom: float
-    kinds: tuple[Correlation, ...] = ()
-
-
-def correlated(model: Linearised, group: Indices, informations: Array) -> Covariances:
-    """The covariance of each group's score, with what errors have in common.
+def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[Array, Dependence]:
+    """(G, P, P) the covariance of each group's score, with what errors have in common, and what that rests on.
 
     Args:
         model: of some views, in directions in which everything is known to one. group: (E,) of the G views or
@@ -102,7 +87,7 @@ def correlated(model: Linearised, group: Indices, informations: Array) -> Covari
         private.append(factor)
         inverse += average.inverse_freedom
         kinds.append(average.correlation(kind))
-    return Covariances(scores, max(private), inverse, tuple(kinds))
+    return scores, Dependence(tuple(kinds), None, max(private), inverse)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,16 +270,15 @@ def measure_scatter(
     group = views_or_placements(model.equations)
     prior = model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root
     groups = GroupNormals.of(model, group, prior)
-    within = correlated(model, group, groups.normal)
-    whole = _whole(groups, within.scores)
-    lasting = any(kind.lasting for kind in within.kinds) and go_over_groups(model.equations, group)
-    between, inverse = None, within.inverse_freedom
+    scores, dependence = correlated(model, group, groups.normal)
+    whole = _whole(groups, scores)
+    lasting = any(kind.lasting for kind in dependence.correlations) and go_over_groups(model.equations, group)
     enough = len(groups.counts) >= FEWEST_GROUPS and not lasting
-    compared = compare_groups(groups, within.scores, whole) if enough else None
-    if compared is not None:
+    if enough and (compared := compare_groups(groups, scores, whole)) is not None:
         between, whole = compared
-        inverse += between.probability / between.degrees_of_freedom
-    return Scatter(model.root, whole, Dependence(within.kinds, between, within.private, inverse))
+        inverse = dependence.inverse_freedom + between.probability / between.degrees_of_freedom
+        dependence = replace(dependence, between=between, inverse_freedom=inverse)
+    return Scatter(model.root, whole, dependence)
 
 
 def _whole(groups: GroupNormals, scores: Array) -> Array:

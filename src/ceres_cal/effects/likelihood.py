@@ -97,7 +97,7 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
     best = float(parts[0].log[0])
     for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
         for length in _lengths(family):
-            at, falls = _Eigenbasis.of(family, length, smooth), False
+            at, falls = _eigenbasis(family, length, smooth), False
             for shares in _SHARES:
                 place = number, smooth, length
                 part = (_impossible if falls else _of_shares)(family, at, shares, squared, place)
@@ -118,47 +118,34 @@ def _lengths(family: StrandFamily) -> list[float]:
     return list(lengths.tolist())
 
 
-@dataclass(frozen=True, eq=False)
-class _Eigenbasis:
-    """A family where its correlation is diagonal.
+_Diagonal = tuple[Array, Array]
+"""A family where its correlation is diagonal: (S, M) eigenvalues, and (S, M, Z) the columns along its eigenvectors."""
 
-    Attributes:
-        values: (S, M) its eigenvalues. columns: (S, M, Z) those of the family. white: (S, M) squared lengths of the
-            shared ones.
-    """
 
-    values: Array
-    columns: Array
-    white: Array
-
-    @classmethod
-    def of(cls, family: StrandFamily, length: float, smooth: bool) -> _Eigenbasis:
-        """At one length."""
-        values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
-        columns = family.applied(np.swapaxes(vectors, 1, 2))
-        shared = columns[..., 6:-1]
-        return cls(family.per_strand(np.maximum(values, 0.0)), columns, np.einsum("smz,smz->sm", shared, shared))
+def _eigenbasis(family: StrandFamily, length: float, smooth: bool) -> _Diagonal:
+    """At one length."""
+    values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
+    return family.per_strand(np.maximum(values, 0.0)), family.applied(np.swapaxes(vectors, 1, 2))
 
 
 def _independent(family: StrandFamily, squared: float) -> Likelihoods:
     """The likelihood of independent errors."""
-    shared = family.columns[..., 6:-1]
-    white = np.einsum("smz,smz->sm", shared, shared)
-    at = _Eigenbasis(family.filled.astype(float), family.columns, white)
+    at = family.filled.astype(float), family.columns
     return _of_shares(family, at, np.zeros(1), squared, (0, False, 0.0))
 
 
-def _of_shares(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+def _of_shares(family: StrandFamily, at: _Diagonal, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """The restricted likelihood at one place for some shares (A,)."""
     fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
-    diagonal = 1.0 - shares[:, None, None] * (1.0 - at.values)
-    logs, reduced, taken = _without_private(at.columns / np.sqrt(diagonal)[..., None], family.group)
-    size, count = at.columns.shape[2] - 7, int(np.count_nonzero(family.filled))
+    values, columns = at
+    diagonal, white = 1.0 - shares[:, None, None] * (1.0 - values), np.einsum("smz,smz->sm", *[columns[..., 6:-1]] * 2)
+    logs, reduced, taken = _without_private(columns / np.sqrt(diagonal)[..., None], family.group)
+    size, count = columns.shape[2] - 7, int(np.count_nonzero(family.filled))
     log, variance, freedom = _restricted(family, reduced, count - taken)
-    parts = (1.0 - shares) * at.white.sum(), shares * np.sum(at.white * at.values)
-    few = max(count**2 / float(np.sum(at.values**2)) - (0 if taken else size), fewest_freedom)
+    parts = (1.0 - shares) * white.sum(), shares * np.sum(white * values)
+    few = max(count**2 / float(np.sum(values**2)) - (0 if taken else size), fewest_freedom)
     inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
-    scale = squared / max(float(at.white.sum()), 1e-300)  # of all rows to those looked at
+    scale = squared / max(float(white.sum()), 1e-300)  # of all rows to those looked at
     number, smooth, length_m = (np.full(len(shares), one) for one in place)
     return Likelihoods(
         number,
@@ -172,7 +159,7 @@ def _of_shares(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: fl
     )
 
 
-def _impossible(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+def _impossible(family: StrandFamily, at: _Diagonal, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """Shares that need not be looked at."""
     number, smooth, length = (np.full(len(shares), one) for one in place)
     one = np.ones(len(shares))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from operator import add
 
@@ -19,22 +19,9 @@ from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.scene.lens.base import Roughness
 
 
-@dataclass(frozen=True, eq=False)
-class Sizes:
-    """The likeliest sizes of several effects, and what is then known of their numbers.
-
-    Attributes:
-        sigmas: (K,) of each effect. amount: (Q,) likeliest numbers. precision: (Q, Q) inverse of their covariance.
-    """
-
-    sigmas: Array
-    amount: Array
-    precision: Array
-
-
 def likeliest_sizes(
     normal: Array, slope: Array, forms: Sequence[Array], sigmas: Array, least: Array, at_rest: float
-) -> Sizes:
+) -> tuple[Array, Array, Array]:
     """The standard deviations sigma of effects whose numbers c have the prior information sum F / sigma^2.
 
     The fixed point of MacKay (Neural Computation 4, 1992), sigma^2 = c^T F c / gamma, with gamma = rank F - tr(C F) /
@@ -45,6 +32,9 @@ def likeliest_sizes(
         normal, slope: (Q, Q) and (Q,) what data say of the numbers, whose best is normal^-1 slope. forms: (Q, Q) F of
             each. sigmas: (K,) to begin from. least: (K,) what data cannot talk a size below. at_rest: relative change
             of a size that ends the search.
+
+    Returns:
+        (K,) sizes, (Q,) likeliest numbers, (Q, Q) inverse of their covariance.
     """
     one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
     steps = 200  # of the search for sizes
@@ -60,7 +50,7 @@ def likeliest_sizes(
         sigmas = moved
         if done:
             break
-    return Sizes(sigmas, amount, np.asarray(precision))
+    return sigmas, amount, np.asarray(precision)
 
 
 def _rank(form: Array) -> int:
@@ -115,6 +105,6 @@ def _sigmas(
     data = whole - sum(form / sigma**2 for form, sigma in zip(every, before, strict=True))
     here = values_of(estimate, own)
     least = np.array([form.least for form in forms])
-    sizes = likeliest_sizes(data, whole @ here, every, np.array(before), least, at_rest)
-    away = sizes.amount - here
-    return tuple(sizes.sigmas.tolist()), float(away @ sizes.precision @ away)
+    sigmas, amount, precision = likeliest_sizes(data, whole @ here, every, np.array(before), least, at_rest)
+    away = amount - here
+    return tuple(sigmas.tolist()), float(away @ precision @ away)

@@ -165,9 +165,8 @@ def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
     within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
     forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
     loose, least = np.full((2, len(every)), [[loose_px], [least_px]])
-    sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, at_rest)
-    covariance = np.linalg.inv(sizes.precision)
-    return shifts_by(model.root @ taken, covariance + np.outer(sizes.amount, sizes.amount))
+    _, amount, precision = likeliest_sizes(normal / within, slope / within, forms, loose, least, at_rest)
+    return shifts_by(model.root @ taken, np.linalg.inv(precision) + np.outer(amount, amount))
 
 
 def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:

@@ -19,7 +19,7 @@ from ceres_cal.effects.smoothness import with_smoothness
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
-from ceres_cal.problem.noise import Inliers, Redundancy, judge, median_scales, visible_from
+from ceres_cal.problem.noise import Inliers, Redundancy, by_count, by_leverage, judge, median_scales, visible_from
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
@@ -314,7 +314,8 @@ class _RowRounds(Rounds[RobustSolution]):
         """Noise and inliers by the leverages there, and what they were taken from."""
         reduced = information(state.problem, state.solution.estimate)
         self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
-        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
+        sights = state.problem.sights
+        self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), reduced.leverages)
         return self._judge(state.solution, state.residuals), reduced
 
     def _judged(
@@ -328,7 +329,7 @@ class _RowRounds(Rounds[RobustSolution]):
         return self._with(anew, solution, there, rounds)
 
     def _judge(self, solution: Solution, there: Residuals) -> Inliers:
-        redundancy = self._redundancy or Redundancy.by_count(
+        redundancy = self._redundancy or by_count(
             self._problem.sights.equations, self._problem.unknowns(solution.estimate)
         )
         return judge(self._observations, there, redundancy, self._problem.options, self._usual)

@@ -11,17 +11,11 @@ from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
 
 
-class _Floor(Effect):
-    """What moves the places of targets that are part of the world up or down."""
-
-    wrong = "model"
-    absorbed = True
-
-
-class FloorBowed(_Floor):
+class FloorBowed(Effect):
     """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
 
     kind = "floor bowed"
+    absorbed = True
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         target, names = _target_of(case)
@@ -48,10 +42,11 @@ def _lower(mm: float) -> str:
     return f"{'higher' if mm > 0.0 else 'lower'} by {abs(mm):.1f}"
 
 
-class FloorUneven(_Floor):
+class FloorUneven(Effect):
     """The floor is higher or lower at one place."""
 
     kind = "floor uneven"
+    absorbed = True
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted.
