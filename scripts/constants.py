@@ -88,7 +88,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("calibration.lens_kinds", "_REFUTED _UNSEEN_GROUPS", "lens"),
     *_of("calibration.lens_seen", "_KEPT", "lens"),
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),
-    *_of("posterior.roughness", "AGREES", "lens"),
+    *_of("posterior.other_lenses", "AGREES", "lens"),
     *_of("calibration.outcome", "_RESTING", "calibrate"),
     *_of("observations.bounds", "_LARGE_M", "calibrate"),
     *_of("robust.robust", "AT_REST", "calibrate"),

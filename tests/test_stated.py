@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,7 +21,8 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.bent import Ends
-from ceres_cal.posterior.files import BendsFile, PosteriorFile, ProfileFile
+from ceres_cal.posterior.files import PosteriorFile
+from ceres_cal.posterior.files_before import BendsFile, ProfileFile, as_mixtures
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information, Key, over
@@ -142,11 +144,16 @@ def test_files_of_before_are_read() -> None:
     triangle = across.matrix[np.tril_indices(4)].tolist()
     valley = ProfileFile(list(KEYS), 800.0, steps.tolist(), rises.tolist(), [triangle] * 13, False, False)
     new = PosteriorFile.of(Posterior(known))
-    before = msgspec.structs.replace(new, profiles={"a": valley}).posterior(KEYS)
+
+    def read(**of_before: Any) -> Posterior:
+        file = msgspec.json.decode(msgspec.json.encode(msgspec.structs.replace(new, **of_before)), type=PosteriorFile)
+        return as_mixtures(file, file.posterior(KEYS))
+
+    before = read(profiles={"a": valley})
     assert before.followed == ("a",)
     assert before.bounds[0] == pytest.approx([-10.0 * NORMAL_95, 10.0 * NORMAL_95], rel=0.02)
     bends = BendsFile(list(KEYS[1:]), [[2.0, 0.0, 0.0, 0.0]], [[6.0, 0.0, 0.0, 0.0]], 2.0)
-    bent = msgspec.structs.replace(new, bends=bends).posterior(KEYS)
+    bent = read(bends=bends)
     assert bent.sd == pytest.approx([1.0, np.sqrt(0.25 + 0.75 * 9.0), 1.0, 1.0, 1.0], rel=1e-6)
     assert not bent.followed and len(bent.mixtures[""].weights) > 10
     for wrong in (
@@ -155,7 +162,7 @@ def test_files_of_before_are_read() -> None:
         {"bends": msgspec.structs.replace(bends, ends=[])},
     ):
         with pytest.raises(InputError, match="calibrate again"):
-            msgspec.structs.replace(new, **wrong).posterior(KEYS)
+            read(**wrong)
 
 
 @given(st.integers(0, 2**31))

@@ -179,7 +179,7 @@ def with_roughness(posterior: Posterior, end: RobustSolution, observations: Obse
     """Wider by what a lens without a formula leaves in the same places of all views."""
     if not end.problem.options.blank_lens.roughness:
         return posterior
-    from ceres_cal.posterior.roughness import shifts_by_roughness
+    from ceres_cal.posterior.other_lenses import shifts_by_roughness
 
     return posterior.widened(*shifts_by_roughness(end, observations))
 
