@@ -255,7 +255,8 @@ class Ends:
         rows = np.split(self.steps / self.half_width, 2)[0] @ self.information.matrix
         rows = over(rows, self.keys, keys)
         known = Information(keys, information.matrix + (1.0 / within - 1.0) * rows.T @ rows)
-        return Mixture(keys, np.full(len(steps), 1.0 / len(steps)), steps, (known,) * len(steps))
+        every = np.zeros(len(steps), dtype=np.int64)
+        return Mixture(keys, np.full(len(steps), 1.0 / len(steps)), steps, (known,), every)
 
 
 def _drawn(count: int) -> Array:

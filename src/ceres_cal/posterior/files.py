@@ -45,15 +45,13 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
     @classmethod
     def of(cls, mixture: Mixture) -> MixtureFile:
         """As a file has it."""
-        different = {id(one): one for one in mixture.information}
-        number = {name: count for count, name in enumerate(different)}
-        known = next(iter(different.values())).keys
+        known = mixture.information[0].keys
         return cls(
             list(mixture.keys),
             mixture.weights.tolist(),
             mixture.steps.tolist(),
-            [number[id(one)] for one in mixture.information],
-            [lower_triangle(one.over(known)) for one in different.values()],
+            mixture.at.tolist(),
+            [lower_triangle(one.over(known)) for one in mixture.information],
             [key for key in mixture.keys if key not in known],
             [ChainFile(int(chain.at[0]), chain.roots.tolist()) for chain in mixture.chains],
             mixture.phi_px,
@@ -78,10 +76,9 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
             raise InputError(f"{where}.chains do not fit its components: calibrate again")
         if chains and self.keys[0][:3] != ("camera", name, "phi"):
             raise InputError(f"{where} does not begin with phi of camera {name!r}: calibrate again")
-        information = tuple(every[number] for number in self.at)
-        numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), information
+        numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), tuple(every)
         valley = self.phi_px, self.open_below, self.open_above
-        return Mixture(tuple(self.keys), *numbers, chains, *valley, dict(self.lenses))
+        return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, dict(self.lenses))
 
 
 class SeenFile(msgspec.Struct, forbid_unknown_fields=True):

@@ -129,7 +129,7 @@ class Outlook:
             if not np.any(added.matrix):
                 yield float(phi[node]), np.inf, Errors(np.inf, np.inf)
                 continue
-            across, along = valley.information[node].matrix, tangents[node]
+            across, along = valley.information[valley.at[node]].matrix, tangents[node]
             coupling = -across @ along
             of_phi = along @ across @ along + bend / phi[node] ** 2
             matrix = np.block([[np.atleast_2d(of_phi), coupling[None]], [coupling[:, None], across]])
