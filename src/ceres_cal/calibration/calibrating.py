@@ -31,7 +31,7 @@ from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.posterior.assess import assess, with_doubts, with_other_lenses, with_roughness
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.bundle import Progress, Solution
 from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, problem_of
@@ -54,10 +54,6 @@ if TYPE_CHECKING:
     from ceres_cal.robust.bulk import Bulk, Settled, Subset
 
 
-# Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
-# outliers are those of the right drawing; and how many there may be.
-_REDRAWN, _MOST_DRAWINGS = 0.005, 4
-_LONG_TO_DIGEST = 20_000  # observations: fewer take less than a thread, and what makes one
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
     "priors and their units"
@@ -121,12 +117,15 @@ def _measured(
     observations: Observations, options: Options, progress: Callable[[Progress], None] | None, client: Any
 ) -> Calibration:
     """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
-    for _ in range(_MOST_DRAWINGS):
+    # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start
+    # and outliers are those of the right drawing; and how many there may be.
+    redrawn, most_drawings = 0.005, 4
+    for _ in range(most_drawings):
         calibration = _calibrated(observations, options, progress, client)
         before = calibration.estimate.structure
         calibration = calibration.redrawn()
         moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
-        if float(np.max(np.abs(moved), initial=0.0)) < _REDRAWN:
+        if float(np.max(np.abs(moved), initial=0.0)) < redrawn:
             break
         observations = calibration.drawn_alike(observations)
     return calibration
@@ -271,7 +270,8 @@ def solved_from(
     Raises:
         CalibrationError: see `calibrate`.
     """
-    takes_long = len(observations.points) + len(observations.curves) > _LONG_TO_DIGEST
+    long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
+    takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
@@ -292,7 +292,11 @@ def solved_from(
 
         beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
         problem, end = beside.problem, beside.end
-    end, others = least_of_few(problem, observations, end, start.others) if again is None else (end, ())
+    others: tuple[Solution, ...] = ()
+    if again is None and end.problem.sights.equations == problem.sights.equations:
+        least, others = least_of_few(end.problem, end.solution.estimate, start.others)
+        if least is not end.solution.estimate:
+            end = replace(end.moved_to(least, observations, problem), reduced=None)
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     posterior, conflicts, settled = None, Conflicts(), None

@@ -1,7 +1,11 @@
-"""How well a pixel tells a place: standard deviations and 95 % bounds of located points, in metres at a height.
+"""How well a pixel tells a place, in metres at a height, and how well a camera knows its own image, in pixels.
 
 They are the calibration's own share: the noise of the pixel that is asked about comes on top, and model error (a lens
 with too few coefficients, a field painted amiss) is not in them.
+
+A camera that turns by a little shows the same picture with another principal point: of an image what a turn makes good
+is left out, by least squares. What remains is the lens's and the focal length's, wherever the camera hangs; what the
+pose adds is in the maps over the field.
 """
 
 from __future__ import annotations
@@ -12,13 +16,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.reading import Functional, read
-from ceres_cal.problem.information import STATION_QUANTITIES, Key
+from ceres_cal.problem.information import STATION_QUANTITIES, Key, over
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
-from ceres_cal.problem.quantities import pixel_slopes
+from ceres_cal.problem.quantities import PixelSlopes, pixel_slopes
+from ceres_cal.scene.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,3 +192,101 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     sd_mm[visible], radius_mm[visible] = 1e3 * spread.sd_m, 1e3 * spread.radius_95_m
     values = (part.reshape(grid.shape) for part in (sd_mm, radius_mm))
     return FieldMap(grid.height_m, grid.x_m, grid.y_m, station, *values)
+
+
+_STEPS = 32  # along the longer side
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMap:
+    """How well one camera knows its image, over a grid.
+
+    Attributes:
+        x_px (X,), y_px (Y,): of the grid. radius_95_px: (Y, X) 95 % of the errors are shorter; infinite where it is not
+            known, NaN past the lens's monotone radius.
+    """
+
+    camera: str
+    x_px: Array
+    y_px: Array
+    radius_95_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a camera shows at N pixels, and how that moves when the camera is another one."""
+
+    camera: Camera
+    pixels: Array
+
+    @cached_property
+    def _rays(self) -> Array:
+        return self.camera.rays(self.pixels)
+
+    @cached_property
+    def _by(self) -> PixelSlopes:
+        return pixel_slopes(self.camera, self._rays)
+
+    def of(self, camera: Camera) -> Picture:
+        """What another one shows at the same pixels."""
+        return Picture(camera.at(Pose.identity()), self.pixels)
+
+    @property
+    def shown(self) -> Mask:
+        """(N,) which pixels the lens has an answer for."""
+        return np.isfinite(self._by.turns[:, 0, 0])
+
+    @property
+    def _turns(self) -> Array:
+        """(2 N, 3) px per rad about the camera's axes; 0 where the lens shows nothing."""
+        return np.nan_to_num(self._by.turns.reshape(-1, 3))
+
+    def shift(self, other: Camera) -> Array:
+        """(N, 2) px from where this camera shows its rays to where another one does, turned as well as can be; NaN
+        where either shows nothing.
+        """
+        shift = other.project(self._rays) - self.pixels
+        known = np.repeat(np.isfinite(shift[:, 0]), 2)
+        turn = np.linalg.lstsq(self._turns[known], shift.ravel()[known], rcond=None)[0]
+        return np.asarray(shift - (self._turns @ turn).reshape(-1, 2))
+
+    def slopes(self, quantities: Sequence[str]) -> Array:
+        """(N, 2, K) px per unit of some intrinsics, turned as well as can be; 0 where the lens shows nothing."""
+        names = intrinsic_names(self.camera.lens)
+        moving = np.nan_to_num(self._by.intrinsics[:, :, [names.index(name) for name in quantities]])
+        flat = moving.reshape(2 * len(moving), len(quantities))
+        turn = np.linalg.lstsq(self._turns, flat, rcond=None)[0]
+        return np.asarray((flat - self._turns @ turn).reshape(moving.shape))
+
+
+def image_grid(image_size: tuple[int, int]) -> tuple[Array, Array]:
+    """x (X,) and y (Y,) of a grid over an image, px, from its first pixels to its last."""
+    steps = (max(round(_STEPS * side / max(image_size)), 2) for side in image_size)
+    x, y = (np.linspace(0.0, side - 1.0, count + 1) for side, count in zip(image_size, steps, strict=True))
+    return x, y
+
+
+def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap:
+    """The map over a camera's image.
+
+    Raises:
+        InputError: no such camera.
+    """
+    if camera not in estimate.cameras:
+        raise InputError(f"there is no camera {camera!r}: it is one of {', '.join(estimate.cameras)}")
+    own = estimate.cameras[camera].at(Pose.identity())
+    x, y = image_grid(own.image_size)
+    pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    picture = Picture(own, pixels)
+    shown = Functional(
+        lambda there: picture.shift(there.cameras[camera].at(Pose.identity())),
+        lambda there, keys: picture_slopes(picture.of(there.cameras[camera]), keys, camera),
+    )
+    radius = read(posterior, estimate, shown, camera).radius_95
+    return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
+
+
+def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
+    """(N, 2, K) px per unit of each of the keys: 0 of what is not this camera's."""
+    own = [key for key in keys if key[:2] == ("camera", camera)]
+    return over(picture.slopes([key.quantity for key in own]), own, keys)

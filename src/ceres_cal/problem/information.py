@@ -96,7 +96,6 @@ def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
 
 
 _VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
-_DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,10 +205,11 @@ class Information:
     @cached_property
     def root(self) -> Array:
         """(R, K) with root^T root = matrix: a row for each direction that is determined, in standard deviations."""
+        determined = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
         diagonal = np.diagonal(self.matrix)
         if np.count_nonzero(self.matrix) == np.count_nonzero(diagonal):
             return np.asarray(np.diag(np.sqrt(diagonal))[diagonal > 0.0])
         scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
         values, vectors = np.linalg.eigh(self.matrix * scale[:, None] * scale)
-        kept = values > _DETERMINED
+        kept = values > determined
         return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T / scale)

@@ -197,10 +197,8 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
         )
 
 
-_MOST_SCREENED, _MOST_SIGHTS = 12, 200  # of a camera: that are asked first, and that tell the sigma
 # Standard deviations of products of different views from which on the likelihood is asked, which costs as much again.
 _REPEATS = 2.0
-_DEGREE, _POWERS = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
 
 
 def estimate_as_built(
@@ -212,6 +210,7 @@ def estimate_as_built(
     Args:
         problem: of all the observations. end: of its rounds.
     """
+    most_screened, most_sights = 12, 200  # of a camera: that are asked first, and that tell the sigma
     structure, tolerances = whole_structure(observations.targets), problem.options.tolerances
     dimensions = problem.options.dimensions
     stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.solution.estimate.structure)
@@ -219,14 +218,14 @@ def estimate_as_built(
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
         return (), as_stated
-    sights = _some(end.problem.sights, _MOST_SCREENED)
+    sights = _some(end.problem.sights, most_screened)
     equations, weights = _equations(stated, observations, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
     # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved.
     if not any(agreement(scores[:, numbers]) > _REPEATS for numbers in kinds.values()):
         return (), as_stated
-    equations, weights = _equations(stated, observations, end, _some(end.problem.sights, _MOST_SIGHTS))
+    equations, weights = _equations(stated, observations, end, _some(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
     every = tuple(_likely(repeats, kinds, observations))
@@ -289,14 +288,15 @@ def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
     """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
     radius.
     """
+    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
     for name in equations.sights.cameras:
         camera = estimate.cameras[name]
         place = (equations.pixel - camera.principal_point) / unit_px(camera)
         x, y = place.T
-        smooth = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+        smooth = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
         along = np.sum(place * equations.direction, axis=1)
-        radial = [np.sum(place**2, axis=1) ** power * along for power in _POWERS]
+        radial = [np.sum(place**2, axis=1) ** power * along for power in powers]
         every = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
         yield np.column_stack(every) * (owner == name)[:, None]
 

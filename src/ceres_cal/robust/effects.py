@@ -29,8 +29,6 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
-# Probability below which an effect is nothing: by as much of its amounts' variance nothing is visibly wider.
-_NEGLIGIBLE = 0.01
 _MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
 
 
@@ -179,12 +177,14 @@ class _Amounts:
 
     def shifts(self) -> Iterator[Array]:
         """(K,) each, see `EffectsEnd`."""
+        # Probability below which an effect is nothing: by as much of its amounts' variance nothing is visibly wider.
+        negligible = 0.01
         amounts, covariance = self._best
         yield from shifts_by(self.taken, covariance)
         for number, group in enumerate(self.groups):
             (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
             if probability > LIKELY:
                 yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
-            elif probability > _NEGLIGIBLE:
+            elif probability > negligible:
                 alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))
                 yield from np.sqrt(probability) * shifts_by(taken, open_ + np.outer(alone, alone))
