@@ -32,7 +32,7 @@ from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import moved, natural_sizes, values_of
+from ceres_cal.problem.quantities import difference, moved, natural_sizes, values_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
@@ -41,6 +41,7 @@ from ceres_cal.robust.stated import (
     Conflict,
     Statement,
     WaldTest,
+    agreed,
     contradicted,
     contradicting,
     grouped,
@@ -202,23 +203,31 @@ class Conflicts:
     """What contradicts what, and how the numbers move with each of it.
 
     Attributes:
-        every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when a
-            statement in conflict is left out.
+        every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when
+            statements in conflict are left out, or are not.
+        answer: without what was stated and is contradicted; None where the answer stays.
     """
 
     every: tuple[Conflict, ...] = ()
     keys: tuple[Key, ...] = ()
     shifts: tuple[Array, ...] = ()
+    answer: RobustSolution | None = None
 
 
 @numerical("the test of what was stated")
 def find_conflicts(
-    problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None = None
+    problem: Problem,
+    observations: Observations,
+    end: RobustSolution,
+    usual: tuple[float, float] | None = None,
+    part: Problem | None = None,
 ) -> Conflicts:
     """Everything stated that the rest contradicts, the worst first, each with those before it left out.
 
     Args:
         problem: of all the observations. end: its solution. usual: noise scales that were seen before.
+        part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
+            without an outlier; None where the answer stays.
     """
     every = tuple(statements(problem, observations, end.solution.estimate))
     if not every:
@@ -228,8 +237,16 @@ def find_conflicts(
     while search.solves < _MOST and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
-    shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.shifts]
-    return Conflicts((*(one for _, one in pairs), *search.conflicts()), reduced.shared.keys, tuple(shifts))
+    named = (*(one for _, one in pairs), *search.conflicts())
+    priors, answer = agreed(problem.priors, named), None
+    if part is not None and priors != problem.priors:
+        answer = _solved(replace(part, priors=priors), observations, search.end, usual)
+    if answer is None:
+        shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.places[1:]]
+    else:
+        moved = difference(answer.solution.estimate, end.solution.estimate, reduced.shared.keys)
+        shifts = [place - moved for place in search.places[:-1]]
+    return Conflicts(named, reduced.shared.keys, tuple(shifts), answer)
 
 
 def without_suspicious(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
@@ -269,6 +286,17 @@ def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
     return np.asarray(covariance[:, column] / covariance[column, column] * offset)
 
 
+def _solved(
+    problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
+) -> RobustSolution | None:
+    """The problem solved from where another one ended; None where it cannot be."""
+    try:
+        after = solve_robustly(problem, observations, end.solution.estimate, usual)
+    except CalibrationError:  # quiet: the linear test decides, and the answer stays
+        return None
+    return None if after.solution.failed else after
+
+
 @dataclass(eq=False)
 class _ForwardSelection:
     """Forward selection: the worst statement is left out, then the worst of the others.
@@ -276,7 +304,7 @@ class _ForwardSelection:
     Attributes:
         problem, end: without what was left out. left: statements that are not judged yet.
         out: those in conflict, their tests, and names of others that may be wrong in their place.
-        shifts: see `Conflicts`.
+        places: (K,) from the first end: it, ends without statements, and where rivals left out would lead.
     """
 
     problem: Problem
@@ -288,9 +316,9 @@ class _ForwardSelection:
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
         self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
-        self.shifts: list[Array] = []
         self._level = float(np.log(LEVEL / len(self.every)))
         self._first = self.end.reduced or information(self.end.problem, self.end.solution.estimate)
+        self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.solution.estimate
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
@@ -303,16 +331,16 @@ class _ForwardSelection:
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.solution.estimate)
-        after = None if suspect.kind == "earlier" else self._solved(freed)
+        after = None if suspect.kind == "earlier" else _solved(freed, self.observations, self.end, self.usual)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
             return True
         self.out.append((suspect, test, [one.name for one, _ in rivals]))
-        self.shifts += [_along(self._first, t.key, t.seen[0] - t.stated[0]) for _, t in rivals]
+        here = self.places[-1]
+        self.places += [here + _along(self._first, t.key, t.seen[0] - t.stated[0]) for _, t in rivals]
         if after is not None:
-            start = GaussianPrior.about(Information.nothing(self._first.shared.keys), self.end.solution.estimate)
-            self.shifts.append(start.offsets(after.solution.estimate))
+            self.places.append(difference(after.solution.estimate, self._start, self._first.shared.keys))
             self.problem, self.end = freed, after
         return True
 
@@ -326,14 +354,6 @@ class _ForwardSelection:
             if test.log_p <= self._level:
                 found.append(contradicted(statement, test, alone, rivals))
         return found
-
-    def _solved(self, problem: Problem) -> RobustSolution | None:
-        """The problem solved from where the last one ended; None where it cannot be."""
-        try:
-            after = solve_robustly(problem, self.observations, self.end.solution.estimate, self.usual)
-        except CalibrationError:  # quiet: the linear test decides
-            return None
-        return None if after.solution.failed else after
 
     def _confirmed(self, statement: Statement, after: RobustSolution) -> WaldTest:
         """The test where the problem without the statement was solved. In a bent valley the least squares themselves
