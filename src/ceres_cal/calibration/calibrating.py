@@ -317,7 +317,7 @@ def solved_from(
         posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *conflicts.words, *unknown_phi(end, posterior))
         warnings = (
             *warnings,
             *resting_phi(end, problem),

@@ -25,6 +25,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import log_f_tail
+from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.costs import robust_weights
@@ -44,6 +45,7 @@ from ceres_cal.robust.stated import (
     agreed,
     contradicted,
     contradicting,
+    doubted,
     grouped,
     statements,
 )
@@ -192,8 +194,8 @@ def log_probability(squared: float, rest: Rest) -> float:
     return float(log_f_tail(squared / rank, rank, max(rest.freedom, 1.0)))
 
 
-# Probability of a linear picture from which on it is worth another solve: 2.5 sigma.
-_SUSPICIOUS = 0.0124
+# Probability of a linear picture from which on it is worth another solve: 2.2 sigma, where one in twenty is wrong.
+_SUSPICIOUS = 0.028
 _MOST = 4  # solves
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
@@ -206,12 +208,28 @@ class Conflicts:
         every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when
             statements in conflict are left out, or are not.
         answer: without what was stated and is contradicted; None where the answer stays.
+        doubts: priors that look wrong, and are too likely right to be set aside.
     """
 
     every: tuple[Conflict, ...] = ()
     keys: tuple[Key, ...] = ()
     shifts: tuple[Array, ...] = ()
     answer: RobustSolution | None = None
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """One line of each."""
+        return (*(one.words for one in self.every), *(one.words for one in self.doubts))
+
+
+class Doubt(NamedTuple):
+    """That a prior may be wrong: its numbers, how probable that is, (K,) by how much everything moves without it."""
+
+    keys: tuple[Key, ...]
+    probability: float
+    shift: Array
+    words: str
 
 
 @numerical("the test of what was stated")
@@ -246,7 +264,7 @@ def find_conflicts(
     else:
         moved = difference(answer.solution.estimate, end.solution.estimate, reduced.shared.keys)
         shifts = [place - moved for place in search.places[:-1]]
-    return Conflicts(named, reduced.shared.keys, tuple(shifts), answer)
+    return Conflicts(named, reduced.shared.keys, tuple(shifts), answer, tuple(search.doubts))
 
 
 def without_suspicious(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
@@ -286,6 +304,13 @@ def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
     return np.asarray(covariance[:, column] / covariance[column, column] * offset)
 
 
+def _wrong(squared: float) -> float:
+    """Probability that a statement so far off is wrong, which one in twenty is: as of a line that lies aside."""
+    scatter = 1.0 + FEATURE_ASIDE.scatter**2
+    right, *others = FEATURE_ASIDE.probabilities * np.exp(0.5 * squared * (1.0 - 1.0 / scatter)) / np.sqrt(scatter)
+    return float(np.sum(others) / (right + np.sum(others)))
+
+
 def _solved(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
 ) -> RobustSolution | None:
@@ -304,7 +329,8 @@ class _ForwardSelection:
     Attributes:
         problem, end: without what was left out. left: statements that are not judged yet.
         out: those in conflict, their tests, and names of others that may be wrong in their place.
-        places: (K,) from the first end: it, ends without statements, and where rivals left out would lead.
+        doubts: see `Conflicts`. places: (K,) from the first end: it, ends without statements, and where rivals that are
+            left out would lead.
     """
 
     problem: Problem
@@ -316,6 +342,7 @@ class _ForwardSelection:
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
         self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
+        self.doubts: list[Doubt] = []
         self._level = float(np.log(LEVEL / len(self.every)))
         self._first = self.end.reduced or information(self.end.problem, self.end.solution.estimate)
         self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.solution.estimate
@@ -335,6 +362,10 @@ class _ForwardSelection:
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
+            if after is not None and suspect.kind == "prior":
+                shift = difference(after.solution.estimate, self.end.solution.estimate, self._first.shared.keys)
+                words = doubted(suspect, test, len(self.every) == 1, likely := _wrong(test.squared))
+                self.doubts.append(Doubt(suspect.keys, likely, shift, words))
             return True
         self.out.append((suspect, test, [one.name for one, _ in rivals]))
         here = self.places[-1]

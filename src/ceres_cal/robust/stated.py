@@ -195,12 +195,23 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
         alone: whether nothing but observations stands against it. rivals: names of other statements that may be wrong
             in its place.
     """
+    key, also = test.key, "".join(f", or else {one}" for one in rivals)
+    words = f"{_apart(statement, test, alone)}: {_in_another_unit(test)}correct or remove it{also}"
+    return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
+
+
+def doubted(statement: Statement, test: WaldTest, alone: bool, probability: float) -> str:
+    """A statement that is in doubt, in words."""
+    which = f"({100.0 * probability:.0f} % that it is wrong)"
+    return (
+        f"in doubt about {_apart(statement, test, alone)} {which}; standard deviations hold for either: measure again"
+    )
+
+
+def _apart(statement: Statement, test: WaldTest, alone: bool) -> str:
     key, who = test.key, "the observations alone say" if alone else "everything else says"
     about = f"{_STATED[statement.kind]} {key.quantity} of {key.whose}, {number_text(*test.stated, key)}"
-    apart = f"{who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
-    advice = f"{_in_another_unit(test)}correct or remove it{''.join(f', or else {one}' for one in rivals)}"
-    words = f"the {about}: {apart}: {advice}"
-    return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
+    return f"the {about}: {who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
 
 
 def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Conflict]]:
