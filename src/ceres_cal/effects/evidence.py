@@ -90,8 +90,8 @@ _SWEEPS = 2  # over the effects, each beside the others
 LEAST_PX = 1e-3
 """Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
-# The same of directions that tell a size. What is free besides takes up nearly all of those that are less determined, and
-# what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a lens had left over.
+# The same of directions that tell a size. What is free besides takes up nearly all of those that are less determined,
+# and what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a lens had left over.
 _TELLS = 1e-3
 _Name = TypeVar("_Name", bound=Hashable)
 _STEPS = 200

@@ -25,6 +25,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import log_f_tail
+from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import solve
@@ -137,12 +138,16 @@ def _slopes(problem: Problem, observations: Observations, estimate: Estimate, re
     return np.array(slopes)
 
 
-def rest_at(statement: Statement, end: RobustSolution) -> Rest:
-    """Where a problem without the statement was solved."""
+def rest_at(statement: Statement, end: RobustSolution, observations: Observations | None = None) -> Rest:
+    """Where a problem without the statement was solved; with the observations, as these scatter."""
     estimate = end.solution.estimate
     reduced = end.reduced or information(end.problem, estimate)
     freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
-    return Rest(estimate, np.zeros(len(statement.keys)), reduced.shared.marginal(statement.keys), freedom)
+    scatter = None
+    if observations is not None:
+        scatter = measure_scatter(observations, end.problem, end.residuals, estimate, reduced)
+    known = scattered(reduced, scatter).marginal(statement.keys)
+    return Rest(estimate, np.zeros(len(statement.keys)), known, freedom)
 
 
 def worst_test(statement: Statement, rest: Rest) -> WaldTest:
@@ -196,6 +201,7 @@ def log_probability(squared: float, rest: Rest) -> float:
 
 # Probability of a linear picture from which on it is worth another solve: 2.2 sigma, where one in twenty is wrong.
 _SUSPICIOUS = 0.028
+_DOUBTFUL = 0.05  # probability that a statement is wrong, from which on both explanations are named
 _MOST = 4  # solves
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
@@ -362,9 +368,10 @@ class _ForwardSelection:
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
-            if after is not None and suspect.kind == "prior":
+            likely = _wrong(test.squared)
+            if after is not None and suspect.kind == "prior" and likely > _DOUBTFUL:
                 shift = difference(after.solution.estimate, self.end.solution.estimate, self._first.shared.keys)
-                words = doubted(suspect, test, len(self.every) == 1, likely := _wrong(test.squared))
+                words = doubted(suspect, test, len(self.every) == 1, likely)
                 self.doubts.append(Doubt(suspect.keys, likely, shift, words))
             return True
         self.out.append((suspect, test, [one.name for one, _ in rivals]))
@@ -381,7 +388,7 @@ class _ForwardSelection:
         found = []
         for number, (statement, test, rivals) in enumerate(self.out):
             if number < len(self.out) - 1 and statement.kind != "earlier":
-                test = worst_test(statement, rest_at(statement, self.end))
+                test = worst_test(statement, rest_at(statement, self.end, self.observations))
             if test.log_p <= self._level:
                 found.append(contradicted(statement, test, alone, rivals))
         return found
@@ -391,7 +398,8 @@ class _ForwardSelection:
         say how far apart the two are: by how much they rise, over the same observations, when the statement is added.
         """
         rest = rest_at(statement, after)
-        test = worst_test(statement, rest)
+        alone = worst_test(statement, rest)
+        test = worst_test(statement, rest_at(statement, after, self.observations))
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
         try:
@@ -399,7 +407,8 @@ class _ForwardSelection:
         except CalibrationError:  # quiet: the linear test decides
             return test
         rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
-        if rise >= test.squared or len(statement.priors) > 1:
+        if rise >= alone.squared or len(statement.priors) > 1:
             return test
-        share = float(np.sqrt(rise / test.squared))
-        return test._replace(squared=rise, log_p=log_probability(rise, rest), sigmas=test.sigmas * share)
+        share = rise / alone.squared
+        squared, sigmas = share * test.squared, test.sigmas * share**0.5
+        return test._replace(squared=squared, log_p=log_probability(squared, rest), sigmas=sigmas)
