@@ -302,7 +302,12 @@ def solved_from(
     posterior, conflicts, settled = None, Conflicts(), None
     assessed = again is None or again.assessed
     if assessed:
-        conflicts = find_conflicts(problem, observations, end, usual)
+        part = taking_part(problem, observations, explanations) if again is None else None
+        conflicts = find_conflicts(problem, observations, end, usual, part)
+    if conflicts.answer is not None:
+        problem = replace(problem, priors=conflicts.answer.problem.priors)
+        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        end, others = replace(conflicts.answer, residuals=shown), ()
     if watched.settle is not None:
         settled = watched.settle(problem, end, explanations, watched.progress)
         end = settled.end
@@ -316,7 +321,7 @@ def solved_from(
         posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *conflicts.words, *unknown_phi(end, posterior))
         warnings = (
             *warnings,
             *resting_phi(end, problem),

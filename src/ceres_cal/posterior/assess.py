@@ -164,6 +164,9 @@ def with_doubts(
     estimate = end.solution.estimate
     disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as any of what contradicts it
     posterior = posterior.with_alternatives(conflicts.keys, conflicts.shifts, [disputed] * len(conflicts.shifts))
+    for doubt in conflicts.doubts:  # of which nothing is known for certain any more
+        posterior = replace(posterior, stated=posterior.stated.without(doubt.keys))
+        posterior = posterior.with_alternatives(conflicts.keys, [doubt.shift], [doubt.probability])
     doubtful = [one for one in explanations if one.is_doubtful]
     shifts = [difference(one.other, estimate, posterior.keys) for one in doubtful]
     likely = np.array([one.doubt for one in doubtful])
