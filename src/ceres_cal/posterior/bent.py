@@ -32,6 +32,7 @@ _HELD = 0.005  # of a step: how closely its end is held
 _FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
 _FEW = 300  # equations beside which other minima are sought: not measured; the cases mended had under 200
 _MOST_ITERATIONS = 30  # of each end: along a flat valley the solver creeps for hundreds that change nothing here
+_NEAR = 1e-6  # of a variance: how nearly each end costs the least; by a thousandth of a standard deviation it is off
 _FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
 # Another minimum lies so far off, of the rise at an end, by what the normal equations say, and costs less than so much
 # of that: the same one, not quite reached, costs all of it.
@@ -217,7 +218,7 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
 def _solved(problem: Problem, start: Estimate) -> Solution | None:
     short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
     try:
-        solution = solve(replace(problem, options=short), start)
+        solution = solve(replace(problem, options=short), start, precision=_NEAR / max(problem.equations, 1))
     except CalibrationError:  # quiet: the end counts as far away as any
         return None
     return None if solution.failed else solution
