@@ -127,10 +127,10 @@ def put(*path: str, value: Any) -> Callable[[dict[str, Any]], None]:
             put("cameras", "overhead", "lens", "coefficients", value={"a2": 0.0, "a3": -1e-6}),
             "'overhead'.*folds over at",
         ),
-        (put("cameras", "overhead", "lens", "kind", value="fisheye"), "unknown lens 'fisheye'"),
+        (put("cameras", "overhead", "lens", "kind", value="fisheye"), "there is no lens 'fisheye'"),
         (put("cameras", "overhead", "sensor", value=1), "unknown field `sensor`"),
         (put("stations", "overhead", "rotation", value=[[1.0, 0.0], [0.0, 1.0]]), "rotation"),
-        (put("options", "loss", value="l2"), "unknown loss 'l2'"),
+        (put("options", "loss", value="l2"), "there is no loss 'l2'"),
         (put("options", "fixed", value={"k9": 1.0}), "cannot fix 'k9'"),
         (put("options", "priors", value=[{"station": "overhead"}]), "prior"),
         (lambda data: data.pop("fit"), "missing required field `fit`"),
@@ -171,7 +171,7 @@ def test_stations_by_name() -> None:
     assert one.station().cam_from_world == one.estimate.stations["overhead"].cam_from_world
     assert list(three.stations) == ["first", "second", "third"] and list(three.cameras) == ["overhead"]
     for name in (None, "fourth"):
-        with pytest.raises(InputError, match=f"station {name!r} is not there: there are 'first', 'second', 'third'"):
+        with pytest.raises(InputError, match=f"there is no station {name!r}: choose one of first, second, third"):
             three.station(name)
 
 

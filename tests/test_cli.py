@@ -609,9 +609,9 @@ def _no_camera(data: Sample) -> None:
 @pytest.mark.parametrize(
     "spoil, words",
     [
-        (_feature, ("view 0 (frame ", "point feature 'CornerOfTheRoom' is unknown", "`ceres-cal targets`")),
-        (_curve, ("view 0 (frame ", "curve feature 'Horizon' is unknown")),
-        (_target, ("view 0 (frame ", "target 'pitch', which is not there")),
+        (_feature, ("view 0 (frame ", "has no point 'CornerOfTheRoom'", "`ceres-cal targets`")),
+        (_curve, ("view 0 (frame ", "has no curve 'Horizon'")),
+        (_target, ("view 0 (frame ", "there is no target 'pitch'")),
         (_kind, ("target 'field'", "unknown kind 'tennis'")),
         (_version, ("version 99 is not known",)),
         (_nan, ("view 0 (frame ", "pixel is not finite")),
@@ -619,7 +619,7 @@ def _no_camera(data: Sample) -> None:
         (_too_few, ("cannot",)),
         (_collinear, ("overhead",)),
         (_idle_camera, ("camera 'spare' has no observation",)),
-        (_no_camera, ("view 0 (frame ", "camera 'underwater', which is not there")),
+        (_no_camera, ("view 0 (frame ", "there is no camera 'underwater'")),
     ],
 )
 def test_bad_observations(say: Say, tmp_path: Path, spoil: Callable[[Sample], None], words: Sequence[str]) -> None:
@@ -796,7 +796,7 @@ def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatc
         (("1,nan",), "'nan' is not a finite number"),
         (("1,2", "--file", "rows.csv"), "not both"),
         (("--file", "rows.csv"), "rows.csv, line 2: 'two' is not a number"),
-        (("1,2", "--station", "attic"), "station 'attic' is not there: there are 'overhead'"),
+        (("1,2", "--station", "attic"), "there is no station 'attic': choose one of overhead"),
         (("1,2", "--height-mm", "nan"), "'nan' is no length: write a number of mm, or 5m, 150mm"),
     ],
 )

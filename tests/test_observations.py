@@ -321,19 +321,19 @@ BAD_DOCUMENTS: list[tuple[Callable[[Document], object], tuple[str, ...]]] = [
     # names
     (
         at(*POINTS_0, "features", 0, value="corner"),
-        (VIEW_0, "point feature 'corner' is unknown in target 'field'", "ceres-cal targets"),
+        (VIEW_0, "target 'field' has no point 'corner'", "ceres-cal targets"),
     ),
-    (at(*POINTS_0, "features", 0, value="a\nb"), (VIEW_0, r"point feature 'a\nb'")),
-    (at(*POINTS_0, "features", 0, value="BottomTouchLine"), (VIEW_0, "point feature 'BottomTouchLine' is unknown")),
+    (at(*POINTS_0, "features", 0, value="a\nb"), (VIEW_0, r"has no point 'a\nb'")),
+    (at(*POINTS_0, "features", 0, value="BottomTouchLine"), (VIEW_0, "has no point 'BottomTouchLine'")),
     (
         at(*CURVES_0, "features", 1, value="CenterMark"),
-        (VIEW_0, "curve feature 'CenterMark' is unknown in target 'field'"),
+        (VIEW_0, "target 'field' has no curve 'CenterMark'"),
     ),
     (
         at("views", 1, "target", value="plate"),
-        (VIEW_1, "names target 'plate', which is not there: there are 'field', 'board'"),
+        (VIEW_1, "there is no target 'plate': choose one of field, board"),
     ),
-    (at("views", 1, "camera", value="side"), (VIEW_1, "names camera 'side', which is not there: there are 'overhead'")),
+    (at("views", 1, "camera", value="side"), (VIEW_1, "there is no camera 'side': choose one of overhead")),
     (at("cameras", value=TWO_CAMERAS), ("camera 'side' has no observation",)),
     (at("targets", "field", "kind", value="ssl"), ("target 'field': unknown kind 'ssl'",)),
     (at("targets", "board", "rows", value=1), ("target 'board': ", "at least 2")),
@@ -392,7 +392,7 @@ BAD_DOCUMENTS: list[tuple[Callable[[Document], object], tuple[str, ...]]] = [
     # priors
     (
         at("priors", 0, "station", value="side"),
-        ("a prior names station 'side', which is not there: there are 'overhead'",),
+        ("a prior: there is no station 'side': choose one of overhead",),
     ),
     (at("priors", 0, "camera", value="overhead"), ('prior 0: a prior names one "camera" or one "station"',)),
     (
@@ -446,7 +446,7 @@ def test_a_file_whose_name_begins_the_message(tmp_path: Path, monkeypatch: pytes
     data = document()
     data["views"][0]["camera"] = "side"
     written(tmp_path, data, "view")
-    with pytest.raises(InputError, match=r"^view: view 0 \(frame '0001'\) names camera"):
+    with pytest.raises(InputError, match=r"^view: view 0 \(frame '0001'\): there is no camera"):
         Observations.load("view")
 
 
@@ -529,8 +529,8 @@ BAD_ARRAYS: list[tuple[Callable[[dict[str, Any]], object], tuple[str, ...]]] = [
     (lambda a: a.update(header=np.array(["an", {"object": 1}], object)), ("it holds pickled objects",)),
     (lambda a: a.update(points_pixels=a["points_pixels"].astype(object)), ("it holds pickled objects",)),
     (header_with(at("version", value=7)), ("version 7 is not known here, only 1",)),
-    (header_with(at("views", 0, "camera", value="side")), (VIEW_0, "names camera 'side', which is not there")),
-    (header_with(at("views", 0, "target", value="plate")), (VIEW_0, "names target 'plate', which is not there")),
+    (header_with(at("views", 0, "camera", value="side")), (VIEW_0, "there is no camera 'side'")),
+    (header_with(at("views", 0, "target", value="plate")), (VIEW_0, "there is no target 'plate'")),
     (header_with(at("cameras", value=TWO_CAMERAS)), ("camera 'side' has no observation",)),
     (header_with(at("lines", value={})), ("Object contains unknown field `lines`",)),
 ]

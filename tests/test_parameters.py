@@ -66,8 +66,8 @@ def watched(*views: tuple[str, str | None], cameras: dict[str, str] | None = Non
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"lens": "fisheye"}, "unknown lens 'fisheye': choose one of radial, brown, kannala-brandt"),
-        ({"loss": "l2"}, "unknown loss 'l2': choose one of trivial, huber, soft_l1, cauchy, tukey"),
+        ({"lens": "fisheye"}, "there is no lens 'fisheye': choose one of radial, brown, kannala-brandt"),
+        ({"loss": "l2"}, "there is no loss 'l2': choose one of trivial, huber, soft_l1, cauchy, tukey"),
         ({"noise_scale": "guess"}, "noise_scale must be 'estimate' or 'stated', not 'guess'"),
         ({"lens": "radial", "fixed": {"k3": 0.0}}, "cannot fix 'k3': the radial lens has phi, aspect, cx, cy, a2, a3"),
         ({"lens": "brown", "fixed": {"a2": 0.0}}, "cannot fix 'a2': the brown lens has .*k1, k2, p1, p2, k3"),

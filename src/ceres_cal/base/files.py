@@ -93,6 +93,8 @@ def opened(path: str | Path) -> Iterator[IO[bytes]]:
             yield stream
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except TypeError:
+        raise InputError(f"path must be a path, not {type(path).__name__}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 

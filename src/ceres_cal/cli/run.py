@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.images import IMAGE_ENDINGS, images_and_videos
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import (
     estimate_option,
@@ -19,9 +20,8 @@ from ceres_cal.cli.arguments import (
     prior_option,
 )
 from ceres_cal.cli.command import COMMANDS, command
-from ceres_cal.cli.files import IMAGE_ENDINGS, attempted, images_and_videos
+from ceres_cal.cli.files import attempted
 from ceres_cal.cli.options import QuietArguments, argument, option
-from ceres_cal.cli.photographs import frames_of_videos
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -124,10 +124,11 @@ def _typed(name: str, arguments: Sequence[str]) -> str:
 
 def _photographs(args: RunArguments) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
+    from ceres_cal.detect.video import frames_of_videos
+
     images, videos = images_and_videos(args.images)
     with progress_bar(args) as bar:
-        images += frames_of_videos(videos, args.frames, args.output, bar)
-    return images
+        return [*images, *frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 
 def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:

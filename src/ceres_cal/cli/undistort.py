@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.images import image_files
 from ceres_cal.base.words import frame_of
 from ceres_cal.cli.arguments import (
     calibration_argument,
@@ -20,7 +21,7 @@ from ceres_cal.cli.arguments import (
     station_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.files import finishing, image_files, read_calibration
+from ceres_cal.cli.files import finishing, read_calibration
 from ceres_cal.cli.options import QuietArguments, argument, given_of, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
