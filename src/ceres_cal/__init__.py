@@ -3,7 +3,8 @@
 The names are loaded when they are first used, so that `import ceres_cal` costs nothing.
 """
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.lazy import names_of
 
@@ -88,7 +89,7 @@ _HOME = {
     "write_report": "report",
 }
 __all__ = list(_HOME)
-__getattr__ = names_of(__name__, _HOME)
+__getattr__: Callable[[str], Any] = names_of(__name__, _HOME)
 
 
 def __dir__() -> list[str]:

@@ -135,6 +135,9 @@ def detect_field(
         posed = Auto(tuple(Facing(*one) for one in sides.items()), before)
     if target is None:
         raise InputError("target is missing: name the field, such as ssl_field('B')")
+    for feature in sides:
+        if feature not in target.point_index and feature not in target.curves:
+            raise InputError(f"facing: {no_such('line or point', feature, (*target.curves, *target.point_index))}")
     for name in not_painted:
         if name not in target.curves:
             raise InputError(f"not_painted: {no_such('line', name, target.curves)}")

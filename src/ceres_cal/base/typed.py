@@ -108,8 +108,8 @@ def _meant(given: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 
 
 @cache
-def _kinds(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
-    """What an argument may be; nothing where that cannot be checked by its type."""
+def _every(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
+    """The alternatives of an argument's annotation."""
     kind = function.__annotations__.get(name, Any)
     if isinstance(kind, str):
         try:
@@ -117,10 +117,17 @@ def _kinds(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
         except NameError:  # quiet: imported for type checkers alone: the function itself reads the value
             return ()
     every = get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
-    every = tuple(Mapping if get_origin(one) is Mapping else one for one in every)
-    return (
-        every if all((isinstance(one, type) and one is not Any) or get_origin(one) is Literal for one in every) else ()
-    )
+    return tuple(Mapping if get_origin(one) is Mapping else one for one in every)
+
+
+def _is_plain(kind: Any) -> bool:
+    return (isinstance(kind, type) and kind is not Any) or get_origin(kind) is Literal
+
+
+def _kinds(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
+    """What an argument may be; nothing where that cannot be checked by its type."""
+    every = _every(function, name)
+    return every if all(map(_is_plain, every)) else ()
 
 
 def _fits(value: Any, kinds: tuple[Any, ...]) -> bool:
@@ -139,7 +146,8 @@ def _wrong(name: str, value: Any, kinds: tuple[Any, ...], function: Callable[...
     shown = f"{type(value).__name__} {value!r:.{_MOST_LETTERS}}" if isinstance(value, str | int | float) else ""
     said = f"{name} must be {words}, not {shown or _named(type(value))}"
     for other, its in given.items():
-        if other != name and _fits(value, _kinds(function, other)) and _fits(its, kinds):
+        fitting = tuple(filter(_is_plain, _every(function, other)))
+        if other != name and _fits(value, fitting) and _fits(its, kinds):
             return f"{said}: exchange {name} and {other}"
     loading = [one for one in expected if hasattr(one, "load")]
     if loading and isinstance(value, str | os.PathLike):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.images import image_files
+from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import ReportArguments
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Section
@@ -48,7 +49,7 @@ def read_target(text: str, name: str) -> Target:
     if text in by_name:
         return by_name[text]
     if not Path(text).exists():
-        raise InputError(f"--target {text!r}: neither {' nor '.join(by_name)}, nor a file")
+        raise InputError(f"--target: {no_such('target', text, by_name)} (or a file)")
     content = json_object(Path(text))
     named = content.get("targets")
     spec = named.get(name) if isinstance(named, dict) else content

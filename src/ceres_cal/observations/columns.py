@@ -90,7 +90,13 @@ class Prior:
         return cls("target", target, f"{curve}{_OFFSET}", (0.0,), (sigma_m,))
 
 
-TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
+TYPES: dict[str, type[np.generic]] = {
+    "view": np.int32,
+    "feature": np.int32,
+    "pixels": np.float64,
+    "sigma_px": np.float64,
+    "side": np.int8,
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,14 +43,11 @@ class Uncertainty:
 
     @property
     def _shown(self) -> Shown:
-        numbers = [
-            (
-                f"{one.key.quantity} of {one.key.owner}",
-                f"{at_precision(one.value, one.sd)} ± {two_digits(one.sd)} {one.key.unit}".rstrip("1 "),
-                one.verdict,
-            )
-            for one in self.verdicts
-        ]
+        numbers = []
+        for one in self.verdicts:
+            unit = "" if one.key.unit == "1" else f" {one.key.unit}"
+            value = f"{at_precision(one.value, one.sd)} ± {two_digits(one.sd)}{unit}"
+            numbers.append((f"{one.key.quantity} of {one.key.owner}", value, one.verdict))
         return f"Uncertainty of {len(numbers)} numbers (value ± standard deviation)", numbers
 
     def __repr__(self) -> str:
