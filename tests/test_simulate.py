@@ -433,12 +433,12 @@ def change(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("broken", "said"),
     [
-        (change("format", to="ceres-cal/observations"), '"format" must be "ceres-cal/scene"'),
+        (change("format", to="ceres-cal/observations"), "it holds observations, where a scene must be given"),
         (change("version", to=2), "version 2 is not known"),
         (change("extra", to=1), "extra"),
         (change("targets", "field", to={"kind": "pitch"}), "target 'field': unknown kind 'pitch'"),
         (change("cameras", "c", "phi", to=-1.0), "camera 'c': intrinsics must be finite"),
-        (change("cameras", "c", "phi", to="long"), "camera 'c': Expected `float`"),
+        (change("cameras", "c", "phi", to="long"), "camera 'c': Expected a number"),
         (
             change("cameras", "c", "lens", "coefficients", to={"k1": 0.1}),
             "camera 'c': lens 'radial' has no coefficient",
@@ -465,7 +465,7 @@ def change(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
         (change("disturbance", to={"outliers": 1.5}), "disturbance: outliers is a share"),
         (change("disturbance", to={"outliers": 0.6, "wrong_labels": 0.6}), "at most 1 in all"),
         (change("disturbance", to={"points_sigma_px": -0.5}), "disturbance: points_sigma_px must be"),
-        (change("disturbance", to={"hidden_stretches": 0.5}), "disturbance: Expected `int`"),
+        (change("disturbance", to={"hidden_stretches": 0.5}), "disturbance: Expected a whole number"),
     ],
 )
 def test_bad_scenes_get_one_line(broken: Callable[[dict[str, Any]], None], said: str, tmp_path: Path) -> None:

@@ -46,9 +46,12 @@ _HOLDING = {
     "ceres-cal/truth": "the truth of a simulation",
     "ceres-cal/scene": "a scene",
 }
-_KINDS = {"`array`": "a list", "`object`": "names with values", "`float`": "a number", "`int`": "a whole number",
-          "`str`": "a text", "`bool`": "true or false", "`null`": "nothing"}  # fmt: skip
-_MEANING = {
+_KINDS = {
+    **{"array": "a list", "object": "names with values", "float": "a number", "int": "a whole number"},
+    **{"str": "a text", "bool": "true or false", "null": "nothing"},
+}
+"""What msgspec's words for types mean."""
+_MEANING = {  # of fields that may be missing
     "format": "what the file holds, such as ceres-cal/observations",
     "version": "of the file's format, 1",
     "targets": "what was observed, by name",
@@ -216,7 +219,7 @@ def _require_finite(value: Any, place: str, where: str) -> None:
 def check_header(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
     """The same data once its "format" and "version" are known to be ours; InputError naming `where` otherwise."""
     stated = data.get("format") if isinstance(data, dict) else None
-    if stated in _HOLDING and stated != format_name:
+    if isinstance(stated, str) and stated in _HOLDING and stated != format_name:
         raise InputError(
             f"{where}: it holds {_HOLDING[stated]}, where {_HOLDING.get(format_name, format_name)} must be given: "
             "were two arguments exchanged?"
@@ -251,10 +254,10 @@ def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
         meaning = _MEANING.get(found[1])
         text = f"{found[1]!r} is missing{f' ({meaning})' if meaning else ''}"
         return f"{text} in {place}" if place else text
-    if found := re.fullmatch(r"Object contains unknown field `(.+)`", said):
-        return f"{place or 'the file'} has no field {found[1]!r}: remove it, or correct its name"
-    for theirs, ours in _KINDS.items():
-        said = said.replace(theirs, ours)
+    if found := re.fullmatch(r"Object contains unknown field `(.+)`", " ".join(said.split())):
+        return f"there is no field {found[1]!r}{f' in {place}' if place else ''}: remove it, or correct its name"
+    for theirs in set(re.findall(r"`([^`]+)`", said)):
+        said = said.replace(f"`{theirs}`", " or ".join(_KINDS.get(one, one) for one in theirs.split(" | ")))
     return f"{said}, in {place}" if place else said
 
 
@@ -267,10 +270,8 @@ def _path(path: str, message: str, data: Any, kind: type[Any]) -> list[str | int
             names.append(next((key for key in here if not _is_well(data, names, key, kind, message)), "..."))
         elif not part[2]:
             names.append(int(part[1]) if part[1] else part[0])
-        try:
-            here = here[names[-1]]
-        except (KeyError, IndexError, TypeError):  # quiet: as far as the path is in the data
-            here = None
+        is_there = names[-1] in here if isinstance(here, dict) else isinstance(here, list)
+        here = here[names[-1]] if is_there else None
     return names
 
 
@@ -286,7 +287,7 @@ def _is_well(data: Any, names: list[str | int], key: str, kind: type[Any], messa
 
     try:
         msgspec.convert(alone(data, names), kind)
-    except msgspec.ValidationError as error:
+    except msgspec.ValidationError as error:  # quiet: this entry is not the one that the message is about
         return str(error) != message
     return True
 

@@ -182,7 +182,9 @@ class Document(NamedTuple):
     def one_line(self) -> str:
         """The answer in one line, as with --quiet: the verdict, or what is said first."""
         first = sorted(self.sections, key=lambda one: one.title not in _RESULTS)
-        return next((" ".join(str(line).split()) for one in first for line in one.lines if str(line).strip()), "")
+        lines = [" ".join(str(line).split()) for one in first for line in one.lines if str(line).strip()]
+        within = (line.removeprefix("verdict ") for line in lines if line.startswith("verdict "))  # of a step of `run`
+        return next(within, lines[0] if lines else "")
 
     @property
     def data(self) -> dict[str, Any]:
