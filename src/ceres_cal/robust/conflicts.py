@@ -35,7 +35,6 @@ from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
 from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
-from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.stated import (
     LEVEL,
