@@ -15,10 +15,12 @@ import numpy as np
 from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.numerical import numerical
+from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.effects.smoothness import with_smoothness
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
+from ceres_cal.problem.equations import Equations
 from ceres_cal.problem.noise import Inliers, Redundancy, by_count, by_leverage, judge, median_scales, visible_from
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
@@ -129,6 +131,11 @@ class RobustSolution:
     def judged_like(self, before: RobustSolution, no_change: float) -> bool:
         """Whether nothing worth another solve changed since another round."""
         return self.inliers.same_as(before.inliers, no_change)
+
+    def weights_of(self, observations: Observations, equations: Equations) -> Weights:
+        """How the equations counted."""
+        taking_part = self.inliers.points, self.inliers.curves
+        return equation_weights(observations, self.problem.weighting, equations, self.residuals, taking_part)
 
     def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
         """The same with another estimate. `problem`: of all the observations."""
