@@ -43,7 +43,8 @@ from ceres_cal.robust.groups import (
     mostly_rejected,
     rows_compared,
 )
-from ceres_cal.robust.robust import RobustSolution, require_fits
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust.usable import require_fits
 
 # Log odds between which both explanations are named: 19 to 1.
 DOUBTFUL = 3.0
