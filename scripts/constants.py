@@ -82,7 +82,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("problem.ranges", "PHI_RANGE _BUILT _REDRAWN", "calibrate"),
     *_of("observations.bounds", "_SIGMA_RATIO _FAR", "calibrate"),
     *_of("robust.usable", "_OFF_CENTRE", "calibrate"),
-    *_of("robust.robust", "_NO_FIT", "calibrate"),
+    *_of("robust.usable", "_NO_FIT", "calibrate"),
     *_of("calibration.lens_forms", "AS_GOOD ALIKE CLEARLY", "lens"),
     *_of("calibration.lens_comparison", "_QUIETER _SOUND_PX", "lens"),
     *_of("calibration.lens_kinds", "_REFUTED _UNSEEN_GROUPS", "lens"),

@@ -45,8 +45,8 @@ from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
-from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
-from ceres_cal.robust.usable import require_possible, require_usable
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.usable import require_fits, require_possible, require_usable
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
 
@@ -334,7 +334,8 @@ def solved_from(
     calibration = came_out(start.phi_from, observations, problem, end, explanations)
     if settled is not None:
         calibration = of_all(calibration, settled)
-    warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
+    wholes = [one.rows for one in explanations if one.is_taken]
+    warnings = (*calibration.warnings, *require_usable(end, problem, wholes), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
     options = replace(problem.options, tolerances=tolerances)

@@ -20,7 +20,7 @@ from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResul
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.effects.columns import EffectSums
+from ceres_cal.effects.columns import EffectSums, least_absolute
 from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import select
@@ -258,15 +258,10 @@ def _mislabelled(case: DiagnosisCase) -> Mask:
 
 def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
     """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
-    columns = columns[:, np.any(columns != 0.0, axis=0)]
-    amount: Array = np.zeros(columns.shape[1])
-    for _ in range(30):
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
-        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
+    amount = least_absolute(columns, residual)
     _, of = np.unique(observation, return_inverse=True)
     lengths = np.sqrt(np.bincount(of, (residual + columns @ amount) ** 2))
-    agree = (lengths <= reject_sigma)[of]
-    return agree if np.all(np.abs(amount) < _FAR_M) else np.zeros(len(agree), dtype=bool)
+    return np.asarray((lengths <= reject_sigma)[of] & np.all(np.abs(amount) < _FAR_M))
 
 
 # ---- new observations ------------------------------------------------------------------------------------------------

@@ -51,6 +51,17 @@ def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
     return numbers, group
 
 
+def least_absolute(columns: Array, residual: Array) -> Array:
+    """(Q,) amounts of columns (N, Q) that leave the least absolute deviations of residuals (N,), all in standard
+    deviations: by least squares again and again, each residual weighed by what was left of it.
+    """
+    amount = np.zeros(columns.shape[1])
+    for _ in range(30):
+        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
+        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
+    return amount
+
+
 @dataclass(frozen=True, eq=False)
 class EffectSums:
     """What the equations say of each of an effect's G groups: X its columns beyond the free numbers of a model, and r

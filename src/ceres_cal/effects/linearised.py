@@ -209,11 +209,6 @@ class Linearised:
         rest, taken = self._projected(column[:, None])
         return np.asarray(rest[:, 0] - self.shared @ taken[:, 0])
 
-    def unabsorbed(self, shift: Array) -> Array:
-        """(E,) px of a displacement (E,) px that the free numbers could not have taken up."""
-        rest, taken = self._projected((shift * self.weight)[:, None])
-        return np.asarray((rest - self.shared @ taken)[:, 0] / self.weight)
-
     def _projected(self, columns: Array) -> tuple[Array, Array]:
         """Columns (E, Q), in standard deviations, beyond private placements, and what `shared` takes of them (P, Q)."""
         rest = self.beyond_private(columns)

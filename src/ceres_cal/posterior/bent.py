@@ -226,17 +226,10 @@ class Ends:
         return information.widened(over(self.excesses, self.keys, information.keys))
 
     def beside(self, stated: Information) -> Ends:
-        """With ends no farther than what was stated lets them be.
-
-        With L what the observations say, P what was stated, C = (L + P)^-1 and E the excesses, the covariance of L + P
-        with L widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
-        """
+        """With ends no farther than what was stated lets them be."""
         if not np.any(stated.matrix):
             return self
-        moved = self.excesses @ self.information.less(stated).matrix @ self.information.inverse
-        left = moved @ stated.matrix @ self.excesses.T
-        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
-        excesses = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved
+        excesses = self.information.beside(stated, self.excesses)
         return replace(self, ends=self.steps + self.half_width * np.sqrt(2.0) * excesses)
 
     def mixture(self, information: Information) -> Mixture:

@@ -113,17 +113,11 @@ class Posterior:
         return replace(self, information=information, placements=placements, mixtures=mixtures)
 
     def _beside_stated(self, shifts: Array) -> Array:
-        """(S, P) shifts as far as what was stated lets them be.
-
-        With L what the observations say, P what was stated and C = (L + P)^-1, the covariance of L + P with L widened
-        by d is C + g g^T, where g = C L d / (1 + d^T L C P d)^1/2: never more than P^-1.
-        """
+        """(S, P) shifts as far as what was stated lets each of them be: never more than its standard deviation."""
         if not np.any(self.stated.matrix):
             return shifts
         stated = self.stated.over(self.keys)
-        moved = shifts @ self.information.less(stated).matrix @ self.information.inverse
-        left = np.einsum("sp,pq,sq->s", moved, stated.matrix, shifts)
-        moved = moved / np.sqrt(1.0 + np.maximum(left, 0.0))[:, None]
+        moved = np.concatenate([self.information.beside(stated, shift[None]) for shift in shifts])
         with np.errstate(invalid="ignore"):  # of what is stated nearly alone, all of it is rounding
             room = np.sqrt(np.maximum(np.nan_to_num(self.stated_sd**2 - self.spread.sd**2, nan=np.inf), 0.0))
         return np.asarray(np.clip(moved, -room, room))

@@ -174,6 +174,17 @@ class Information:
         left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
         return Information(self.keys, left.T @ left)
 
+    def beside(self, stated: Information, shifts: Array) -> Array:
+        """(S, K) shifts that widen all of it as shifts (S, K) widen what is known beyond what was stated.
+
+        With L what is known beyond, P what was stated, C = (L + P)^-1 and E the shifts, the covariance of L + P with L
+        widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
+        """
+        moved = shifts @ self.less(stated).matrix @ self.inverse
+        left = moved @ stated.matrix @ shifts.T
+        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
+        return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved)
+
     def less(self, other: Information) -> Information:
         """What is left without a part of it; nothing of numbers of which that part says all but rounding."""
         left = self.matrix - other.over(self.keys).matrix

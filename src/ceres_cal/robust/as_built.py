@@ -25,7 +25,7 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, LIKELY, RepeatedAmounts, agreement
-from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
+from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.equations import Equations, equations_of, whole_structure
@@ -259,7 +259,7 @@ def _equations(
     stated_alone = stated.carrying(estimate.structure)
     before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
     solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
-    weights = _weights(observations, end, equations)
+    weights = end.weights_of(observations, equations)
     return replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1)), weights
 
 
@@ -268,12 +268,6 @@ def _columns(structure: Structure, equations: Equations, weights: Weights) -> Sp
     slots, scale = equations.slots(structure), weights.inverse_sigma * weights.used
     values = np.where(slots >= 0, equations.built * scale[:, None], 0.0)
     return SparseColumns(np.where(slots >= 0, slots, len(structure.names)), values, len(structure.names))
-
-
-def _weights(observations: Observations, end: RobustSolution, equations: Equations) -> Weights:
-    """How the equations counted at the end."""
-    taking_part = end.inliers.points, end.inliers.curves
-    return equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
 
 
 def _drawn(equations: Equations, weights: Weights, stated: Structure, end: RobustSolution) -> Linearised:

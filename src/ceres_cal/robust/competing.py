@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, medians_known
+from ceres_cal.base.arrays import Indices, Mask, medians_known
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.words import two_digits
+from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.evidence import Offsets, measure_offsets
-from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
+from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.equations import write_equations
@@ -42,7 +43,8 @@ from ceres_cal.robust.groups import (
     mostly_rejected,
     rows_compared,
 )
-from ceres_cal.robust.robust import RobustSolution, require_fits
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust.usable import require_fits
 
 # Log odds between which both explanations are named: 19 to 1.
 DOUBTFUL = 3.0
@@ -319,9 +321,7 @@ class _Competition:
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
         equations = write_equations(observations, sights, end.solution.estimate, end.residuals)
-        inliers, weighting = end.inliers, end.inliers.weighting(problem.options)
-        taking_part = inliers.points, inliers.curves
-        weights = equation_weights(observations, weighting, equations, end.residuals, taking_part)
+        weights = end.weights_of(observations, equations)
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(problem, end.solution.estimate, equations, weights)
@@ -330,7 +330,9 @@ class _Competition:
         agreeing = model.used.copy()
         for number in back:
             own = np.flatnonzero(effect.group == np.searchsorted(chosen, number))
-            agree = _agreeing(model, effect.columns, own, problem.options.reject_sigma)
+            left = (equations.residual * model.weight)[own]
+            left = left + effect.columns[own] @ least_absolute(effect.columns[own], left)
+            agree = np.abs(left) <= problem.options.reject_sigma
             if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
                 return chosen, None
             agreeing[own] = agree
@@ -361,14 +363,3 @@ def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | No
     each = offsets.log_evidence_with_each(at)
     best = int(np.argmax(each))
     return int(chosen[best]) if each[best] > offsets.log_evidence(at) else None
-
-
-def _agreeing(model: Linearised, columns: Array, rows: Indices, reject_sigma: float) -> Mask:
-    """(N,) which of the rows one offset brings within the bound, by least absolute deviations."""
-    own = columns[rows][:, np.any(columns[rows] != 0.0, axis=0)]
-    residual = (model.equations.residual * model.weight)[rows]
-    left = residual
-    for _ in range(20):
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(left), 1.0))
-        left = residual - own @ np.linalg.lstsq(own * sizes[:, None], residual * sizes, rcond=1e-9)[0]
-    return np.asarray(np.abs(left) <= reject_sigma)

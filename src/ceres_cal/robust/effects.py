@@ -19,7 +19,7 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
-from ceres_cal.effects.linearised import equation_weights, make_linear_model
+from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
@@ -108,9 +108,7 @@ class _Amounts:
         equations = write_equations(observations, problem.sights, estimate, end.residuals)
         along = np.sum(off[equations.observation] * equations.direction, axis=1)
         equations = replace(equations, residual=equations.residual - along)
-        taking_part = end.inliers.points, end.inliers.curves
-        weights = equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
-        model = make_linear_model(problem, estimate, equations, weights)
+        model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))
         case = Case(observations, problem, estimate, model)
         groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
         for effect in estimated():

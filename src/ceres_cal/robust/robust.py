@@ -13,12 +13,14 @@ from typing import Generic, Protocol, Self, TypeVar
 import numpy as np
 
 from ceres_cal.base.arrays import Indices
-from ceres_cal.base.errors import DegenerateError, SolutionError
+from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.numerical import numerical
+from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.effects.smoothness import with_smoothness
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
+from ceres_cal.problem.equations import Equations
 from ceres_cal.problem.noise import Inliers, Redundancy, by_count, by_leverage, judge, median_scales, visible_from
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
@@ -104,9 +106,6 @@ _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
 # is painted aside is told from noise only at a scale near the noise's own.
 _MUCH_LESS = 0.3
-# Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
-# that is too simple stays below a few pixels. Nothing changes from half to double.
-_NO_FIT = 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +128,11 @@ class RobustSolution:
     def judged_like(self, before: RobustSolution, no_change: float) -> bool:
         """Whether nothing worth another solve changed since another round."""
         return self.inliers.same_as(before.inliers, no_change)
+
+    def weights_of(self, observations: Observations, equations: Equations) -> Weights:
+        """How the equations counted."""
+        taking_part = self.inliers.points, self.inliers.curves
+        return equation_weights(observations, self.problem.weighting, equations, self.residuals, taking_part)
 
     def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
         """The same with another estimate. `problem`: of all the observations."""
@@ -363,20 +367,3 @@ def _evenly(problem: Problem) -> Indices:
         chosen += boards[:: max(1, min(len(boards) // enough, share_of_placements))]
         chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
     return np.array(sorted(chosen), dtype=np.int64)
-
-
-def require_fits(end: RobustSolution, problem: Problem) -> None:
-    """Raise SolutionError where the solve failed, or its end explains too little."""
-    if end.solution.failed:
-        raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
-    points, curves = end.residuals.lengths
-    for name, camera in end.solution.estimate.cameras.items():
-        own = problem.sights.of_camera(name)
-        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
-        met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
-        met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
-        if 2 * met < len(own.point_rows) + len(own.curve_rows):
-            raise SolutionError(
-                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
-                "check labels, target dimensions and which lens it is"
-            )
