@@ -112,7 +112,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(start, observations, sights, options, Watched()).redrawn()
+        return _of_lens(start, observations, sights, options, Watched(bends=False)).redrawn()
 
 
 def _measured(
@@ -258,10 +258,12 @@ class Watched:
 
     Attributes:
         progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
+        bends: whether it matters how the uncertainty bends.
     """
 
     progress: Callable[[Progress], None] | None = None
     settle: Callable[..., Settled] | None = None
+    bends: bool = True
 
 
 def solved_from(
@@ -317,7 +319,7 @@ def solved_from(
     effects = beside.estimates if beside else ()
     warnings = (*warnings, *(one.warning for one in effects))
     if assessed:
-        end, posterior = _assess(end, observations, problem, again)
+        end, posterior = _assess(end, observations, problem, again, watched.bends)
         if again is None:
             require_lens_told(end.solution.estimate, posterior)
         posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
@@ -354,7 +356,7 @@ def _as_long_as_asked(
 
 
 def _assess(
-    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None
+    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None, bends: bool
 ) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
@@ -370,7 +372,8 @@ def _assess(
         found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
         return measure_scatter(observations, known, found, there, says)
 
-    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
+    freedom = end.inliers.degrees_of_freedom
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, bends=bends)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 
