@@ -288,7 +288,7 @@ def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
         camera = estimate.cameras[name]
         place = (equations.pixel - camera.principal_point) / unit_px(camera)
         x, y = place.T
-        smooth = [x**i * y**j for i in range(degree + 1) for j in range(max(2 - i, 0), degree + 1 - i)]
+        smooth = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
         along = np.sum(place * equations.direction, axis=1)
         radial = [np.sum(place**2, axis=1) ** power * along for power in powers]
         every = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
