@@ -280,7 +280,7 @@ def _drawn(equations: Equations, weights: Weights, stated: Structure, end: Robus
 
 def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
     """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
-    radius. Linear ones no camera of square pixels can follow: beside them a board of 90 mm was sheared by 2 mm.
+    radius.
     """
     degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
