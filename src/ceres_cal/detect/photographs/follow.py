@@ -74,7 +74,7 @@ def follow(
             again = tracker.refined(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
-    return best if best.holds else tracker.stretched(best)
+    return best if best.is_field else tracker.stretched(best)
 
 
 def approach(
@@ -113,13 +113,15 @@ def refine(
     free: FreeIntrinsics,
     lacking: Sequence[tuple[str, ...]] = (),
 ) -> Followed:
-    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside.
+    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside; where that
+    looks like another field, the one that is drawn in a picture that was stretched.
 
     Args:
         lacking: parts that this field is known to lack.
     """
     tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
-    return tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
+    refined = tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
+    return refined if refined.is_field else tracker.stretched(refined)
 
 
 @dataclass(frozen=True, eq=False)
