@@ -122,7 +122,7 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
 
 
 def _sharpness(frame: Image) -> float:
-    """The variance of the Laplacian, in a picture of half a megapixel at most: what is blurred by less does not matter."""
+    """The variance of the Laplacian, in a picture of half a megapixel at most: blur by less does not matter."""
     judged_px = 5e5
     scale = min(1.0, float(np.sqrt(judged_px / (frame.shape[0] * frame.shape[1]))))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
