@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import brief, drawn
 from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.reading import Functional, Reading, read
@@ -41,6 +43,12 @@ class ImageMap:
     x_px: Array
     y_px: Array
     radius_95_px: Array
+
+    __repr__ = brief
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+        return drawn("plot_map", self, ax)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import brief, drawn
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.reading import Functional, read
 from ceres_cal.problem.information import STATION_QUANTITIES, Key
@@ -36,6 +38,8 @@ class PointSpread:
     high: Array
     radius_95_m: Array
     sd_m: Array
+
+    __repr__ = brief
 
 
 def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tuple[Key, ...]:
@@ -147,6 +151,12 @@ class FieldMap(ErrorMap):
     station: str
     sd_mm: Array
     radius_95_mm: Array
+
+    __repr__ = brief
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+        return drawn("plot_map", self, ax)
 
     @property
     def errors_mm(self) -> Array:

@@ -54,7 +54,10 @@ def chart_of(camera: Camera, free: Indices) -> Chart | None:
     return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
 
 
-class ChartedCost(pyceres.CostFunction):
+_CostFunction: Any = pyceres.CostFunction  # which has no types
+
+
+class ChartedCost(_CostFunction):
     """A cost function over what Ceres moves, of one over the numbers themselves."""
 
     def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyceres
@@ -48,7 +48,10 @@ class CostValue(NamedTuple):
     jacobians: Sequence[Array]
 
 
-class CachedCost(pyceres.CostFunction):
+_CostFunction: Any = pyceres.CostFunction  # which has no types
+
+
+class CachedCost(_CostFunction):
     """A cost function; what it costs is `_evaluated`."""
 
     def __init__(self, run: Run) -> None:
@@ -116,7 +119,7 @@ class SightCost(CachedCost):
             self._poses[1] = estimate.placements[key.placement].log()
         sizes = (len(free), 6, 6, count)
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
-        self.slots = [slot for slot in range(4) if is_free[slot]]
+        self.slots: list[int] = [slot for slot in range(4) if is_free[slot]]
         self.set_num_residuals(len(free) + offsets + 7)
         self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
 
@@ -181,7 +184,8 @@ class EliminatedCost(CachedCost):
 
     def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
-        self.camera, weighting = sights.keys[0].camera, problem.weighting
+        self.camera: str = sights.keys[0].camera
+        weighting = problem.weighting
         self._sights, self._structure = sights, estimate.structure
         free, count = problem.layout.free[self.camera], len(self._structure.values)
         feet = starting_feet(sights, estimate, problem.feet)
@@ -200,7 +204,7 @@ class EliminatedCost(CachedCost):
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._last = self._accepted
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
-        self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
+        self.slots: list[int] = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, Wrong, amounts
 
 _CELL_M = 1.0  # side of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
 # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted. Nothing
@@ -19,7 +20,7 @@ _FEWEST_AT_PLACE = 8
 class _Floor(Effect):
     """What moves the places of targets that are part of the world up or down."""
 
-    wrong = "model"
+    wrong: ClassVar[Wrong] = "model"
     absorbed = True
 
 

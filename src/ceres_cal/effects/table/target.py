@@ -89,7 +89,7 @@ class CurveAside(_StructureTest):
     kind = "curve aside"
     built = "lines"
     curves = True
-    places: ClassVar = slice(0, 3)
+    places: ClassVar[slice] = slice(0, 3)
 
     def words(self, evidence: Evidence) -> Words:
         name = evidence.score.subject
@@ -116,7 +116,7 @@ class PointAside(_StructureTest):
 
     kind = "point aside"
     built = "points"
-    places: ClassVar = slice(0, 2)
+    places: ClassVar[slice] = slice(0, 2)
 
     def words(self, evidence: Evidence) -> Words:
         name = evidence.score.subject
@@ -134,7 +134,7 @@ class BoardBent(_StructureTest):
 
     kind = "board bent"
     built = "warp"
-    places: ClassVar = slice(2, 2 + len(WARP))
+    places: ClassVar[slice] = slice(2, 2 + len(WARP))
 
     def words(self, evidence: Evidence) -> Words:
         name = evidence.score.subject
