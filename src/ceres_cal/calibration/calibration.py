@@ -17,15 +17,20 @@ from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_
 from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
+    COPY,
     FORMAT,
     VERSION,
     CalibrationFile,
+    Fit,
+    LensChoice,
+    Refitted,
     RefittedFile,
+    Rejected,
     StationFile,
     options_from_json,
     options_to_json,
+    package_versions,
 )
-from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
@@ -262,12 +267,17 @@ class Calibration:
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
         estimate = data.estimate(targets, options)
-        known = every_key(estimate)
+        known, told = every_key(estimate), data.posterior
+        posterior = None if told is None else told.posterior(known)
+        if told is not None and posterior is not None and (told.profiles or told.bends):
+            from ceres_cal.posterior.files_before import as_mixtures
+
+            posterior = as_mixtures(told, posterior)
         return cls(
             estimate,
             targets,
             options=options,
-            posterior=None if data.posterior is None else data.posterior.posterior(known),
+            posterior=posterior,
             refitted=None if data.refitted is None else data.refitted.refitted(known),
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},

@@ -29,14 +29,12 @@ from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.costs import robust_weights
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import difference, moved, natural_sizes, values_of
-from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
+from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.stated import (
     LEVEL,
@@ -55,9 +53,6 @@ LARGEST_FREEDOM = 1e6
 """Degrees of freedom that count as infinitely many."""
 _LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
 _STATED = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
-# Of a standard deviation, and at most of a number's natural size, to either side, for the slope of the cost along what
-# is held.
-_STEP, _MOST_STEP = 0.1, 1e-3
 
 
 class Rest(NamedTuple):
@@ -69,7 +64,7 @@ class Rest(NamedTuple):
     freedom: float
 
 
-def linear_rest(statement: Statement, end: RobustSolution, observations: Observations) -> Rest:
+def linear_rest(statement: Statement, end: RobustSolution) -> Rest:
     """By the linear picture where the problem with the statement was solved."""
     estimate, freedom = end.solution.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
@@ -84,7 +79,7 @@ def linear_rest(statement: Statement, end: RobustSolution, observations: Observa
     else:
         freed = statement.left_out(end.problem, estimate)
         rest = information(freed, estimate).shared.marginal(statement.keys)
-        slope = -_slopes(end.problem, observations, estimate, rest)
+        slope = -_slopes(freed, estimate, statement.keys)
         step = rest.inverse @ slope
     # It swells the noise that the rest is measured by, as far as the linear picture goes.
     noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
@@ -110,32 +105,15 @@ def _roots(stated: Array, least: float) -> tuple[Array, Array]:
     return size * vectors * root, vectors / root / size
 
 
-def _slopes(problem: Problem, observations: Observations, estimate: Estimate, rest: Information) -> Array:
-    """Derivative of the cost by what is held, everything else where it is."""
-    weighting = problem.weighting
-    sigmas = (
-        weighting.point_scale * observations.points.sigma_px[:, None],
-        weighting.curve_scale * observations.curves.sigma_px,
-    )
-
-    def standardised(there: Estimate) -> tuple[Array, Array]:
-        seen = residuals(observations, problem.sights, there, problem.feet)
-        return np.nan_to_num(seen.points / sigmas[0]), np.nan_to_num(seen.curves / sigmas[1])
-
-    points, curves = standardised(estimate)
-    weights = robust_weights(weighting, np.concatenate([np.sum(points**2, axis=1), curves**2]))
-    points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
-    slopes, sizes = [], natural_sizes(estimate, rest.keys)
-    for number, stated in enumerate(np.diagonal(rest.matrix)):
-        if not stated > 0.0:  # the rest says nothing of it
-            slopes.append(0.0)
-            continue
-        step = np.zeros(len(rest.keys))
-        step[number] = min(_STEP / np.sqrt(stated), _MOST_STEP * sizes[number])
-        above, below = (standardised(moved(estimate, rest.keys, sign * step)) for sign in (1.0, -1.0))
-        change = np.sum(points * (above[0] - below[0])) + curves @ (above[1] - below[1])
-        slopes.append(float(change) / (2.0 * step[number]))
-    return np.array(slopes)
+def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """Derivative of the cost by what was held of a camera, everything else where it is."""
+    name = keys[0].owner
+    own = freed.sights.of_camera(name)
+    if not len(own):
+        return np.zeros(len(keys))
+    gradient = normals_with_residuals(own, freed, estimate)[:, -1, :-1].sum(axis=0)
+    every = [intrinsic_keys(name, estimate.cameras[name].lens)[number] for number in freed.layout.free[name]]
+    return np.asarray(gradient[[every.index(key) for key in keys]])
 
 
 def rest_at(statement: Statement, end: RobustSolution, observations: Observations | None = None) -> Rest:
@@ -202,7 +180,6 @@ def log_probability(squared: float, rest: Rest) -> float:
 # Probability of a linear picture from which on it is worth another solve: 2.2 sigma, where one in twenty is wrong.
 _SUSPICIOUS = 0.028
 _DOUBTFUL = 0.05  # probability that a statement is wrong, from which on both explanations are named
-_MOST = 4  # solves
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
@@ -253,12 +230,13 @@ def find_conflicts(
         part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
             without an outlier; None where the answer stays.
     """
+    most = 4  # solves
     every = tuple(statements(problem, observations, end.solution.estimate))
     if not every:
         return Conflicts()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     search = _ForwardSelection(problem, end, observations, usual, every)
-    while search.solves < _MOST and search.leave_out_the_worst():
+    while search.solves < most and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
     named = (*(one for _, one in pairs), *search.conflicts())
@@ -281,7 +259,7 @@ def without_suspicious(problem: Problem, observations: Observations, end: Robust
     for one in statements(problem, observations, estimate):
         if one.kind in ("earlier", "tolerance"):
             continue
-        if worst_test(one, linear_rest(one, end, observations)).log_p < np.log(_SUSPICIOUS):
+        if worst_test(one, linear_rest(one, end)).log_p < np.log(_SUSPICIOUS):
             problem = one.left_out(problem, estimate)
     return problem
 
@@ -355,7 +333,7 @@ class _ForwardSelection:
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
-        tests = [worst_test(one, linear_rest(one, self.end, self.observations)) for one in self.left]
+        tests = [worst_test(one, linear_rest(one, self.end)) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
         if number < 0 or tests[number].log_p > np.log(_SUSPICIOUS):
             return False

@@ -24,7 +24,6 @@ LEVEL = 1e-3
 word back, so it is as rare as a coin that falls on one side ten times."""
 _FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 1e-3: "km"}
 _STATED = {"prior": "stated", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
-_NEAR = 0.1  # relative: how near a unit must bring the two to be the likely cause
 
 
 @dataclass(frozen=True)
@@ -232,8 +231,9 @@ def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Confli
 
 def _in_another_unit(test: WaldTest) -> str:
     """The likely cause, where the two agree in another unit."""
+    near = 0.1  # relative: how near a unit must bring the two to be the likely cause
     if test.key.unit != "m" or not test.seen[0]:
         return ""
     ratio = test.stated[0] / test.seen[0]
-    units = [unit for factor, unit in _FACTORS.items() if abs(ratio / factor - 1.0) < _NEAR]
+    units = [unit for factor, unit in _FACTORS.items() if abs(ratio / factor - 1.0) < near]
     return f"is it in {units[0]}? Give metres; " if units else ""
