@@ -62,7 +62,7 @@ class Constant:
             if not inspect.isclass(getattr(owner, cls)):
                 object.__setattr__(getattr(owner, cls), field, value)
                 return
-            make = getattr(owner, cls).__init__
+            make = inspect.unwrap(getattr(owner, cls).__init__)
             names = [name for name, one in inspect.signature(make).parameters.items() if one.default is not one.empty]
             defaults = list(make.__defaults__)
             defaults[names.index(field)] = value

@@ -50,21 +50,21 @@ def squares(columns: int, rows: int) -> Paint:
 
 
 def ideal_picture(camera: Camera, square_m: float, paint: Paint) -> Array:
-    """What each pixel sees: the mean over its area, at 64 places of a lattice wherever an edge runs through it."""
+    """What each pixel sees: the mean over its area, at 64 places of a lattice wherever an edge runs through it.
+
+    Within a pixel the camera is taken to be linear, which it is to a few 1e-5 px.
+    """
     width, height = camera.image_size
     middle = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
     number = np.arange(64)
     lattice = (np.stack([number, number * 19 % 64], axis=1) + 0.5) / 64.0 - 0.5
-
-    def seen(pixels: Array) -> Array:
-        return paint(camera.locate(pixels) / square_m)
-
-    spread = np.stack(
-        [seen(middle + corner) for corner in np.array([[0, 0], [-1, -1], [1, -1], [-1, 1], [1, 1]]) * 0.55]
-    )
+    corners = 0.55 * np.array([[0, 0], [-1, -1], [1, -1], [-1, 1], [1, 1]])
+    places = np.stack([camera.locate(middle + corner) / square_m for corner in corners])
+    spread = np.stack([paint(place) for place in places])
     picture = spread[0]
-    mixed = np.ptp(spread, axis=0) > 0.0
-    picture[mixed] = seen((middle[mixed, None] + lattice).reshape(-1, 2)).reshape(-1, 64).mean(axis=1)
+    mixed = np.flatnonzero(np.ptp(spread, axis=0) > 0.0)
+    there, slopes = places[0, mixed], np.einsum("ck,cni->nki", corners / np.sum(corners[:, 0] ** 2), places[:, mixed])
+    picture[mixed] = paint((there[:, None] + lattice @ slopes).reshape(-1, 2)).reshape(-1, 64).mean(axis=1)
     return np.asarray(picture.reshape(height, width))
 
 

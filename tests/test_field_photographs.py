@@ -205,6 +205,21 @@ def test_edges_say_the_same_as_middles(tmp_path: Path, shot: script.Shot) -> Non
     assert np.mean(script.floor_error_mm(shot, by_edges)) < 0.2  # 0.05 mm
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_lines_darker_than_the_floor(tmp_path: Path, shot: script.Shot, known: bool) -> None:
+    """A negative shows the same field, of which the second photograph is looked at as the first one was."""
+    paths = [saved(shot, tmp_path), tmp_path / "dark.png", tmp_path / "again.png"]
+    for path in paths[1:]:
+        cv2.imwrite(str(path), 255 - shot.picture.image)
+    start = shot.camera if known else script.clicks(shot, 0)
+    light, dark = (detect_field(some, FIELD, start).observations.curves for some in (paths[:1], paths[1:]))
+    assert len(dark) == 2 * len(light)
+    for number in (0, 1):
+        own = dark.view == number
+        assert np.allclose(dark.pixels[own], light.pixels, rtol=0.0, atol=0.01)  # 0.002 measured
+        assert np.allclose(dark.sigma_px[own], light.sigma_px, rtol=0.05)  # 0.014 measured
+
+
 def test_a_wrong_field_is_a_miss(tmp_path: Path, shot: script.Shot) -> None:
     path = saved(shot, tmp_path)
     with pytest.raises(InputError, match="no field in any of 1 images") as raised:

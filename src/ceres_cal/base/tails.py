@@ -45,10 +45,11 @@ _CHEBYSHEV = (
 def normal_cdf(x: ArrayLike) -> Array:
     """Probability that a standard normal variable is smaller, to seven digits."""
     z = np.clip(np.asarray(x, dtype=float), -_FARTHEST, _FARTHEST) / -math.sqrt(2.0)
-    t = 1.0 / (1.0 + 0.5 * np.abs(z))
-    series = np.zeros_like(z)
+    t = np.asarray(1.0 / (1.0 + 0.5 * np.abs(z)))
+    series = np.zeros_like(t)
     for coefficient in _CHEBYSHEV:
-        series = t * (series + coefficient)
+        series += coefficient
+        series *= t
     above = 0.5 * t * np.exp(np.minimum(-z * z - 1.26551223 + series, 0.0))
     return np.asarray(np.where(z >= 0.0, above, 1.0 - above))
 

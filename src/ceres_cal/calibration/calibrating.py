@@ -12,6 +12,7 @@ import numpy as np
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import (
@@ -60,6 +61,7 @@ _OTHERWISE = (
 )
 
 
+@checked
 @numerical("the calibration")
 def calibrate(
     observations: Observations,

@@ -14,6 +14,7 @@ from ceres_cal.base.arrays import Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
+from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
     COPY,
@@ -102,6 +103,11 @@ class Calibration:
     def __repr__(self) -> str:
         cameras = ", ".join(f"{name!r}: {camera!r}" for name, camera in self.stations.items())
         return f"Calibration({cameras}; {self.rms_px:.3f} px rms)"
+
+    def _repr_html_(self) -> str:
+        shown = self.stations.items()
+        rows = [(name, repr(camera).removeprefix("Camera(").removesuffix(")")) for name, camera in shown]
+        return html_of((f"Calibration, {self.rms_px:.3f} px rms", rows))
 
     @property
     def cameras(self) -> Mapping[str, Camera]:

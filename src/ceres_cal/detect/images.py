@@ -97,6 +97,11 @@ def filled(grey: Array32, left_out: Mask) -> Array32:
     return plane
 
 
+def negative(grey: Array32) -> Array32:
+    """The negative of a photograph: lines that are darker than the floor are lighter in it."""
+    return np.asarray(np.max(grey) - grey, dtype=np.float32)
+
+
 def encoded(image: Image, ending: str, jpeg_quality: int) -> bytes:
     """The content of an image file: ".png" as it is, ".jpg" in so much quality, 1 to 100.
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
+from ceres_cal.detect.images import negative
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6
@@ -97,6 +98,15 @@ def find_strokes(grey: Array32) -> Strokes:
     fine = fine.take(_COARSER * fine.strength >= _strength_beside(fine, coarse, size))
     coarse = coarse.take(coarse.strength > _COARSER * _strength_beside(coarse, fine, size))
     return Strokes(*(np.concatenate([getattr(one, name) for one in (fine, coarse)]) for name in ("ends", "strength")))
+
+
+def are_darker(grey: Array32) -> bool:
+    """Whether a photograph's lines are darker than its floor: dark strokes are longer in all than light ones.
+
+    On fields with light lines they came to 0.92 of them at most, mostly to 0.2; on two with dark lines to 6 and 14.
+    """
+    dark, light = (float(np.sum(find_strokes(plane).length_px)) for plane in (negative(grey), grey))
+    return dark > light
 
 
 def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:

@@ -295,7 +295,7 @@ class DoesNotHold(Check):
     """
 
     kind = "does not hold"
-    wrong = "calibration"
+    wrong: ClassVar[Wrong] = "calibration"
 
     def tests(self, case: DiagnosisCase) -> int:
         return 1

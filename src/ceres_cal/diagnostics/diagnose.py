@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.numerical import numerical
+from ceres_cal.base.shown import Shown, drawn, html_of, text_of
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked
+from ceres_cal.base.words import plural
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResults, measure_noise, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled
@@ -62,6 +66,26 @@ class Diagnosis:
     conflicts: tuple[Conflict, ...] = ()
 
     @property
+    def _shown(self) -> Shown:
+        rows = [(one.kind, f"{one.effect_px:.2f} px", one.sentence) for one in self.findings]
+        count = plural(len(rows), "finding") if rows else "nothing found, residuals look like noise"
+        return f"Diagnosis: {count} ({self.tests} tests)", rows
+
+    def __repr__(self) -> str:
+        return text_of(self._shown)
+
+    def _repr_html_(self) -> str:
+        return html_of(self._shown)
+
+    def plot(self, ax: Any = None, camera: str | None = None) -> Any:
+        """Draw the residual vectors over one camera's image into Matplotlib's Axes; returns the Axes.
+
+        Args:
+            camera: its name; may be left out where there is only one.
+        """
+        return drawn("plot_residuals", self, ax, camera=camera)
+
+    @property
     def model_error(self) -> bool:
         return any(finding.is_model_error for finding in self.findings)
 
@@ -69,6 +93,7 @@ class Diagnosis:
 _FIRST = "correct first what was stated beforehand and is contradicted: this may come from it"
 
 
+@checked
 @numerical("the diagnosis")
 def diagnose(
     calibration: Calibration,

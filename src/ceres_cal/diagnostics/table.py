@@ -14,6 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask, numbers_of
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
+from ceres_cal.base.shown import brief
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import Equations, pairs_of, plane_shift
@@ -64,6 +65,8 @@ class ResidualTable:
     standardised: Array
     radius_px: Array
     reason: Codes
+
+    __repr__ = brief
 
     def __len__(self) -> int:
         return len(self.row)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.shown import brief, text_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations
@@ -42,6 +43,8 @@ class FieldDifference(ErrorMap):
     difference_mm: Array
     expected_mm: Array
     lost: Mask
+
+    __repr__ = brief
 
     @property
     def errors_mm(self) -> Array:
@@ -84,6 +87,8 @@ class MapChange:
     shift_px: float
     maps: tuple[FieldDifference, ...]
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class ImageDifference:
@@ -102,6 +107,8 @@ class ImageDifference:
     difference_px: Array
     angles_deg: Array
     turn_deg: float
+
+    __repr__ = brief
 
     @property
     def errors_px(self) -> Array:
@@ -160,6 +167,8 @@ class Agreement:
     pose_free: bool = False
     solution: Calibration | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class Agreements(Mapping[str, Agreement]):
@@ -184,6 +193,10 @@ class Agreements(Mapping[str, Agreement]):
     def exit_code(self) -> int:
         """1 where one does not hold."""
         return int(self.holds is False)
+
+    def __repr__(self) -> str:
+        holds = "" if self.holds is None else f", holds: {self.holds}"
+        return text_of((f"Agreements of {len(self)}{holds}", [(name, one.words) for name, one in self.items()]))
 
     def __getitem__(self, name: str) -> Agreement:
         return self.answers[name]

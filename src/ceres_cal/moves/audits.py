@@ -19,6 +19,7 @@ from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids
@@ -39,6 +40,7 @@ _LENSES = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (
 _SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 
 
+@checked
 @numerical("the audit")
 def audit(foreign: Calibration, observations: Observations) -> Agreements:
     """Hold a calibration, ours or another program's, against observations of its stations.

@@ -17,6 +17,7 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.agreement import (
@@ -57,6 +58,7 @@ _WILL_DO = 10.8
 _USUAL_EQUATIONS = 4.0
 
 
+@checked
 @numerical("the check")
 def check(
     calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1

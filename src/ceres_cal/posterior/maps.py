@@ -13,12 +13,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import brief, drawn
 from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.reading import Functional, read
@@ -43,6 +45,8 @@ class PointSpread:
     high: Array
     radius_95_m: Array
     sd_m: Array
+
+    __repr__ = brief
 
 
 def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tuple[Key, ...]:
@@ -155,6 +159,12 @@ class FieldMap(ErrorMap):
     sd_mm: Array
     radius_95_mm: Array
 
+    __repr__ = brief
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+        return drawn("plot_map", self, ax)
+
     @property
     def errors_mm(self) -> Array:
         return self.sd_mm
@@ -210,6 +220,12 @@ class ImageMap:
     x_px: Array
     y_px: Array
     radius_95_px: Array
+
+    __repr__ = brief
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+        return drawn("plot_map", self, ax)
 
 
 @dataclass(frozen=True, eq=False)

@@ -259,31 +259,51 @@ def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Ar
     if len(weights) == 1:
         return np.asarray(means[0] + half_width * sds[0])
     finite, tail = np.isfinite(means), float(normal_cdf(-half_width))
-    low = np.min(np.where(finite, means - _REACH * sds, np.inf), axis=0)
-    high = np.max(np.where(finite, means + _REACH * sds, -np.inf), axis=0)
     beyond = np.tensordot(weights, (means == np.inf).astype(float), axes=1) > tail
-    sds = np.maximum(sds, np.finfo(float).tiny)
+    low = np.where(beyond, 0.0, np.min(np.where(finite, means - _REACH * sds, np.inf), axis=0))
+    high = np.where(beyond, 0.0, np.max(np.where(finite, means + _REACH * sds, -np.inf), axis=0))
+    sds = np.maximum(sds, np.finfo(float).tiny).reshape(len(weights), -1)
+    means = means.reshape(len(weights), -1)
 
-    def above(x: Array) -> Array:
+    def above(x: Array, rows: Indices) -> Array:
         with np.errstate(over="ignore"):
-            return np.tensordot(weights, normal_cdf((means - x) / sds), axes=1)
+            return weights @ normal_cdf((means[:, rows] - x) / sds[:, rows])
 
-    return np.where(beyond, np.inf, _root(above, low, high, tail))
+    return np.where(beyond, np.inf, _root(above, low.ravel(), high.ravel(), tail).reshape(low.shape))
 
 
-def _root(above: Callable[[Array], Array], low: Array, high: Array, tail: float) -> Array:
-    """(...) where a falling function is so much, between two places."""
-    halvings = 28  # of an interval that holds a quantile: to 1e-7 standard deviations
-    for _ in range(halvings):
-        middle = 0.5 * (low + high)
-        over_it = above(middle) > tail
-        low, high = np.where(over_it, middle, low), np.where(over_it, high, middle)
-    return np.asarray(0.5 * (low + high))
+def _root(above: Callable[[Array, Indices], Array], low: Array, high: Array, tail: float) -> Array:
+    """(N,) where falling functions are so much, each between two places; `above` gives some of them at a place each.
+
+    By Chandrupatla's method (Advances in Engineering Software 28, 1997) on their logarithms: inverse quadratic
+    interpolation through three places where that may be trusted, else the middle.
+    """
+    least, exact, most_steps = 1e-12, 1e-7, 40  # of the function; of it and of the interval, as good as its values
+    roots, rows = np.full(len(low), np.nan), np.flatnonzero(np.ones(len(low)))
+    x, y, width, share = low, high, exact * (high - low), 0.5 * np.ones_like(low)
+    a, b = -np.log(tail) * np.ones_like(low), np.log(least / tail) * np.ones_like(low)
+    for _ in range(most_steps):
+        roots[rows] = place = x + share * (y - x)
+        value = np.log(np.maximum(above(place, rows), least) / tail)
+        left = (np.abs(value) > exact) & (np.abs(y - x) > width)
+        if not left.any():
+            break
+        rows, (width, place, value, x, y, a, b) = rows[left], (v[left] for v in (width, place, value, x, y, a, b))
+        alike = (value > 0.0) == (a > 0.0)
+        z, c = np.where(alike, x, y), np.where(alike, a, b)  # the place that is left
+        y, b, x, a = np.where(alike, y, x), np.where(alike, b, a), place, value
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off, at = (x - y) / (z - y), (a - b) / (c - b)
+            through = a / (b - a) * c / (b - c) + (z - x) / (y - x) * a / (c - a) * b / (c - b)
+            nearest = np.minimum(0.5 * width / np.abs(y - x), 0.5)
+        share = np.where((at**2 < off) & ((1.0 - at) ** 2 < 1.0 - off), through, 0.5)
+        share = np.clip(share, nearest, 1.0 - nearest)
+    return roots
 
 
 def normal_quantile(tail: float) -> float:
     """Standard deviations that so much of a normal variable lies above."""
-    return float(_root(lambda x: normal_cdf(-x), np.zeros(()), np.full((), _REACH), tail))
+    return float(_root(lambda x, _: normal_cdf(-x), np.zeros(1), np.full(1, _REACH), tail)[0])
 
 
 def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) -> Array:
@@ -308,9 +328,11 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
         return np.asarray(np.where(unknown, np.inf, each[0]))
     nowhere = np.tensordot(weights, np.isinf(each).astype(float), axes=1) > tail
 
-    def above(radius: Array) -> Array:
-        share = normal_cdf((1.0 - cubed - np.cbrt(radius**2 / square)) / np.sqrt(cubed))
-        return np.tensordot(weights, np.where(sized, share, np.isinf(each)), axes=1)
+    def above(radius: Array, rows: Indices) -> Array:
+        spread = cubed[:, rows]
+        share = normal_cdf((1.0 - spread - np.cbrt(radius**2 / square[:, rows])) / np.sqrt(spread))
+        return weights @ np.where(sized[:, rows], share, np.isinf(each[:, rows]))
 
-    largest = np.max(np.where(np.isfinite(each), each, 0.0), axis=0)
-    return np.asarray(np.where(unknown | nowhere, np.inf, _root(above, np.zeros_like(largest), largest, tail)))
+    endless = unknown | nowhere
+    largest = np.max(np.where(np.isfinite(each) & ~endless, each, 0.0), axis=0)
+    return np.asarray(np.where(endless, np.inf, _root(above, np.zeros_like(largest), largest, tail)))

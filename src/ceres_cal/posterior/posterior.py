@@ -10,6 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import brief
 from ceres_cal.base.spread import Spread, without
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter
@@ -51,6 +52,8 @@ class Posterior:
     dependence: Dependence | None = None
     stated: Information = field(default_factory=Information.nothing)
     lenses: tuple[Estimate, ...] = ()
+
+    __repr__ = brief
 
     @property
     def keys(self) -> tuple[Key, ...]:

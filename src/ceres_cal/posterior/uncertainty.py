@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import Shown, html_of, text_of
 from ceres_cal.base.spread import are_known
-from ceres_cal.base.words import two_digits
+from ceres_cal.base.typed import rows
+from ceres_cal.base.words import at_precision, two_digits
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
 from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
@@ -203,6 +205,21 @@ class Uncertainty:
     targets: Mapping[str, Target]
     conflicts: tuple[Conflict, ...] = ()
 
+    @property
+    def _shown(self) -> Shown:
+        numbers = []
+        for one in self.verdicts:
+            unit = "" if one.key.unit == "1" else f" {one.key.unit}"
+            value = f"{at_precision(one.value, one.sd)} ± {two_digits(one.sd)}{unit}"
+            numbers.append((f"{one.key.quantity} of {one.key.owner}", value, one.verdict))
+        return f"Uncertainty of {len(numbers)} numbers (value ± standard deviation)", numbers
+
+    def __repr__(self) -> str:
+        return text_of(self._shown)
+
+    def _repr_html_(self) -> str:
+        return html_of(self._shown)
+
     @cached_property
     def verdicts(self) -> tuple[Verdict, ...]:
         """Known, weak, unknown or in conflict, of each shared number."""
@@ -268,7 +285,7 @@ class Uncertainty:
             InputError: see `map_sd_mm`.
         """
         name = self.estimate.station_name(station)
-        return spread_of_points(self.estimate, self.posterior, name, np.asarray(pixels, dtype=float), height_m)
+        return spread_of_points(self.estimate, self.posterior, name, rows(pixels, 2, "pixels"), height_m)
 
     def map_sd_mm(
         self,

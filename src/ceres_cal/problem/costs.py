@@ -53,7 +53,10 @@ class CostValue(NamedTuple):
     jacobians: Sequence[Array]
 
 
-class CachedCost(pyceres.CostFunction):
+_CostFunction: Any = pyceres.CostFunction  # which has no types
+
+
+class CachedCost(_CostFunction):
     """A cost function; what it costs is `_evaluated`."""
 
     def __init__(self, run: Run) -> None:
@@ -120,7 +123,7 @@ class SightCost(CachedCost):
             self._poses[1] = estimate.placements[key.placement].log()
         sizes = (len(free), 6, 6, count)
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
-        self.slots = [slot for slot in range(4) if is_free[slot]]
+        self.slots: list[int] = [slot for slot in range(4) if is_free[slot]]
         self.set_num_residuals(len(free) + offsets + 7)
         self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
 
@@ -186,7 +189,8 @@ class EliminatedCost(CachedCost):
 
     def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
-        self.camera, weighting = sights.keys[0].camera, problem.weighting
+        self.camera: str = sights.keys[0].camera
+        weighting = problem.weighting
         self._sights, self._structure = sights, estimate.structure
         free, count = problem.layout.free[self.camera], len(self._structure.values)
         feet = starting_feet(sights, estimate, problem.feet)
@@ -205,7 +209,7 @@ class EliminatedCost(CachedCost):
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._last = self._accepted
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
-        self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
+        self.slots: list[int] = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
 
@@ -312,7 +316,7 @@ def chart_of(camera: Camera, free: Indices) -> Chart | None:
     return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
 
 
-class ChartedCost(pyceres.CostFunction):
+class ChartedCost(_CostFunction):
     """A cost function over what Ceres moves, of one over the numbers themselves."""
 
     def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:

@@ -254,7 +254,7 @@ class SharedCost(CachedCost):
             slots = [slot for slot in range(4) if own[slot]]
             self._of[key] = owners_of(key, slots)
             sizes |= dict(zip(self._of[key], (own[slot] for slot in slots), strict=True))
-        self.owners = list(sizes)
+        self.owners: list[tuple[str, str]] = list(sizes)
         ends = np.cumsum([0, *sizes.values()])
         self._columns = {owner: np.arange(*ends[n : n + 2]) for n, owner in enumerate(sizes)}
         rows = sum(1 + sum(sizes[owner] for owner in own) for own in self._of.values())

@@ -15,8 +15,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.base.typed import take_types
+from ceres_cal.base.typed import checked_fields, take_types
+from ceres_cal.base.words import no_such
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.structure import Structure, Tolerance
@@ -32,6 +34,7 @@ OF_PIXELS = ("phi", "aspect", "cx", "cy")
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Options:
     """What to solve for and how.
@@ -106,7 +109,7 @@ class Options:
         elif self.terms:
             raise InputError("terms are of a lens that is named: leave them out, or name it")
         if self.loss not in LOSSES:
-            raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
+            raise InputError(no_such("loss", self.loss, LOSSES))
         if self.noise_scale not in ("estimate", "stated"):
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
         if self.as_built not in ("estimate", "as drawn"):
@@ -220,6 +223,8 @@ class Estimate:
     structure: Structure
     """The targets as built."""
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
 
@@ -231,8 +236,10 @@ class Estimate:
         """
         if name is None and len(self.stations) == 1:
             return next(iter(self.stations))
-        if name is None or name not in self.stations:
-            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
+        if name is None:
+            raise InputError(f"which station? Name one of {', '.join(self.stations)}")
+        if name not in self.stations:
+            raise InputError(no_such("station", name, self.stations))
         return name
 
     def camera_at(self, station: str, placement: str | None = None) -> Camera:

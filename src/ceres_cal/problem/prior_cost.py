@@ -70,7 +70,8 @@ class PriorCost(CachedCost):
         self._is_usual, self._is_log = prior.is_usual, prior.is_log
         self._root, self._mean = prior.information.root, prior.mean
         parts = dict(_parts(prior, estimate, layout))
-        self._parts, self.owners = list(parts.values()), list(parts)
+        self._parts = list(parts.values())
+        self.owners: list[tuple[str, str]] = list(parts)
         self.set_num_residuals(len(self._root))
         self.set_parameter_block_sizes([part.size for part in self._parts])
 

@@ -20,6 +20,7 @@ from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import take_types
+from ceres_cal.base.words import no_such
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.scene.curves import Curve
@@ -221,7 +222,7 @@ def make_structure(
     """
     for name in tolerances:
         if name not in targets:
-            raise InputError(f"a tolerance names target {name!r}: there are {', '.join(map(repr, targets))}")
+            raise InputError(f"a tolerance: {no_such('target', name, targets)}")
     if all(tolerance == Tolerance() for tolerance in tolerances.values()) and not dimensions:
         return EXACT
     every = [of for name, target in targets.items() for of in _tolerated(name, target, tolerances)]
@@ -336,7 +337,7 @@ def dimension_slopes(
     columns = np.zeros((len(offsets), len(dimensions)))
     for column, name in enumerate(dimensions):
         if name not in known:
-            raise InputError(f"there is no dimension {name!r} to be solved for: there are {', '.join(known) or 'none'}")
+            raise InputError(no_such("dimension to solve for", name, known))
         target, _, dimension = name.partition("/")
         spec = targets[target].spec
         other = target_from_spec({**spec, dimension: (1.0 + _STEP) * known[name]}, target)

@@ -74,7 +74,8 @@ class Bulk:
     """Very many observations, and the engine that asks them."""
 
     def __init__(self, observations: Observations, client: Any = None) -> None:
-        self.observations, self._client = observations, client
+        self.observations: Observations = observations
+        self._client = client
         self._engines: list[InProcess | OnWorkers] = []
         self._left_out = None
         if observations.copies.are_there:
@@ -83,7 +84,9 @@ class Bulk:
         self._engine = self._engine_without(self._left_out)
         views = observations.views
         self._world = np.array([view.placement is None for view in views])
-        self.keys = tuple({SightKey(v.camera, v.station, None): None for v in views if v.placement is None})
+        self.keys: tuple[SightKey, ...] = tuple(
+            {SightKey(v.camera, v.station, None): None for v in views if v.placement is None}
+        )
 
     def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> Engine:
         shares = list(cut(self.observations, left_out))

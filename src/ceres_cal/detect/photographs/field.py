@@ -11,9 +11,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import InputError, NothingShownError, naming
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.shown import brief
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
-from ceres_cal.detect.images import filled, read_light
+from ceres_cal.detect.images import filled, negative, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.as_built import ASIDE_M
 from ceres_cal.detect.photographs.candidates import prepare_search
@@ -23,6 +24,7 @@ from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import Auto, SearchResult, SeveralWaysError, search
+from ceres_cal.detect.strokes import are_darker
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
@@ -49,6 +51,8 @@ class FieldDetections:
     found: dict[str, Followed]
     missed: tuple[tuple[str, str], ...]
     searched: dict[str, SearchResult]
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -111,9 +115,16 @@ def detect_field(
             )
     results: dict[str, SearchResult] = {}
     last: Followed | None = None
+    darker = None  # whether the lines are; a start that is near finds light ones sooner than strokes tell
     for number, path in enumerate(paths, start=1):
         grey = _without(read_light(path), options.left_out, path)
-        result = _looked_for(grey, drawn, painted, start if last is None else last, (path, options))
+        if darker is None and not isinstance(start, Camera):
+            darker = are_darker(grey)
+        given = (drawn, painted, start if last is None else last, (path, options))
+        result = _looked_for(negative(grey) if darker else grey, *given)
+        if result.followed is None and not darker and isinstance(start, Camera) and are_darker(grey):
+            result = _looked_for(negative(grey), *given)
+            darker = result.followed is not None
         results[str(path)] = result
         if result.followed is None and options.refused is not None:
             options.refused(path, result)

@@ -56,7 +56,7 @@ class Aspect(HeldNumbers):
     """How high pixels are beside their width."""
 
     kind = "aspect"
-    places: ClassVar = [1]
+    places: ClassVar[list[int]] = [1]
 
     def words(self, evidence: Evidence) -> Words:
         score = evidence.score
@@ -73,7 +73,7 @@ class PrincipalPoint(HeldNumbers):
     """Where the optical axis meets the image."""
 
     kind = "principal point"
-    places: ClassVar = [2, 3]
+    places: ClassVar[list[int]] = [2, 3]
 
     def words(self, evidence: Evidence) -> Words:
         score = evidence.score
@@ -90,7 +90,7 @@ class Phi(HeldNumbers):
     """The focal length."""
 
     kind = "phi"
-    places: ClassVar = [0]
+    places: ClassVar[list[int]] = [0]
 
     def words(self, evidence: Evidence) -> Words:
         score = evidence.score

@@ -87,7 +87,7 @@ class CurveAside(_StructureTest):
     kind = "curve aside"
     built = "lines"
     curves = True
-    places: ClassVar = slice(0, 3)
+    places: ClassVar[slice] = slice(0, 3)
 
     def words(self, evidence: Evidence) -> Words:
         name = evidence.score.subject
@@ -114,7 +114,7 @@ class PointAside(_StructureTest):
 
     kind = "point aside"
     built = "points"
-    places: ClassVar = slice(0, 2)
+    places: ClassVar[slice] = slice(0, 2)
 
     def words(self, evidence: Evidence) -> Words:
         name = evidence.score.subject
@@ -132,7 +132,7 @@ class BoardBent(_StructureTest):
 
     kind = "board bent"
     built = "warp"
-    places: ClassVar = slice(2, 2 + len(WARP))
+    places: ClassVar[slice] = slice(2, 2 + len(WARP))
 
     def words(self, evidence: Evidence) -> Words:
         # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.

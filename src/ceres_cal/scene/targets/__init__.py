@@ -1,6 +1,7 @@
 """Targets: rigid things of known geometry, one module for each kind of them, and the table of the kinds."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.lazy import names_of
 from ceres_cal.scene.curves import SIDES as SIDES
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets.ring_sheets import rings as rings
     from ceres_cal.scene.targets.tape_grids import tape_grid as tape_grid
 
-__getattr__ = names_of(
+__getattr__: Callable[[str], Any] = names_of(
     __name__,
     {
         "april_grid": "april_grids",
