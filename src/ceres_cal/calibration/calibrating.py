@@ -112,7 +112,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(start, observations, sights, options, Watched()).redrawn()
+        return _of_lens(start, observations, sights, options, Watched(bends=False)).redrawn()
 
 
 def _measured(
@@ -258,10 +258,12 @@ class Watched:
 
     Attributes:
         progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
+        bends: whether it matters how the uncertainty bends.
     """
 
     progress: Callable[[Progress], None] | None = None
     settle: Callable[..., Settled] | None = None
+    bends: bool = True
 
 
 def solved_from(
@@ -304,7 +306,12 @@ def solved_from(
     posterior, conflicts, settled = None, Conflicts(), None
     assessed = again is None or again.assessed
     if assessed:
-        conflicts = find_conflicts(problem, observations, end, usual)
+        part = taking_part(problem, observations, explanations) if again is None else None
+        conflicts = find_conflicts(problem, observations, end, usual, part)
+    if conflicts.answer is not None:
+        problem = replace(problem, priors=conflicts.answer.problem.priors)
+        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        end, others = replace(conflicts.answer, residuals=shown), ()
     if watched.settle is not None:
         settled = watched.settle(problem, end, explanations, watched.progress)
         end = settled.end
@@ -312,13 +319,13 @@ def solved_from(
     effects = beside.estimates if beside else ()
     warnings = (*warnings, *(one.warning for one in effects))
     if assessed:
-        end, posterior = _assess(end, observations, problem, again)
+        end, posterior = _assess(end, observations, problem, again, watched.bends)
         if again is None:
             require_lens_told(end.solution.estimate, posterior)
         posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *conflicts.words, *unknown_phi(end, posterior))
         warnings = (
             *warnings,
             *resting_phi(end, problem),
@@ -349,7 +356,7 @@ def _as_long_as_asked(
 
 
 def _assess(
-    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None
+    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None, bends: bool
 ) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
@@ -365,7 +372,8 @@ def _assess(
         found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
         return measure_scatter(observations, known, found, there, says)
 
-    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
+    freedom = end.inliers.degrees_of_freedom
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, bends=bends)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 

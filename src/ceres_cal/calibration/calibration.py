@@ -44,7 +44,7 @@ from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import every_key
 from ceres_cal.problem.structure import redrawn
-from ceres_cal.robust.stated import Conflict
+from ceres_cal.robust.stated import Conflict, agreed
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
@@ -207,9 +207,11 @@ class Calibration:
         weighting = Weighting(*self.fit.scales, options.loss, options.loss_scale)
         if new_data or prior is None or self.posterior is None:
             priors = gather_priors(observations, options, self.estimate.structure)
-            return Problem(sights, make_layout(observations, options), priors, weighting, options)
-        priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
-        return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
+            layout = make_layout(observations, options)
+        else:
+            priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
+            layout = self.posterior.layout(self.estimate)
+        return Problem(sights, layout, agreed(priors, self.conflicts), weighting, options)
 
     def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
         """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""

@@ -255,6 +255,18 @@ class Scatter:
         return Information(seen.keys, seen.matrix + 0.5 * (change + change.T))
 
 
+def scattered(reduced: ReducedInformation, scatter: Scatter | None) -> Information:
+    """What observations and priors say of everything shared, as the observations scatter.
+
+    What targets may be off is a scatter of theirs: trusted more than that where errors go together, it made halves of
+    real boards differ by 1.7 times what was stated.
+    """
+    if scatter is None:
+        return reduced.shared
+    built = reduced.built.over(reduced.shared.keys)
+    return scatter.widened(reduced.points + reduced.curves + built) + reduced.priors.less(built)
+
+
 def measure_scatter(
     observations: Observations, problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
 ) -> Scatter | None:

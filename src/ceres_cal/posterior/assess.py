@@ -48,6 +48,8 @@ def assess(
     reduced: ReducedInformation,
     degrees_of_freedom: float,
     scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
+    *,
+    bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
@@ -60,6 +62,7 @@ def assess(
         reduced: what the problem says at the estimate.
         degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
         scatter_at: how the data scatter at an estimate, of which the problem says so much.
+        bends: whether weak directions are followed, which takes a solve for each end.
 
     Raises:
         SolutionError: no possible lens fits.
@@ -81,7 +84,8 @@ def assess(
         reduced = information(problem, estimate)
         posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
-    return estimate, _with_bends(replace(posterior, mixtures=mixtures), problem, estimate)
+    posterior = replace(posterior, mixtures=mixtures)
+    return estimate, _with_bends(posterior, problem, estimate) if bends else posterior
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
@@ -164,6 +168,9 @@ def with_doubts(
     estimate = end.solution.estimate
     disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as any of what contradicts it
     posterior = posterior.with_alternatives(conflicts.keys, conflicts.shifts, [disputed] * len(conflicts.shifts))
+    for doubt in conflicts.doubts:  # of which nothing is known for certain any more
+        posterior = replace(posterior, stated=posterior.stated.without(doubt.keys))
+        posterior = posterior.with_alternatives(conflicts.keys, [doubt.shift], [doubt.probability])
     doubtful = [one for one in explanations if one.is_doubtful]
     shifts = [difference(one.other, estimate, posterior.keys) for one in doubtful]
     likely = np.array([one.doubt for one in doubtful])

@@ -4,15 +4,16 @@ They are the calibration's own share: the noise of the pixel that is asked about
 with too few coefficients, a field painted amiss) is not in them.
 
 A camera that turns by a little shows the same picture with another principal point: of an image what a turn makes good
-is left out, by least squares. What remains is the lens's and the focal length's, wherever the camera hangs; what the
-pose adds is in the maps over the field.
+is left out, by least squares, each place as far as it is known: a corner that nobody observed tells no turn. What
+remains is the lens's and the focal length's, wherever the camera hangs; what the pose adds is in the maps over the
+field.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.shown import brief, drawn
 from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.reading import Functional, read
+from ceres_cal.posterior.reading import Functional, Reading, read
 from ceres_cal.problem.information import STATION_QUANTITIES, Key, over
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
 from ceres_cal.problem.quantities import PixelSlopes, pixel_slopes
@@ -204,6 +205,7 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     return FieldMap(grid.height_m, grid.x_m, grid.y_m, station, *values)
 
 
+_EXACT_PX = 1e-6  # places that are known better tell a turn alike
 _STEPS = 32  # along the longer side
 
 
@@ -230,10 +232,15 @@ class ImageMap:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a camera shows at N pixels, and how that moves when the camera is another one."""
+    """What a camera shows at N pixels, and how that moves when the camera is another one.
+
+    Attributes:
+        weights: (N,) of each in the turn that is left out; 0: none is.
+    """
 
     camera: Camera
     pixels: Array
+    weights: Array | float = 1.0
 
     @cached_property
     def _rays(self) -> Array:
@@ -245,7 +252,7 @@ class Picture:
 
     def of(self, camera: Camera) -> Picture:
         """What another one shows at the same pixels."""
-        return Picture(camera.at(Pose.identity()), self.pixels)
+        return replace(self, camera=camera.at(Pose.identity()))
 
     @property
     def shown(self) -> Mask:
@@ -262,17 +269,21 @@ class Picture:
         where either shows nothing.
         """
         shift = other.project(self._rays) - self.pixels
-        known = np.repeat(np.isfinite(shift[:, 0]), 2)
-        turn = np.linalg.lstsq(self._turns[known], shift.ravel()[known], rcond=None)[0]
-        return np.asarray(shift - (self._turns @ turn).reshape(-1, 2))
+        known = np.isfinite(shift[:, 0])
+        return shift - self._turned(np.nan_to_num(shift)[:, :, None], known)[:, :, 0]
 
     def slopes(self, quantities: Sequence[str]) -> Array:
         """(N, 2, K) px per unit of some intrinsics, turned as well as can be; 0 where the lens shows nothing."""
         names = intrinsic_names(self.camera.lens)
         moving = np.nan_to_num(self._by.intrinsics[:, :, [names.index(name) for name in quantities]])
-        flat = moving.reshape(2 * len(moving), len(quantities))
-        turn = np.linalg.lstsq(self._turns, flat, rcond=None)[0]
-        return np.asarray((flat - self._turns @ turn).reshape(moving.shape))
+        return moving - self._turned(moving, self.shown)
+
+    def _turned(self, moving: Array, known: Mask) -> Array:
+        """(N, 2, K) how much of (N, 2, K) px a turn makes good."""
+        weights = np.repeat(self.weights * known, 2)[:, None]
+        flat = moving.reshape(len(weights), moving.shape[-1])
+        turn = np.linalg.lstsq(weights * self._turns, weights * flat, rcond=None)[0]
+        return np.asarray((self._turns @ turn).reshape(moving.shape))
 
 
 def image_grid(image_size: tuple[int, int]) -> tuple[Array, Array]:
@@ -293,12 +304,18 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     own = estimate.cameras[camera].at(Pose.identity())
     x, y = image_grid(own.image_size)
     pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
-    picture = Picture(own, pixels)
-    shown = Functional(
-        lambda there: picture.shift(there.cameras[camera].at(Pose.identity())),
-        lambda there, keys: picture_slopes(picture.of(there.cameras[camera]), keys, camera),
-    )
-    radius = read(posterior, estimate, shown, camera).radius_95
+
+    def known(picture: Picture) -> Reading:
+        shown = Functional(
+            lambda there: picture.shift(there.cameras[camera].at(Pose.identity())),
+            lambda there, keys: picture_slopes(picture.of(there.cameras[camera]), keys, camera),
+        )
+        return read(posterior, estimate, shown, camera)
+
+    picture = Picture(own, pixels, 0.0)
+    with_turns = known(picture).sd
+    picture = replace(picture, weights=1.0 / np.maximum(with_turns, _EXACT_PX))
+    radius = known(picture).radius_95
     return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
 
 

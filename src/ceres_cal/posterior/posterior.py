@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.shown import brief
 from ceres_cal.base.spread import Spread, without
 from ceres_cal.base.tails import NORMAL_95, student_95
-from ceres_cal.effects.dependence import Dependence, Scatter
+from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.information import Information, Key, over, pose_keys, sigma_limits
 from ceres_cal.problem.parameters import Estimate, Layout
@@ -256,7 +256,7 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
     model, stated = reduced.shared, reduced.stated
     if scatter is None:
         return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom, stated=stated)
-    shared, dependence = scatter.widened(reduced.points + reduced.curves) + reduced.priors, scatter.dependence
+    shared, dependence = scattered(reduced, scatter), scatter.dependence
     placements = _Placements(reduced.eliminated, shared, dependence.private)
     return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence, stated=stated)
 

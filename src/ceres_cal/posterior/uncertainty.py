@@ -51,8 +51,8 @@ class Verdict:
         sd: root mean square of what may be, infinite where unknown; where phi is followed along its profile, half the
             distance of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural
             size, infinite also for phi and height where the valley is open.
-        verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": its sd is the one that was stated,
-            and everything else contradicts it. by_profile: whether the bounds are the profile's.
+        verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": everything else contradicts what
+            was stated of it, and both are within its bounds. by_profile: whether the bounds are the profile's.
         factor: standard deviation as the data scatter over that by the model alone.
     """
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -126,10 +127,11 @@ class _Assembly:
 def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     private, sights, layout = problem.private, problem.sights, problem.layout
     blocks = _ParameterBlocks.pack(estimate, layout, private)
-    assembly = _Assembly(blocks, [], [])
+    assembly, posed = _Assembly(blocks, [], []), set[str]()
     for camera in estimate.cameras:
         own = sights.numbers(camera, placements=private)
         if len(own):
+            posed.add(camera)
             cost = EliminatedCost(run, sights.take(own), problem, estimate)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
@@ -143,7 +145,8 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     if problem.elsewhere is not None:
         more = problem.elsewhere.cost(run, problem, estimate)
         assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
-    for prior in problem.priors_of(estimate):
+    smooth = (problem.smooth_at(estimate, name) for name in estimate.cameras if name not in posed)
+    for prior in (*problem.stated_at(estimate), *chain.from_iterable(smooth)):
         prior_cost = PriorCost(run, prior, estimate, layout)
         assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
     return assembly
@@ -291,6 +294,8 @@ def _rests(history: Sequence[float]) -> bool:
 
 def _require_enough(problem: Problem, estimate: Estimate) -> None:
     unknowns = problem.layout.size + len(estimate.structure.values)
+    if problem.equations >= unknowns:
+        return
     known = unknowns - problem.unknowns(estimate)
     if problem.equations + known < unknowns:
         raise DegenerateError(

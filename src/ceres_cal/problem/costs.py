@@ -20,7 +20,7 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.parameters import Estimate, unit_px
+from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales, unit_px
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.problem.structure import Structure
@@ -208,6 +208,7 @@ class EliminatedCost(CachedCost):
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._last = self._accepted
+        self._smooth = _smoothness(problem, estimate, self.camera, self._size)
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self.slots: list[int] = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
@@ -229,7 +230,7 @@ class EliminatedCost(CachedCost):
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
             swept = self._swept(at, tolerance, newton)
-            cost = float(np.sum(swept.costs))
+            cost = float(np.sum(swept.costs)) + self._add_smoothness(at, swept.reduced)
             if not np.isfinite(cost):
                 return None
             kernels.cholesky(swept.reduced, upper)
@@ -240,6 +241,17 @@ class EliminatedCost(CachedCost):
         residuals[-1] = np.sqrt(max(missing, 0.0))
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
+
+    def _add_smoothness(self, at: Array, reduced: Array) -> float:
+        """What the lens's roughness costs, once its normal equations are added: as residuals of its own Ceres would
+        take as long over it as over all sights.
+        """
+        if self._smooth is None:
+            return 0.0
+        slope = self._smooth @ at
+        reduced[:-1, :-1] += self._smooth
+        reduced[-1, :-1] += slope
+        return float(at @ slope)
 
     def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
         """Every placement brought to its best in a place, from the last accepted one."""
@@ -337,3 +349,15 @@ class ChartedCost(_CostFunction):
                     jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
             return True
         return False
+
+
+def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> Array | None:
+    """(size, size) what is known of a lens's roughness, by the numbers of its camera's block; None of nothing."""
+    camera, whole = estimate.cameras[name], None
+    place = {number: at for at, number in enumerate(problem.layout.free[name].tolist())}
+    for prior in problem.smooth_at(estimate, name):
+        numbers = [intrinsic_names(camera.lens).index(key.quantity) for key in prior.keys]
+        at, scales = [place[number] for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
+        whole = np.zeros((size, size)) if whole is None else whole
+        whole[np.ix_(at, at)] += scales[:, None] * prior.information.matrix * scales
+    return whole

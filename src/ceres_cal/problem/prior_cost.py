@@ -27,10 +27,10 @@ class _Linear(NamedTuple):
         """(n,) in the units of the keys."""
         return np.asarray(block[self.slots] * self.scales)
 
-    def slopes(self, block: Array) -> Array:
-        """(n, size) derivatives by the block."""
-        slopes = np.zeros((len(self.slots), self.size))
-        slopes[np.arange(len(self.slots)), self.slots] = self.scales
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, size) derivatives by the block of root (R, n) times the values."""
+        slopes = np.zeros((len(root), self.size))
+        slopes[:, self.slots] = root * self.scales
         return slopes
 
 
@@ -48,14 +48,14 @@ class _StationCoordinates(NamedTuple):
         turn = rotation_log(pose.rotation @ self.rotation.T)
         return np.concatenate([pose.position, turn])[self.rows]
 
-    def slopes(self, block: Array) -> Array:
-        """(n, 6) derivatives by the rotation vector and the translation."""
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, 6) derivatives of root (R, n) times the values by the rotation vector and the translation."""
         inverse, left = rotation_exp(block[:3]).T, left_jacobian(block[:3])
         slopes = np.zeros((6, 6))
         slopes[:3] = np.hstack([-inverse @ skew(block[3:]) @ left, -inverse])
         turn = rotation_log(inverse.T @ self.rotation.T)
         slopes[3:, :3] = np.linalg.solve(left_jacobian(turn), left)
-        return slopes[self.rows]
+        return np.asarray(root @ slopes[self.rows])
 
 
 class PriorCost(CachedCost):
@@ -87,7 +87,7 @@ class PriorCost(CachedCost):
         if self._is_usual:
             residuals, slope = _bent(residuals)
             root = slope[:, None] * root
-        slopes = [(root[:, part.columns] @ part.slopes(block)).reshape(-1) for part, block in blocks]
+        slopes = [part.slopes(block, root[:, part.columns]).reshape(-1) for part, block in blocks]
         return CostValue(at, residuals, slopes)
 
 

@@ -58,7 +58,8 @@ class ReducedInformation:
 
     Attributes:
         points, curves: what the observations of either kind say. priors: what was known before.
-        stated: that part of the priors which somebody stated, or an earlier calibration found.
+        stated: that part of the priors which somebody stated, or an earlier calibration found. built: that part of them
+            which says how far targets may be from their drawings: a scatter that equations have in common.
         eliminated: the private placements, by station.
         point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
     """
@@ -67,6 +68,7 @@ class ReducedInformation:
     curves: Information
     priors: Information
     stated: Information
+    built: Information
     eliminated: tuple[Eliminated, ...]
     point_leverage: float
     curve_leverage: float
@@ -175,9 +177,13 @@ class _InformationSums:
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
         known = reduce(add, priors, Information.nothing(self._keys))
-        every = self._problem.stated_at(self._estimate)
-        stated = reduce(add, (prior.information for prior in every if not prior.is_usual), Information.nothing())
-        return ReducedInformation(points, curves, known, stated, tuple(eliminated), *self._leverages.tolist())
+        every = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
+        of_targets = [all(key.kind == "structure" for key in prior.keys) for prior in every]
+        stated, built = (
+            reduce(add, (one.information for one, own in zip(every, of_targets, strict=True) if own == of), nothing)
+            for of, nothing in ((False, Information.nothing()), (True, Information.nothing()))
+        )
+        return ReducedInformation(points, curves, known, stated, built, tuple(eliminated), *self._leverages.tolist())
 
     def _owned(self, kind: str, name: str) -> Indices:
         return self._columns.get((kind, name), np.empty(0, dtype=np.int64))

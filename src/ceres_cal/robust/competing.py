@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.arrays import Indices, Mask, medians_known
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.columns import least_absolute
@@ -285,7 +285,7 @@ class _Competition:
                 instead = f"the whole of {groups.name(rival)} does not belong"
                 rivals = self._without(groups, tuple(rival if one == number else one for one in numbers))
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
-            aside_px = float(np.nanmedian(lengths[own]))
+            aside_px = float(medians_known(lengths[own]))
             explanations.append(Explanation(groups.name(number), own, aside_px, odds, instead, other))
         rows = groups.among(np.array(numbers)) & self._taking_part
         least = min(one.log_odds for one in explanations)
