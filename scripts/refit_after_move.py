@@ -34,7 +34,7 @@ from watching import Folder, Journal
 
 import ceres_cal as cc
 from ceres_cal.base.files import make_folder, read_bytes, write_bytes
-from ceres_cal.cli.files import IMAGE_ENDINGS
+from ceres_cal.base.images import IMAGE_ENDINGS
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.photographs import check_photographs
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements

@@ -339,7 +339,7 @@ def test_advice_needs_a_field_a_station_and_an_uncertainty() -> None:
     calibration = calibrated("whole field, 8 deg")
     with pytest.raises(InputError, match="sees nothing of the field at 9000 mm"):
         advise(calibration, height_m=9.0)
-    with pytest.raises(InputError, match="station 'gone' is not there"):
+    with pytest.raises(InputError, match="there is no station 'gone'"):
         advise(calibration, "gone")
     with pytest.raises(InputError, match="calibrate again"):
         advise(replace(calibration, posterior=None))
@@ -391,7 +391,7 @@ def test_the_command_for_scripts(file: str, capsys: pytest.CaptureFixture[str]) 
     "more, message",
     [
         (["--height-mm", "x"], "--height-mm: 'x' is no length: write a number of mm, or 5m, 150mm"),
-        (["--station", "k"], "station 'k' is not there: there are 'overhead'"),
+        (["--station", "k"], "there is no station 'k': there are 'overhead'"),
         (["--board", "9x6"], "--board '9x6': write COLUMNSxROWSxMM, such as 9x6x100"),
         (["--board", "1x6x100"], "columns and rows count inner corners"),
         (["--good-enough-mm", "0"], "--good-enough-mm 0: give a number of millimetres above 0"),

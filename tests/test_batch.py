@@ -159,7 +159,7 @@ def cores(_: int) -> int:
 PLANS = {
     "twice.csv": ("name,command,arguments\na,check,x y\na,check,x z\n", "2 jobs are called 'a'"),
     "more.csv": ("name,command,arguments\na,check,x,y\n", "line 2: more columns than heads"),
-    "key.jsonl": ('{"name": "a", "command": "check", "lens": "auto"}\n', "unknown field `lens`"),
+    "key.jsonl": ('{"name": "a", "command": "check", "lens": "auto"}\n', "there is no field 'lens'"),
     "path.jsonl": ('{"name": "../a", "command": "check"}\n', "files have its name"),
     "quote.jsonl": ('{"name": "a", "command": "check", "arguments": "\\"x"}\n', "No closing quotation"),
     "other.toml": ('[[job]]\nname = "a"\ncommand = "locate"\n', "there is no command 'locate' for a batch"),

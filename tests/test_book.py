@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from chromium import browser
 
 import ceres_cal
 from ceres_cal.cli.command import COMMANDS
@@ -70,6 +71,19 @@ def test_every_link_leads_somewhere(pages: dict[Path, Page]) -> None:
 def test_nothing_is_fetched_from_a_network(pages: dict[Path, Page]) -> None:
     fetched = re.compile(r'<(?:link|script|img)[^>]*(?:href|src)="https?:')
     assert [path.name for path in pages if fetched.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_the_search_works_from_files(pages: dict[Path, Page], width: int) -> None:
+    (index,) = (path for path in pages if path.name == "index.html")
+    with browser() as window:
+        window.open(index, width)
+        window.wait_for("document.querySelector('[data-md-component=search-query]')", 20.0)
+        window.run("document.querySelector('#__search').click()")
+        type_it = "const q = document.querySelector('[data-md-component=search-query]'); q.focus(); q.value = 'height';"
+        window.run(f"(() => {{{type_it} q.dispatchEvent(new KeyboardEvent('keyup', {{key: 't'}}))}})()")
+        window.wait_for("document.querySelectorAll('.md-search-result__item').length > 3", 30.0)
+        assert all(url.startswith("file:") for url in window.requests)
 
 
 def test_every_public_name_is_in_the_reference(pages: dict[Path, Page]) -> None:

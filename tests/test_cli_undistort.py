@@ -123,7 +123,7 @@ def test_several_stations(say: Say, folder: Path) -> None:
     named = say("undistort", two, photograph, "-o", out, "--top-view", "--station", "second", "--json")
     assert json.loads(named.out)["station"] == "second"
     assert "camera 'x' is not there" in refused(say("undistort", two, photograph, "-o", out, "--camera", "x"))
-    assert "station 'x' is not there" in refused(say("undistort", two, photograph, "-o", out, "--station", "x"))
+    assert "there is no station 'x'" in refused(say("undistort", two, photograph, "-o", out, "--station", "x"))
 
 
 def test_refusals(say: Say, folder: Path, tmp_path: Path) -> None:

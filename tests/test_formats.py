@@ -115,7 +115,7 @@ def test_the_look_up_table_is_a_format(tmp_path: Path, capsys: pytest.CaptureFix
     [
         (("--to", "shoes", "-o", "a.toy"), "no export format 'shoes': choose one of table, "),
         (("--to", "toy", "-o", "a.txt"), "a.txt: a file of format toy ends in .toy or .gz.toy"),
-        (("--to", "toy", "-o", "a.toy", "--station", "x"), "station 'x' is not there"),
+        (("--to", "toy", "-o", "a.toy", "--station", "x"), "there is no station 'x'"),
         (("--to", "toy", "-o", "a.toy", "--digits", "x"), "--digits: 'x' is not the number or word that it takes"),
         (("--to", "toy", "-o", "a.toy", "--step-px", "4"), "--step-px is no option of format toy"),
         (("--to", "folder", "-o", "d", "--station", "overhead", "--station", "overhead"), "holds one station, not 2"),
@@ -144,11 +144,11 @@ def test_without_any_format(
     for name in reversed(list(EXPORT_FORMATS)):  # they come back the other way round
         monkeypatch.delitem(EXPORT_FORMATS, name)
     assert main(["export", str(tmp_path / "c.json"), "--to", "toy", "-o", str(tmp_path / "a.toy")]) == 2
-    assert "no export format 'toy': no format is registered" in capsys.readouterr().err
+    assert "no export format 'toy': none is known" in capsys.readouterr().err
 
 
 def test_from_python_refusals(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="format toy has no option 'size': there are digits, comment"):
+    with pytest.raises(InputError, match="there is no option of format toy 'size': choose one of digits, comment"):
         export(calibrated(), "toy", tmp_path / "a.toy", size=3)
-    with pytest.raises(InputError, match="format folder has no option 'size': there are none"):
+    with pytest.raises(InputError, match="there is no option of format folder 'size': none is known"):
         export(calibrated(), "folder", tmp_path / "a", size=3)

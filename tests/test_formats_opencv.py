@@ -203,7 +203,7 @@ def test_broken_files_are_one_line(old: str, new: str, words: str, tmp_path: Pat
 
 def test_too_many_stations_are_refused(tmp_path: Path) -> None:
     mixed = two_cameras("brown")
-    with pytest.raises(InputError, match="station 'x' is not there"):
+    with pytest.raises(InputError, match="there is no station 'x'"):
         export(mixed, "opencv", tmp_path / "a.yml", ["x"])
     with pytest.raises(InputError, match=r"wrong by .* mm on the field, more than 0.001"):
         export(over_field(with_lens("radial-2-3")), "opencv", tmp_path / "a.yml", max_loss_mm=1e-3)

@@ -33,6 +33,7 @@ FLOORS = {
     "report": 11,
     "page": 12,
     "cli": 13,
+    "functions": 13,
 }
 
 # Library: who may import it, at the top or inside a function.
@@ -40,7 +41,7 @@ DOORS = {
     "pyceres": {"problem"},
     "cv2": {"detect", "report", "formats"},
     "pycolmap": {"start", "formats"},
-    "matplotlib": {"report"},
+    "matplotlib": {"report", "base"},  # base: for plot() of public objects
     "google": {"formats"},  # protobuf
     "yaml": {"formats"},
     "distributed": {"cli"},

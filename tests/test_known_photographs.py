@@ -115,7 +115,7 @@ def test_names_are_those_of_the_calibration(calibration: Calibration) -> None:
 
 
 def test_what_cannot_be_looked_for(calibration: Calibration) -> None:
-    with pytest.raises(InputError, match="station 'left' is not there"):
+    with pytest.raises(InputError, match="there is no station 'left'"):
         detect_known(calibration, [NEW], "left")
     with pytest.raises(InputError, match="curve 'Nowhere' is not one of"):
         detect_known(calibration, [NEW], not_painted=["Nowhere"])
@@ -147,7 +147,7 @@ def test_wrong_input_is_refused_in_one_line(say: Say, folder: Path) -> None:
         (("check", old, NEW, folder / "seen.json"), "observations beside photographs"),
         (("check", old, NEW, NEW), "given twice"),
         (("check", old, folder / "gone.jpg"), "no such file"),
-        (("check", old, NEW, "--station", "left"), "station 'left' is not there"),
+        (("check", old, NEW, "--station", "left"), "there is no station 'left'"),
         (("check", old, folder / "seen.json", "--station", "camera"), "are of photographs"),
         (("check", old, ROOT / "data" / "field_2004" / "photographs"), "780 x 580 px"),
         (("check", old, NEW, "--not-painted", "Nowhere"), "curve 'Nowhere' is not one of"),

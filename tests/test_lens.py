@@ -329,7 +329,7 @@ def test_lenses_by_name() -> None:
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: make_lens("fisheye"), "unknown lens 'fisheye': choose one of radial, brown, kannala-brandt"),
+        (lambda: make_lens("fisheye"), "there is no lens 'fisheye': choose one of radial, brown, kannala-brandt"),
         (
             lambda: make_lens("brown", coefficients={"k7": 0.1}),
             "lens 'brown' has no coefficient 'k7': it has k1, k2, p1",

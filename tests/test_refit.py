@@ -341,7 +341,7 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
 
 
 def test_names_that_do_not_fit(calibration: Calibration, observations: Observations) -> None:
-    with pytest.raises(InputError, match="what="):
+    with pytest.raises(InputError, match="no kind of refit"):
         refit(calibration, observations, "phi")
     with pytest.raises(InputError, match="was not observed"):
         refit(calibration, observations, moved=["elsewhere"])

@@ -333,16 +333,16 @@ def test_new_data_tell_a_camera_that_was_bumped(turned_deg: float, found: str) -
 def test_means_of_regions_tell_a_shift_from_noise() -> None:
     calibration, observations = sample()
     table = diagnose(calibration, observations).table
-    rows, seen = np.flatnonzero(table.inlier), calibration.cameras["overhead"]
-    assert len(significant_means(table, rows, seen).places) <= 1
+    rows, size = np.flatnonzero(table.inlier), calibration.cameras["overhead"].image_size
+    assert len(significant_means(table, rows, size)[0]) <= 1
     left = table.pixel[:, 0] < 640.0
     shift = np.array([0.8, -0.6])
     across = table.residual_px / np.linalg.norm(table.residual_px, axis=1, keepdims=True)
     along = np.where(table.is_curve[:, None], across * np.sum(across * shift, axis=1, keepdims=True), shift)
     moved = replace(table, residual_px=table.residual_px + left[:, None] * along)
-    means = significant_means(moved, rows, seen)
-    assert len(means.places) > 15 and np.all(means.places[:, 0] < 680.0) and means.regions > 60
-    assert np.mean(means.vectors, axis=0) == pytest.approx(shift, abs=0.15)  # 0.05 measured
+    places, vectors, regions = significant_means(moved, rows, size)
+    assert len(places) > 15 and np.all(places[:, 0] < 680.0) and regions > 60
+    assert np.mean(vectors, axis=0) == pytest.approx(shift, abs=0.15)  # 0.05 measured
 
 
 def test_the_distortion_curve_is_the_papers_polynomial() -> None:

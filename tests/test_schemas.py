@@ -47,8 +47,8 @@ def test_what_is_written_obeys_and_what_does_not_is_refused(tmp_path: Path) -> N
     assert data["cameras"]["overhead"]["camera_matrix"][0][0] == data["cameras"]["overhead"]["phi"]
     assert Calibration.load(path).notes == {"lens": "Tamron", "screws": [1, 2]}
     for change, words in (
-        ({"units": "millimetres, radians, pixels"}, r"millimetres.*\$\.units"),
-        ({"pixel_origin": "corner of the top-left pixel"}, r"\$\.pixel_origin"),
+        ({"units": "millimetres, radians, pixels"}, r"millimetres.*in units"),
+        ({"pixel_origin": "corner of the top-left pixel"}, "in pixel_origin"),
         ({"cameras": {"overhead": {**data["cameras"]["overhead"], "phi": 800.0}}}, "camera_matrix is another than"),
     ):
         path.write_text(json.dumps({**data, **change}))

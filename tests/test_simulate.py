@@ -433,17 +433,17 @@ def change(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("broken", "said"),
     [
-        (change("format", to="ceres-cal/observations"), '"format" must be "ceres-cal/scene"'),
+        (change("format", to="ceres-cal/observations"), "it holds observations, where a scene must be given"),
         (change("version", to=2), "version 2 is not known"),
         (change("extra", to=1), "extra"),
         (change("targets", "field", to={"kind": "pitch"}), "target 'field': unknown kind 'pitch'"),
         (change("cameras", "c", "phi", to=-1.0), "camera 'c': intrinsics must be finite"),
-        (change("cameras", "c", "phi", to="long"), "camera 'c': Expected `float`"),
+        (change("cameras", "c", "phi", to="long"), "camera 'c': Expected a number"),
         (
             change("cameras", "c", "lens", "coefficients", to={"k1": 0.1}),
             "camera 'c': lens 'radial' has no coefficient",
         ),
-        (change("cameras", "c", "lens", "kind", to="glass"), "camera 'c': unknown lens 'glass'"),
+        (change("cameras", "c", "lens", "kind", to="glass"), "camera 'c': there is no lens 'glass'"),
         (change("stations", "s", "camera", to="d"), "station 's' names camera 'd', which is not there: there are 'c'"),
         (change("stations", "s", "rotation_vector", to=[0, 0, 0]), "station 's': give its rotation as one of"),
         (change("stations", "s", "position_m", to=[0, 0]), "station 's': "),
@@ -456,7 +456,7 @@ def change(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
         (change("views", 0, "station", to="t"), "view 0 names station 't'"),
         (change("views", 0, "target", to="t"), "view 0 names target 't'"),
         (change("views", 0, "placement", to="q"), "view 0 names placement 'q'"),
-        (change("views", 0, "points", to=["Corner"]), "view 0: point 'Corner' is unknown in target 'field'"),
+        (change("views", 0, "points", to=["Corner"]), "view 0: target 'field' has no point 'Corner'"),
         (change("views", 0, "curves", to=["HalfwayLine"] * 2), "view 0: a curve is named twice"),
         (change("views", 0, "spacing_m", to=0), "view 0: spacing_m must be a positive"),
         (change("views", 0, "side", to="top"), "view 0: side 'top' is unknown"),
@@ -465,7 +465,7 @@ def change(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
         (change("disturbance", to={"outliers": 1.5}), "disturbance: outliers is a share"),
         (change("disturbance", to={"outliers": 0.6, "wrong_labels": 0.6}), "at most 1 in all"),
         (change("disturbance", to={"points_sigma_px": -0.5}), "disturbance: points_sigma_px must be"),
-        (change("disturbance", to={"hidden_stretches": 0.5}), "disturbance: Expected `int`"),
+        (change("disturbance", to={"hidden_stretches": 0.5}), "disturbance: Expected a whole number"),
     ],
 )
 def test_bad_scenes_get_one_line(broken: Callable[[dict[str, Any]], None], said: str, tmp_path: Path) -> None:

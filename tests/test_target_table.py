@@ -148,7 +148,7 @@ def test_what_is_asked_of_a_target_is_its_own() -> None:
     assert smaller.targets["field"] == court(4.0)
     with pytest.raises(InputError, match="does not bow"):
         calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(warp_m=0.001)}))
-    with pytest.raises(InputError, match=r"here.size_m: Expected `float`, got `str`"):
+    with pytest.raises(InputError, match=r"here.size_m: Expected a number, got a text"):
         target_from_spec({"kind": "court", "size_m": "6"}, "here")
 
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import (
     Pose,
     euler_from_rotation,
@@ -92,7 +93,7 @@ def test_a_pose_is_frozen() -> None:
     [(np.eye(4), np.zeros(3), r"rotation must have shape \(3, 3\)"), (np.eye(3), np.zeros((3, 1)), "translation must")],
 )
 def test_wrong_shapes_are_refused(rotation: Array, translation: Array, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(InputError, match=message):
         Pose(rotation, translation)
 
 

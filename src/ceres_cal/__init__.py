@@ -3,7 +3,8 @@
 The names are loaded when they are first used, so that `import ceres_cal` costs nothing.
 """
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.lazy import names_of
 
@@ -16,14 +17,20 @@ if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration as Calibration
     from ceres_cal.calibration.calibrating import calibrate as calibrate
     from ceres_cal.diagnostics.advice import advise as advise
+    from ceres_cal.diagnostics.diagnose import Diagnosis as Diagnosis
+    from ceres_cal.diagnostics.diagnose import diagnose as diagnose
     from ceres_cal.formats import export as export
     from ceres_cal.formats import import_calibration as import_calibration
     from ceres_cal.formats import import_observations as import_observations
+    from ceres_cal.functions import check as check
+    from ceres_cal.functions import detect_board as detect_board
+    from ceres_cal.functions import detect_field as detect_field
+    from ceres_cal.functions import join as join
+    from ceres_cal.functions import refit as refit
+    from ceres_cal.functions import run as run
     from ceres_cal.moves.audits import audit as audit
-    from ceres_cal.moves.checks import check as check
     from ceres_cal.moves.comparisons import compare as compare
     from ceres_cal.moves.refit_plan import RefitOptions as RefitOptions
-    from ceres_cal.moves.refits import refit as refit
     from ceres_cal.moves.scores import score as score
     from ceres_cal.observations import Curves as Curves
     from ceres_cal.observations import Observations as Observations
@@ -56,9 +63,9 @@ _HOME = {
     "DegenerateError": "base.errors",
     "InputError": "base.errors",
     "SolutionError": "base.errors",
-    "refit": "moves.refits",
     "RefitOptions": "moves.refit_plan",
-    "check": "moves.checks",
+    **dict.fromkeys(("check", "detect_board", "detect_field", "join", "refit", "run"), "functions"),
+    **dict.fromkeys(("Diagnosis", "diagnose"), "diagnostics.diagnose"),
     "audit": "moves.audits",
     "compare": "moves.comparisons",
     "score": "moves.scores",
@@ -82,4 +89,8 @@ _HOME = {
     "write_report": "report",
 }
 __all__ = list(_HOME)
-__getattr__ = names_of(__name__, _HOME)
+__getattr__: Callable[[str], Any] = names_of(__name__, _HOME)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -36,6 +36,40 @@ _NOT_KEYS = bytes(set(range(256)) - set(b"{}:"))
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
+_HOLDING = {
+    "ceres-cal/calibration": "a calibration",
+    "ceres-cal/observations": "observations",
+    "ceres-cal/corners": "corners to start from",
+    "ceres-cal/truth": "the truth of a simulation",
+    "ceres-cal/scene": "a scene",
+}
+_KINDS = {
+    **{"array": "a list", "object": "names with values", "float": "a number", "int": "a whole number"},
+    **{"str": "a text", "bool": "true or false", "null": "nothing"},
+}
+"""What msgspec's words for types mean."""
+_MEANING = {  # of fields that may be missing
+    "format": "what the file holds, such as ceres-cal/observations",
+    "version": "of the file's format, 1",
+    "targets": "what was observed, by name",
+    "cameras": "each camera by name",
+    "views": "what each frame shows",
+    "image_size": "width and height in px",
+    "frame": "name of the photograph",
+    "camera": "name of the camera that saw it",
+    "target": "name of what is seen",
+    "features": "names of the points or lines",
+    "pixels": "x and y of each observation, px",
+    "kind": "of the target or the lens",
+    "phi": "the focal length in px",
+    "principal_point": "cx and cy in px",
+    "lens": "its kind and coefficients",
+    "stations": "where each camera stands",
+    "rotation": "a 3 x 3 matrix",
+    "translation_m": "three numbers in m",
+}
+
+
 # ---- limits ---------------------------------------------------------------------------------------------------------
 
 
@@ -92,6 +126,8 @@ def opened(path: str | Path) -> Iterator[IO[bytes]]:
             yield stream
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except TypeError:
+        raise InputError(f"path must be a path, not {type(path).__name__}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
@@ -184,6 +220,11 @@ def _require_finite(value: Any, place: str, where: str) -> None:
 def check_header(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
     """The same data once its "format" and "version" are known to be ours; InputError naming `where` otherwise."""
     stated = data.get("format") if isinstance(data, dict) else None
+    if isinstance(stated, str) and stated in _HOLDING and stated != format_name:
+        raise InputError(
+            f"{where}: it holds {_HOLDING[stated]}, where {_HOLDING.get(format_name, format_name)} must be given: "
+            "were two arguments exchanged?"
+        )
     if stated != format_name:
         raise InputError(f'{where}: "format" must be "{format_name}", not {_clipped(stated)}')
     if data.get("version") != version:
@@ -202,7 +243,54 @@ def convert(data: Any, kind: type[T], where: str) -> T:
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{where}: {error}") from None
+        raise InputError(f"{where}: {_in_plain_words(str(error), data, kind)}") from None
+
+
+def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
+    """What msgspec says, with the place as a path of names, and with what a missing field means."""
+    said, _, path = message.partition(" - at `$")
+    names = _path(path.rstrip("`"), message, data, kind)
+    place = "".join(f"[{name}]" if isinstance(name, int) else f".{name}" for name in names).lstrip(".")
+    if found := re.fullmatch(r"Object missing required field `(\w+)`", said):
+        meaning = _MEANING.get(found[1])
+        text = f"{found[1]!r} is missing{f' ({meaning})' if meaning else ''}"
+        return f"{text} in {place}" if place else text
+    if found := re.fullmatch(r"Object contains unknown field `(.+)`", " ".join(said.split())):
+        return f"there is no field {found[1]!r}{f' in {place}' if place else ''}: remove it, or correct its name"
+    for theirs in set(re.findall(r"`([^`]+)`", said)):
+        said = said.replace(f"`{theirs}`", " or ".join(_KINDS.get(one, one) for one in theirs.split(" | ")))
+    return f"{said}, in {place}" if place else said
+
+
+def _path(path: str, message: str, data: Any, kind: type[Any]) -> list[str | int]:
+    """The names on a path of msgspec's, which has [...] for names in a mapping: those without which all is well."""
+    names: list[str | int] = []
+    here: Any = data
+    for part in re.findall(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]", path):
+        if part[2] and isinstance(here, dict):
+            names.append(next((key for key in here if not _is_well(data, names, key, kind, message)), "..."))
+        elif not part[2]:
+            names.append(int(part[1]) if part[1] else part[0])
+        is_there = names[-1] in here if isinstance(here, dict) else isinstance(here, list)
+        here = here[names[-1]] if is_there else None
+    return names
+
+
+def _is_well(data: Any, names: list[str | int], key: str, kind: type[Any], message: str) -> bool:
+    """Whether the data raise another error, or none, with this entry alone at a place."""
+
+    def alone(value: Any, rest: list[str | int]) -> Any:
+        if not rest:
+            return {key: value[key]}
+        copied: Any = dict(value) if isinstance(value, dict) else list(value)
+        copied[rest[0]] = alone(value[rest[0]], rest[1:])
+        return copied
+
+    try:
+        msgspec.convert(alone(data, names), kind)
+    except msgspec.ValidationError as error:  # quiet: this entry is not the one that the message is about
+        return str(error) != message
+    return True
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any, TypeVar, cast
 
+from ceres_cal.base.words import did_you_mean
+
 _Row = TypeVar("_Row")
 
 
@@ -15,7 +17,7 @@ def names_of(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
 
     def of_name(name: str) -> Any:
         if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            raise AttributeError(f"module {package!r} has no attribute {name!r}{did_you_mean(name, homes)}")
         return getattr(import_module(f"{package}.{homes[name]}"), name)
 
     return of_name

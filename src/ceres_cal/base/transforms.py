@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import numbers_in
 
 _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
 
@@ -146,9 +148,9 @@ class Pose:
 
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
-            value = np.array(getattr(self, name), dtype=float, order="C")  # or products round otherwise
+            value = np.array(numbers_in(getattr(self, name), name), order="C")  # or products round otherwise
             if value.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, not {value.shape}")
+                raise InputError(f"{name} must have shape {shape}, not {value.shape}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
@@ -180,8 +182,10 @@ class Pose:
     @classmethod
     def looking(cls, position: ArrayLike, rotation: ArrayLike) -> Pose:
         """cam_from_world of a camera at `position` (the paper's t): x_cam = R (x_world - t)."""
-        r = np.asarray(rotation, dtype=float)
-        return cls(r, -r @ np.asarray(position, dtype=float))
+        r, place = numbers_in(rotation, "rotation"), numbers_in(position, "position")
+        if r.shape != (3, 3) or place.shape != (3,):
+            raise InputError(f"position and rotation must have shapes (3,) and (3, 3), not {place.shape} and {r.shape}")
+        return cls(r, -r @ place)
 
     def turned(self, turn: ArrayLike) -> Pose:
         """cam_from_world of the camera turned by a rotation vector about its own axes, where it stands."""
@@ -213,7 +217,7 @@ class Pose:
             and np.array_equal(self.translation, other.translation)
         )
 
-    __hash__ = None  # type: ignore[assignment]
+    __hash__: ClassVar[None] = None  # type: ignore[assignment]
 
 
 # ---- very many poses ------------------------------------------------------------------------------------------------

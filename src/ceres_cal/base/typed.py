@@ -1,22 +1,43 @@
-"""Dataclasses that people fill in from Python: every field is of the type that its annotation says."""
+"""Arguments that people give from Python: of the types that are annotated, or one line that names the argument."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
-from typing import Any, get_type_hints
+import inspect
+import numbers
+import os
+from collections.abc import Callable, Mapping
+from functools import cache, wraps
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.words import did_you_mean
+
+P = ParamSpec("P")
+R = TypeVar("R")
+_Class = TypeVar("_Class", bound=type)
+_MOST_LETTERS = 40  # of a wrong value
+_UNIONS: tuple[Any, ...] = (Union, UnionType)
+_ALIKE: Mapping[Any, tuple[type, ...]] = {
+    float: (numbers.Real,),
+    int: (numbers.Integral,),
+    bool: (bool, np.bool_),
+    Path: (str, os.PathLike),
+    str: (str,),
+}
+"""What is taken for a type; for every other class its own instances are."""
 
 
 def take_types(instance: Any) -> None:
-    """Give a new dataclass plain Python values of the types that it annotates: a list for a tuple, and NumPy's numbers,
-    are taken for what they hold.
+    """Give a new dataclass plain Python values of the annotated types: lists for tuples and NumPy's numbers are taken.
 
     Raises:
-        InputError: a value is of another type: names the field.
+        InputError: a value has another type; the message names the field.
     """
     for name, kind in _fields(type(instance)).items():  # type: ignore[arg-type] # a class has a hash
         where = f"{type(instance).__name__}({name}=...)"
@@ -37,3 +58,130 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _plain(entry) for name, entry in value.items()}
     return value
+
+
+# ---- arguments of functions -----------------------------------------------------------------------------------------
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """A public function that raises InputError, naming the argument, for a value of another type than annotated.
+
+    Plain classes, unions of them and literals are checked. Arrays are checked where they are read (`rows`).
+    """
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError as error:
+            raise InputError(f"{function.__name__}(): {error}{_meant(kwargs, signature.parameters)}") from None
+        for name, value in given.items():
+            kinds, many = _kinds(function, name), signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD
+            for own, one in value.items() if many else ((name, value),):
+                if kinds and not _fits(one, kinds):
+                    raise InputError(f"{function.__name__}(): {_wrong(own, one, kinds, function, given)}")
+        return function(*args, **kwargs)
+
+    return call
+
+
+def checked_fields(of: _Class) -> _Class:
+    """A dataclass whose construction names a misspelled field, and the one that was meant."""
+    signature, make = inspect.signature(of), of.__init__  # type: ignore[misc]
+
+    @wraps(make)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        if unknown := [name for name in kwargs if name not in signature.parameters]:
+            meant = did_you_mean(unknown[0], signature.parameters)
+            known = meant or f": there are {', '.join(signature.parameters)}"
+            raise InputError(f"{of.__name__} has no field {unknown[0]!r}{known}")
+        make(self, *args, **kwargs)
+
+    of.__init__ = init  # type: ignore[misc]
+    return of
+
+
+def _meant(given: Mapping[str, Any], known: Mapping[str, Any]) -> str:
+    unknown = [name for name in given if name not in known]
+    return did_you_mean(unknown[0], known) if unknown else ""
+
+
+@cache
+def _every(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
+    """The alternatives of an argument's annotation."""
+    kind = function.__annotations__.get(name, Any)
+    if isinstance(kind, str):
+        try:
+            kind = eval(kind, getattr(inspect.unwrap(function), "__globals__", {}))
+        except NameError:  # quiet: imported for type checkers alone: the function itself reads the value
+            return ()
+    every = get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
+    return tuple(Mapping if get_origin(one) is Mapping else one for one in every)
+
+
+def _is_plain(kind: Any) -> bool:
+    return (isinstance(kind, type) and kind is not Any) or get_origin(kind) is Literal
+
+
+def _kinds(function: Callable[..., Any], name: str) -> tuple[Any, ...]:
+    """What an argument may be; nothing where that cannot be checked by its type."""
+    every = _every(function, name)
+    return every if all(map(_is_plain, every)) else ()
+
+
+def _fits(value: Any, kinds: tuple[Any, ...]) -> bool:
+    return any(
+        value in get_args(one) if get_origin(one) is Literal else isinstance(value, _ALIKE.get(one, one))
+        for one in kinds
+    )
+
+
+def _wrong(name: str, value: Any, kinds: tuple[Any, ...], function: Callable[..., Any], given: dict[str, Any]) -> str:
+    """What is wrong with an argument, and what to give."""
+    expected = [one for one in kinds if one is not NoneType]
+    words = " or ".join(
+        " or ".join(map(repr, get_args(one))) if get_origin(one) is Literal else _named(one) for one in expected
+    )
+    shown = f"{type(value).__name__} {value!r:.{_MOST_LETTERS}}" if isinstance(value, str | int | float) else ""
+    said = f"{name} must be {words}, not {shown or _named(type(value))}"
+    for other, its in given.items():
+        fitting = tuple(filter(_is_plain, _every(function, other)))
+        if other != name and _fits(value, fitting) and _fits(its, kinds):
+            return f"{said}: exchange {name} and {other}"
+    loading = [one for one in expected if hasattr(one, "load")]
+    if loading and isinstance(value, str | os.PathLike):
+        return f"{said}: read the file with {loading[0].__name__}.load"
+    return said
+
+
+def _named(kind: type) -> str:
+    word = {str: "text", Path: "path", int: "whole number", float: "number"}.get(kind, kind.__name__)
+    return f"{'an' if word[0] in 'AEIOUaeio' else 'a'} {word}"
+
+
+# ---- arrays ---------------------------------------------------------------------------------------------------------
+
+
+def numbers_in(values: Any, name: str) -> Array:
+    """An array of numbers; InputError naming the argument for anything else."""
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers, not {type(values).__name__} {values!r:.{_MOST_LETTERS}}") from None
+
+
+def size_in(values: Any, name: str = "image_size") -> tuple[int, int]:
+    """Width and height of an image; InputError naming the argument for anything else."""
+    given = numbers_in(values, name)
+    if given.shape != (2,) or not (np.all(given >= 1.0) and np.all(given == np.round(given))):
+        raise InputError(f"{name} must be (width, height) in px, two positive whole numbers, not {values!r}")
+    return int(given[0]), int(given[1])
+
+
+def rows(values: Any, columns: int, name: str) -> Array:
+    """An array (N, columns) of numbers; InputError naming the argument for anything else."""
+    given = numbers_in(values, name)
+    if given.ndim != 2 or given.shape[1] != columns:
+        raise InputError(f"{name} must have shape (N, {columns}), not {given.shape}")
+    return given

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 
 DASH = "\N{EN DASH}"
@@ -101,6 +101,22 @@ def first_of(names: Sequence[str], most: int = 3) -> str:
     """At most so many names, and how many more there are."""
     more = f" and {grouped(len(names) - most)} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """The end of a message, ": did you mean ...", where a known name is much like this one; else nothing."""
+    from difflib import get_close_matches
+
+    every = {one.lower(): one for one in known}
+    near = get_close_matches(str(name).lower(), every, 1)
+    return f": did you mean {every[near[0]]!r}?" if near else ""
+
+
+def no_such(what: str, name: object, known: Iterable[str]) -> str:
+    """What a message says of a wrong name: the known one that is much like it, else which there are."""
+    every = list(known)
+    listed = f": choose one of {', '.join(every)}" if every else ": none is known"
+    return f"there is no {what} {name!r}{did_you_mean(name, every) or listed}"
 
 
 def sentence(text: str) -> str:

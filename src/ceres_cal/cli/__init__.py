@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
-from ceres_cal.base.words import first_of
+from ceres_cal.base.words import did_you_mean, first_of
 from ceres_cal.base.written import noting
 from ceres_cal.cli import terminal
 from ceres_cal.cli.command import COMMANDS, Command, print_answer
@@ -96,7 +96,7 @@ def _run(arguments: list[str]) -> int:
     command, rest = chosen(arguments)
     options = command.parse(rest)
     answer = command.run(options)
-    print_answer(answer, as_json=options.json)
+    print_answer(answer, as_json=options.json, quiet=getattr(options, "quiet", False))
     return answer.exit_code
 
 
@@ -109,8 +109,13 @@ def chosen(arguments: list[str]) -> tuple[Command, list[str]]:
     if not arguments:
         raise InputError("which command? See `ceres-cal --help`")
     if arguments[0] in _BEGINNINGS:
-        raise InputError(f"{arguments[0]} what? See `ceres-cal {arguments[0]} --help`")
-    raise InputError(f"there is no command {arguments[0]!r}: see `ceres-cal --help`")
+        below = [name for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
+        meant = did_you_mean(" ".join(arguments[:2]), below) if arguments[1:] else ""
+        listed = f": one of {', '.join(below)}?"
+        raise InputError(f"{arguments[0]} what{meant or listed}")
+    typed = arguments[0] if arguments[0].startswith("-") else " ".join(arguments[:2])
+    meant = did_you_mean(typed, COMMANDS) or did_you_mean(arguments[0], COMMANDS)
+    raise InputError(f"there is no command {arguments[0]!r}{meant or ': see `ceres-cal --help`'}")
 
 
 def _overview(beginning: str) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import did_you_mean
 from ceres_cal.cli.options import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:
@@ -152,8 +153,8 @@ def parse_board(text: str) -> tuple[int, int, float]:
     """COLUMNSxROWSxMM: inner corners, and the side of a square in metres."""
     parts = text.split("x")
     if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
-        raise InputError(f"--board {text!r}: write COLUMNSxROWSxMM, such as 9x6x100")
-    return int(parts[0]), int(parts[1]), parse_length(parts[2], f"--board {text!r}", "mm") / 1000.0
+        raise InputError(f"board {text!r}: write COLUMNSxROWSxSQUARE, such as 9x6x25mm")
+    return int(parts[0]), int(parts[1]), parse_length(parts[2], f"board {text!r}", "mm") / 1000.0
 
 
 def parse_names(text: str) -> list[str]:
@@ -178,10 +179,8 @@ class PriorNames(NamedTuple):
         return f"a station has {', '.join(self.station)}{of_camera}"
 
 
-def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Prior:
-    """The prior of a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; InputError that names it."""
-    from ceres_cal.observations import prior_from_json
-
+def prior_parts(spec: str, names: PriorNames) -> tuple[str, str, str, tuple[float, ...]]:
+    """Owner, quantity, values and sigmas of a `--prior` argument; InputError that names it."""
     where = f"--prior {spec!r}"
     left, equals, right = spec.rpartition("=")
     values, colon, sigmas = right.partition(":")
@@ -189,20 +188,32 @@ def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Pri
         raise InputError(f"{where}: write OWNER.NAME=VALUE:SIGMA, such as {PRIOR_EXAMPLE}")
     name, _, quantity = left.strip().rpartition(".")
     if quantity not in (*names.station, *names.camera):
-        raise InputError(f"{where}: {quantity!r} is unknown: {names.known}")
+        meant = did_you_mean(quantity, (*names.station, *names.camera))
+        raise InputError(f"{where}: there is no quantity {quantity!r}{meant or f': {names.known}'}")
+    sigma = _parser_of(quantity)(sigmas, f"{where}: sigma")
+    if min(sigma) <= 0.0:
+        raise InputError(f"{where}: sigma must be above 0")
+    return name, quantity, values, sigma
+
+
+def _parser_of(quantity: str) -> Callable[[str, str], tuple[float, ...]]:
+    return parse_lengths if quantity.endswith("_m") else parse_numbers
+
+
+def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Prior:
+    """The prior of a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; InputError that names it."""
+    from ceres_cal.observations import prior_from_json
+
+    where, (name, quantity, values, sigma) = f"--prior {spec!r}", prior_parts(spec, names)
     owner, known = ("station", observations.stations) if quantity in names.station else ("camera", observations.cameras)
     if not name and len(known) == 1:
         name = next(iter(known))
     if name not in known:
         raise InputError(f"{where}: name one {owner} before the dot: {', '.join(known)}")
-    parse = parse_lengths if quantity.endswith("_m") else parse_numbers
-    sigma = parse(sigmas, f"{where}: sigma")
-    if min(sigma) <= 0.0:
-        raise InputError(f"{where}: sigma must be above 0")
     return prior_from_json(
         {
             owner: name,
-            quantity: list(parse(values, where)),
+            quantity: list(_parser_of(quantity)(values, where)),
             "sigma_m" if owner == "station" else "sigma": sigma[0] if len(sigma) == 1 else list(sigma),
         },
         where,

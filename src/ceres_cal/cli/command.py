@@ -11,7 +11,7 @@ from typing import Any, NoReturn, get_type_hints
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.lazy import LazyTable
-from ceres_cal.base.words import sentence
+from ceres_cal.base.words import did_you_mean, sentence
 from ceres_cal.cli.options import Arguments, add_options, filled
 from ceres_cal.cli.terminal import coloured, in_colour
 from ceres_cal.report.document import Document
@@ -25,7 +25,12 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")  # argparse's own from Python 3.14 on
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message}: see `{self.prog} --help`")
+        meant = ""
+        if wrong := re.match(r"unrecognized arguments: (-[\w-]+)", message):
+            meant = did_you_mean(wrong[1], self._option_string_actions)
+        elif wrong := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
+            meant = did_you_mean(wrong[1], re.findall(r"[\w.-]+", wrong[2]))
+        raise InputError(f"{message}{meant or f': see `{self.prog} --help`'}")
 
 
 @dataclass(frozen=True)
@@ -77,9 +82,11 @@ def command(name: str, summary: str, *examples: str) -> Callable[[Callable[[Any]
     return lambda run: Command(name, summary, run, examples)
 
 
-def print_answer(answer: Document, *, as_json: bool) -> None:
-    """Print an answer."""
-    if as_json:
+def print_answer(answer: Document, *, as_json: bool, quiet: bool = False) -> None:
+    """Print an answer; with --quiet its one line."""
+    if quiet and not as_json:
+        print(answer.one_line)
+    elif as_json:
         from ceres_cal.base.files import json_text
 
         print(json_text(answer.data))

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.images import images_and_videos
 from ceres_cal.cli.arguments import frames_option, length
 from ceres_cal.cli.command import command
-from ceres_cal.cli.files import finishing, images_and_videos, read_target, require_observations_output
+from ceres_cal.cli.files import finishing, read_target, require_observations_output
 from ceres_cal.cli.options import QuietArguments, argument, flag, option, switch
-from ceres_cal.cli.photographs import DetectArguments, detected, frames_of_videos, missed_section
+from ceres_cal.cli.photographs import DetectArguments, detected, missed_section
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -66,16 +67,17 @@ def _run_board(args: BoardArguments) -> Document:
     require_observations_output(args.output, [*images, *videos])
     from ceres_cal.detect.boards import detect_boards
     from ceres_cal.detect.charuco import CharucoSpec
+    from ceres_cal.detect.video import frames_of_videos
 
     corners: str | CharucoSpec = args.corner_fit
     if args.charuco is not None and args.marker is not None:
         corners = CharucoSpec(args.charuco, args.marker, args.legacy)
     elif args.charuco is not None or args.marker is not None:
-        raise InputError("--charuco DICT and --marker M go together: give both or neither")
+        raise InputError("--charuco DICT and --marker M belong together: give both or neither")
     board = _board(args)
     with progress_bar(args) as bar:
-        images += detected(args.timeout, partial(frames_of_videos, videos, args.frames, args.output.parent, bar))
-    with progress_bar(args) as bar:
+        taken = partial(frames_of_videos, videos, args.frames, args.output.parent, bar.update)
+        images += detected(args.timeout, taken)
         found = partial(detect_boards, images, board, args.camera, args.station, corners, bar.update)
         detections = detected(args.timeout, found)
     with finishing():

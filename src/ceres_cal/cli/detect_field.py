@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.images import images_and_videos
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import (
     estimate_option,
@@ -21,14 +22,15 @@ from ceres_cal.cli.arguments import (
     timeout_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.files import finishing, images_and_videos, json_object, read_target, require_observations_output
+from ceres_cal.cli.files import finishing, json_object, read_target, require_observations_output
 from ceres_cal.cli.options import QuietArguments, argument, option, switch
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.detect.photographs import Auto, Clicks, Facing, FieldDetections, SearchResult
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.detect.photographs import Clicks, FieldDetections, SearchResult
     from ceres_cal.scene.camera import Camera
     from ceres_cal.scene.targets import Target
 
@@ -97,25 +99,29 @@ def _run(args: FieldArguments) -> Document:
     require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
     one = median_path(args.output, [*images, *videos]) if videos or args.median else None
     _require_fitting(args)
-    from ceres_cal.detect.images import read_grey
-    from ceres_cal.detect.photographs import FieldOptions, detect_field
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.functions import detect_field, field_of
 
-    start = _start(args)
-    target = start.target if args.target is None else read_target(args.target, "field")
+    start = _corners(args.corner) if args.corner else None if args.start is None else _start(args.start, auto=args.auto)
+    target = read_target(args.target, "field") if args.target else None
+    if target is None and isinstance(start, Calibration):
+        target = field_of(start)
     if target is None:
         raise InputError("name the field with --target, such as --target ssl-b")
-    not_painted = parse_names(args.not_painted)
-    if unknown := sorted(set(not_painted) - target.curves.keys()):
-        raise InputError(f"--not-painted: curve {unknown[0]!r} is not one of the target's: see `ceres-cal targets`")
-    painted = [name for name in target.curves if name not in not_painted]
-    options = FieldOptions(
-        start.camera,
-        start.station,
-        points=not args.lines_only,
+    look = partial(
+        detect_field,
+        target=target,
+        start=start,
+        auto=args.auto,
+        facing=dict(map(_facing, args.facing)),
+        not_painted=parse_names(args.not_painted),
+        estimate=parse_estimates(args.estimate, {"field": target}),
+        mask=args.mask,
         edges=args.edges,
-        lengths=parse_estimates(args.estimate, {"field": target}),
-        left_out=None if args.mask is None else read_grey(args.mask) == 0,
+        lines_only=args.lines_only,
         keep_start=args.keep_start,
+        camera=args.camera,
+        station=args.station,
         refused=_drawing(args.picture, target),
     )
     merged = None
@@ -124,8 +130,7 @@ def _run(args: FieldArguments) -> Document:
             merged = detected(args.timeout, partial(write_median, one, images, videos, bar))
         images = [one]
     with progress_bar(args) as bar:
-        found = partial(detect_field, images, target, start.start, painted, options, bar.update)
-        detections = detected(args.timeout, found)
+        detections = detected(args.timeout, partial(look, images, progress=bar.update))
     with finishing():
         detections.observations.save(args.output)
     return Document(tuple(_sections(detections, merged, args.output)))
@@ -163,50 +168,22 @@ def _require_fitting(args: FieldArguments) -> None:
 # ---- where to start -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _FieldStart:
-    start: Camera | Clicks | Auto
-    camera: str
-    station: str
-    target: Target | None
-
-
-def _start(args: FieldArguments) -> _FieldStart:
-    camera = args.camera or "camera"
-    if args.start is None:
-        start = _auto(args.facing, None) if args.auto else _corners(args.corner)
-        return _FieldStart(start, camera, args.station or camera, None)
+def _start(path: Path, *, auto: bool) -> Calibration | Clicks:
     from ceres_cal.calibration import FORMAT, Calibration
-    from ceres_cal.detect.photographs.clicks import load_clicks
-    from ceres_cal.detect.photographs.known import is_painted
+    from ceres_cal.detect.photographs import load_clicks
 
-    if json_object(args.start).get("format") != FORMAT:
-        if args.auto:
-            raise InputError(f"{args.start}: with --auto only a calibration is of use: leave out --auto, or the file")
-        return _FieldStart(load_clicks(args.start), camera, args.station or camera, None)
-    calibration = Calibration.load(args.start)
-    posed = calibration.station(args.station)
-    station = args.station or next(iter(calibration.stations))
-    fields = [target for target in calibration.targets.values() if is_painted(target)]
-    name = args.camera or calibration.estimate.stations[station].camera
-    return _FieldStart(
-        _auto(args.facing, posed) if args.auto else posed, name, station, fields[0] if len(fields) == 1 else None
-    )
+    if json_object(path).get("format") == FORMAT:
+        return Calibration.load(path)
+    if auto:
+        raise InputError(f"{path}: --auto takes a calibration as start, no corners: leave out --auto, or the file")
+    return load_clicks(path)
 
 
-def _auto(facing: Sequence[str], before: Camera | None) -> Auto:
-    from ceres_cal.detect.photographs import Auto
-
-    return Auto(tuple(_facing(spec) for spec in facing), before)
-
-
-def _facing(spec: str) -> Facing:
-    from ceres_cal.detect.photographs import SIDES, Facing
-
+def _facing(spec: str) -> tuple[str, str]:
     name, equals, side = (part.strip() for part in spec.partition("="))
-    if not (name and equals and side in SIDES):
-        raise InputError(f"--facing {spec!r}: write NAME=SIDE, such as {_FACING}; a side is one of {', '.join(SIDES)}")
-    return Facing(name, side)
+    if not (name and equals and side):
+        raise InputError(f"--facing {spec!r}: write NAME=SIDE, such as {_FACING}")
+    return name, side
 
 
 def _corners(specs: Sequence[str]) -> Clicks:

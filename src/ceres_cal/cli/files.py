@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import signal
 import threading
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.images import image_files
+from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import ReportArguments
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Section
@@ -25,37 +26,7 @@ if TYPE_CHECKING:
     from ceres_cal.report import FramePhotographs
     from ceres_cal.scene.targets import Target
 
-IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
-VIDEO_ENDINGS = {".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 T = TypeVar("T")
-
-
-def images_and_videos(given: Iterable[str]) -> tuple[list[Path], list[Path]]:
-    """The images as `image_files` has them, and the videos among what is given."""
-    files = image_files(given)
-    videos = [path for path in files if path.suffix.lower() in VIDEO_ENDINGS]
-    return [path for path in files if path not in videos], videos
-
-
-def image_files(given: Iterable[str]) -> list[Path]:
-    """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
-    return [path for name in given for path in _files(name)]
-
-
-def _files(name: str) -> Iterator[Path]:
-    path = Path(name)
-    if path.is_dir():
-        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
-        if not inside:
-            raise InputError(f"{name}: there are no images in this folder")
-        yield from inside
-    elif path.exists():
-        yield path
-    else:
-        matches = sorted(glob.glob(name))  # noqa: PTH207, Path.glob refuses absolute patterns
-        if not matches:
-            raise InputError(f"{name}: no such file")
-        yield from map(Path, matches)
 
 
 def spelled_target(text: str, where: str) -> Target | None:
@@ -70,15 +41,14 @@ def spelled_target(text: str, where: str) -> Target | None:
 
 def read_target(text: str, name: str) -> Target:
     """The target of `--target`: by its name, spelled out, or in a file, alone or as one of that name among several."""
-    from ceres_cal.scene.targets import target_from_spec, targets_by_name
+    from ceres_cal.scene.targets import target_from_spec, target_named, targets_by_name
 
     if (spelled := spelled_target(text, "--target")) is not None:
         return spelled
-    by_name = targets_by_name()
-    if text in by_name:
-        return by_name[text]
+    if (known := target_named(text)) is not None:
+        return known
     if not Path(text).exists():
-        raise InputError(f"--target {text!r}: neither {' nor '.join(by_name)}, nor a file")
+        raise InputError(f"--target: {no_such('target', text, targets_by_name())} (or a file)")
     content = json_object(Path(text))
     named = content.get("targets")
     spec = named.get(name) if isinstance(named, dict) else content

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
 from ceres_cal.cli.command import command
 from ceres_cal.cli.export import format_options, import_forms, listed, losses
@@ -47,7 +48,7 @@ def _import(args: ImportArguments) -> Document:
 
     require_output(args.output, [args.file])
     if args.form is not None and args.form not in import_forms():
-        raise InputError(f"there is no format {args.form!r} to read: choose one of {', '.join(import_forms())}")
+        raise InputError(no_such("import format", args.form, import_forms()))
     forms = list(import_forms().values()) if args.form is None else [import_forms()[args.form]]
     given = read_foreign(args.file, args.form, **format_options(args.options, forms))
     with finishing():

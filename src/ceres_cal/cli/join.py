@@ -62,6 +62,8 @@ def _moments(observations: Observations) -> Counter[int]:
 
 
 def _sections(labels: Labels, args: JoinArguments) -> Iterator[Section]:
+    from ceres_cal.start.same_labels import open_words
+
     by_count = sorted(_moments(labels.observations).items())
     rule = "of one name" if args.same_frame is None else f"by {args.same_frame!r}"
     seen = ", ".join(f"{number} seen by {plural(count, 'camera')}" for count, number in reversed(by_count))
@@ -71,9 +73,5 @@ def _sections(labels: Labels, args: JoinArguments) -> Iterator[Section]:
     turned = wrapped(f"turned, to be those of the first camera: {which}") if which else []
     yield Section("labels", turned, {"turned": labels.turned, "open": labels.open})
     for station in labels.open:
-        text = (
-            f"station {station!r}: nothing tells which way round its boards are labelled: show the board to it "
-            "and to the first camera at once in more poses, or take a board of odd columns + rows"
-        )
-        yield Section("warning", wrapped(text))
+        yield Section("warning", wrapped(open_words(station)))
     yield Section("written", [str(args.output)], {"output": str(args.output)})

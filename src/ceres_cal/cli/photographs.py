@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.images import image_files
 from ceres_cal.base.native import interruptibly
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import (
@@ -17,7 +18,7 @@ from ceres_cal.cli.arguments import (
     station_option,
     timeout_option,
 )
-from ceres_cal.cli.files import finishing, image_files, require_different, require_output
+from ceres_cal.cli.files import finishing, require_different, require_output
 from ceres_cal.cli.options import Arguments, QuietArguments, argument, option
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
@@ -105,24 +106,6 @@ def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
 
 
 # ---- videos and medians ---------------------------------------------------------------------------------------------
-
-
-def frames_of_videos(videos: Sequence[Path], count: int, folder: Path, bar: ProgressBar) -> list[Path]:
-    """The sharpest frames of videos, each written into a folder of its name.
-
-    Args:
-        count: of each, --frames.
-
-    Raises:
-        InputError: what cannot be read, or --frames below 1.
-    """
-    if count < 1:
-        raise InputError(f"--frames must be at least 1, not {count}")
-    if not videos:
-        return []
-    from ceres_cal.detect.video import sharpest_frames
-
-    return [path for one in videos for path in sharpest_frames(one, folder / one.stem, count, bar.update)]
 
 
 def median_path(output: Path, inputs: Sequence[Path]) -> Path:

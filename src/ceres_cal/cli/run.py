@@ -9,19 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
-from ceres_cal.base.words import plural
+from ceres_cal.base.images import IMAGE_ENDINGS, images_and_videos
+from ceres_cal.base.words import no_such, plural
 from ceres_cal.cli.arguments import (
+    PriorNames,
     estimate_option,
     frames_option,
     not_painted_option,
     output_option,
     parse_board,
+    parse_estimates,
+    parse_names,
     prior_option,
+    prior_parts,
 )
 from ceres_cal.cli.command import COMMANDS, command
-from ceres_cal.cli.files import IMAGE_ENDINGS, attempted, images_and_videos
+from ceres_cal.cli.files import attempted, read_target
 from ceres_cal.cli.options import QuietArguments, argument, option
-from ceres_cal.cli.photographs import frames_of_videos
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -68,10 +72,7 @@ class _Step:
     "boards.mp4 --board 9x6x25mm -o camera/",
 )
 def _run(args: RunArguments) -> Document:
-    if args.target is None and args.board is None:
-        raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
-    if args.board is not None:
-        parse_board(args.board)
+    _require_fitting(args)
     from ceres_cal.base.files import make_folder
     from ceres_cal.formats import export_format
 
@@ -94,6 +95,35 @@ def _run(args: RunArguments) -> Document:
     return Document((Section(data=data), *_sections(args, images, steps, level)), 0 if made else 1)
 
 
+def _require_fitting(args: RunArguments) -> None:
+    """Raise InputError, before any photograph is read, for names, sizes and units that no later step would take."""
+    if args.target is None and args.board is None:
+        raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
+    if args.board is not None:
+        parse_board(args.board)
+    COMMANDS["calibrate"].parse(["observations.json", "--lens", args.lens])
+    if args.prior:
+        from ceres_cal.problem.parameters import Options
+
+        quantities = (*Options(lens=args.lens).intrinsic_names, "principal_point")
+        for spec in args.prior:
+            prior_parts(spec, PriorNames(("height_m", "position_m"), quantities))
+    if args.target is not None:
+        target = read_target(args.target, "field")
+        parse_estimates(args.estimate, {"field": target})
+        if args.facing:
+            from ceres_cal.detect.photographs import SIDES
+        for spec in args.facing:
+            name, _, side = map(str.strip, spec.partition("="))
+            if side not in SIDES:
+                raise InputError(f"--facing {spec!r}: write NAME=SIDE; {no_such('side', side, SIDES)}")
+            if name not in (*target.curves, *target.point_index):
+                raise InputError(f"--facing: {no_such('line or point', name, (*target.curves, *target.point_index))}")
+        for name in parse_names(args.not_painted):
+            if name not in target.curves:
+                raise InputError(f"--not-painted: {no_such('line', name, target.curves)}")
+
+
 # ---- the steps ------------------------------------------------------------------------------------------------------
 
 
@@ -106,6 +136,8 @@ def _step(
 ) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
     quiet = ["--quiet"] if (args.quiet or args.json) and name != "export" else []
+    with progress_bar(args) as bar:
+        bar.say(f"now       {_short(_typed(name, arguments))}")
     answer = COMMANDS[name].run(COMMANDS[name].parse([*arguments, *quiet]))
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
     lines = [*answer.text(titles).splitlines()[:most], *missed]
@@ -124,10 +156,11 @@ def _typed(name: str, arguments: Sequence[str]) -> str:
 
 def _photographs(args: RunArguments) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
+    from ceres_cal.detect.video import frames_of_videos
+
     images, videos = images_and_videos(args.images)
     with progress_bar(args) as bar:
-        images += frames_of_videos(videos, args.frames, args.output, bar)
-    return images
+        return [*images, *frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 
 def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:

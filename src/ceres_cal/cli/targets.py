@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import output_option
+from ceres_cal.base.words import no_such
+from ceres_cal.cli.arguments import output_option, parse_board
 from ceres_cal.cli.command import command
 from ceres_cal.cli.files import finishing, require_ending, require_output, spelled_target
 from ceres_cal.cli.options import Arguments, argument, option
@@ -15,6 +17,8 @@ from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.scene.targets import Curve, Target, TargetKind
+
+_BOARD = re.compile(r"\d+x\d+x.+")
 
 
 def _help() -> str:
@@ -77,14 +81,15 @@ def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
 class PrintArguments(Arguments):
     """What to print."""
 
-    target: str = argument("BOARD", 'as `ceres-cal targets` has it, or {"kind": ...} as in files')
+    target: str = argument("BOARD", 'such as 9x6x25mm, as `ceres-cal targets` has it, or {"kind": ...} as in files')
     output: Path = output_option("the sheet (.pdf)")
 
 
 @command(
     "targets print",
     "a board as a PDF to print to scale, with a ruler on it",
-    '\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',
+    "9x6x25mm -o board.pdf",
+    '\'{"kind": "rings", "radii_m": [0.05, 0.1]}\' -o rings.pdf',
 )
 def _print(args: PrintArguments) -> Document:
     require_output(args.output, [])
@@ -105,7 +110,7 @@ def _print(args: PrintArguments) -> Document:
 
 
 def _targets(wanted: str) -> dict[str, Target]:
-    from ceres_cal.scene.targets import TARGET_KINDS, targets_by_name
+    from ceres_cal.scene.targets import TARGET_KINDS, checkerboard, targets_by_name
 
     if wanted in TARGET_KINDS:
         return TARGET_KINDS[wanted].examples()
@@ -114,10 +119,12 @@ def _targets(wanted: str) -> dict[str, Target]:
     by_name = targets_by_name()
     if wanted in by_name:
         return {wanted: by_name[wanted]}
+    if _BOARD.fullmatch(wanted):
+        return {"board": checkerboard(*parse_board(wanted))}
     if wanted.endswith((".json", ".npz")) or Path(wanted).exists():
         return _targets_in(Path(wanted))
     names = (*TARGET_KINDS, *by_name)
-    raise InputError(f"there is no target {wanted!r}: choose one of {', '.join(names)}, or name a file of observations")
+    raise InputError(f"{no_such('target', wanted, names)} (or a board such as 9x6x25mm, or a file of observations)")
 
 
 def _targets_in(path: Path) -> dict[str, Target]:

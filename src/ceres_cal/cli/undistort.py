@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import frame_of
+from ceres_cal.base.images import image_files
+from ceres_cal.base.words import frame_of, no_such
 from ceres_cal.cli.arguments import (
     calibration_argument,
     height_option,
@@ -20,7 +21,7 @@ from ceres_cal.cli.arguments import (
     station_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.files import finishing, image_files, read_calibration
+from ceres_cal.cli.files import finishing, read_calibration
 from ceres_cal.cli.options import QuietArguments, argument, given_of, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -168,7 +169,7 @@ def _station(args: UndistortArguments, calibration: Calibration) -> str:
     if args.station is not None:
         calibration.station(args.station)  # or says which there are
     if args.camera is not None and args.camera not in calibration.cameras:
-        raise InputError(f"camera {args.camera!r} is not there: there are {', '.join(map(repr, calibration.cameras))}")
+        raise InputError(no_such("camera", args.camera, calibration.cameras))
     fitting = [
         name
         for name, station in stations.items()

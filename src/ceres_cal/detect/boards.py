@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.threads import in_turn
-from ceres_cal.base.words import frame_of, printable
+from ceres_cal.base.words import frame_of, no_such, printable
 from ceres_cal.detect.april_grids import measured_april_grid
 from ceres_cal.detect.charuco import CharucoSpec, charuco_detector
 from ceres_cal.detect.circles import measured_circles
@@ -177,7 +177,7 @@ def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
 
 def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
     if isinstance(corners, str) and corners not in CORNER_FITS:
-        raise InputError(f"unknown corner fit {corners!r}: choose one of {', '.join(CORNER_FITS)}")
+        raise InputError(no_such("corner fit", corners, CORNER_FITS))
     columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")

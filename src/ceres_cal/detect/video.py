@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,8 +122,21 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
 
 
 def _sharpness(frame: Image) -> float:
-    """The variance of the Laplacian, in a picture of half a megapixel at most: blur by less does not matter."""
+    """The variance of the Laplacian, in half a megapixel at most: what is blurred by less does not matter."""
     judged_px = 5e5
     scale = min(1.0, float(np.sqrt(judged_px / (frame.shape[0] * frame.shape[1]))))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return float(np.var(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_32F)))
+
+
+def frames_of_videos(
+    videos: Sequence[Path], count: int, folder: Path, progress: ImageProgress | None = None
+) -> list[Path]:
+    """The sharpest frames of each video, written into a folder of its name.
+
+    Raises:
+        InputError: a video cannot be read, or count is below 1.
+    """
+    if count < 1:
+        raise InputError(f"frames must be at least 1, not {count}")
+    return [path for one in videos for path in sharpest_frames(one, folder / one.stem, count, progress)]

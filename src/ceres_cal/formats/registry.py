@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import read_bytes
+from ceres_cal.base.typed import checked
+from ceres_cal.base.words import no_such
 from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportFormat, ImportRequest
@@ -52,11 +54,11 @@ IMPORT_FORMATS: dict[str, ImportFormat] = {
 def export_format(name: str) -> ExportFormat:
     """The format of a name; InputError where there is none."""
     if name not in EXPORT_FORMATS:
-        known = f"choose one of {', '.join(EXPORT_FORMATS)}" if EXPORT_FORMATS else "no format is registered"
-        raise InputError(f"there is no export format {name!r}: {known}")
+        raise InputError(no_such("export format", name, EXPORT_FORMATS))
     return EXPORT_FORMATS[name]
 
 
+@checked
 def export(
     calibration: Calibration,
     to: str,
@@ -124,6 +126,7 @@ def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> C
     return made
 
 
+@checked
 def import_calibration(path: str | Path, form: str | None = None, **options: Any) -> Calibration:
     """The calibration that a file of another program holds: see `read_foreign`.
 
@@ -138,6 +141,7 @@ def import_calibration(path: str | Path, form: str | None = None, **options: Any
     return given
 
 
+@checked
 def import_observations(path: str | Path, form: str | None = None, **options: Any) -> Observations:
     """The observations that a file of another program holds: see `read_foreign`.
 
@@ -156,7 +160,7 @@ def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat
     known = ", ".join(IMPORT_FORMATS)
     if name is not None:
         if name not in IMPORT_FORMATS:
-            raise InputError(f"there is no format {name!r} to read: choose one of {known}")
+            raise InputError(no_such("import format", name, IMPORT_FORMATS))
         return IMPORT_FORMATS[name]
     for form in IMPORT_FORMATS.values():
         if (path.name.endswith(form.endings) if form.endings else path.is_dir()) and form.recognises(content):
@@ -187,5 +191,5 @@ def _known_options(form: ExportFormat | ImportFormat, options: Mapping[str, Any]
     known = [one.name for one in fields(form.options)]
     for name in options:
         if name not in known:
-            raise InputError(f"format {form.name} has no option {name!r}: there are {', '.join(known) or 'none'}")
+            raise InputError(no_such(f"option of format {form.name}", name, known))
     return options

@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.shown import brief, text_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations
@@ -43,6 +44,8 @@ class FieldDifference(ErrorMap):
     expected_mm: Array
     lost: Mask
 
+    __repr__ = brief
+
     @property
     def errors_mm(self) -> Array:
         """(Y, X) length of the difference; NaN where the first does not show the place."""
@@ -70,7 +73,7 @@ def _root_mean_square(values: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class MapChange:
     """A station from one camera to another.
 
     Attributes:
@@ -83,6 +86,8 @@ class Change:
     phi_px: tuple[float, float]
     shift_px: float
     maps: tuple[FieldDifference, ...]
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +107,8 @@ class ImageDifference:
     difference_px: Array
     angles_deg: Array
     turn_deg: float
+
+    __repr__ = brief
 
     @property
     def errors_px(self) -> Array:
@@ -153,12 +160,14 @@ class Agreement:
     degrees: int = 0
     words: str = ""
     cause: str | None = None
-    change: Change | None = None
+    change: MapChange | None = None
     image: ImageDifference | None = None
     misfit: Misfit = field(default_factory=Misfit)
     views: tuple[Agreement, ...] = ()
     pose_free: bool = False
     solution: Calibration | None = None
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +193,10 @@ class Agreements(Mapping[str, Agreement]):
     def exit_code(self) -> int:
         """1 where one does not hold."""
         return int(self.holds is False)
+
+    def __repr__(self) -> str:
+        holds = "" if self.holds is None else f", holds: {self.holds}"
+        return text_of((f"Agreements of {len(self)}{holds}", [(name, one.words) for name, one in self.items()]))
 
     def __getitem__(self, name: str) -> Agreement:
         return self.answers[name]
@@ -261,7 +274,7 @@ def change_of(
     after: Camera,
     grids: Sequence[FieldGrid],
     known: Callable[[FieldGrid], Array] | None = None,
-) -> Change:
+) -> MapChange:
     """How a station differs from what an estimate says of it.
 
     Args:
@@ -279,7 +292,7 @@ def change_of(
         places = np.column_stack([grid.places, np.full(len(seen), grid.height_m)])
         shifts = np.linalg.norm(seen - after.project(places), axis=1)
     turned_deg, phi_px = float(np.degrees(turn)), (camera.phi, after.phi)
-    return Change(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
+    return MapChange(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
 
 
 def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Array) -> FieldDifference:

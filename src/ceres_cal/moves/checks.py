@@ -17,13 +17,14 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.agreement import (
     FALSE_ALARMS,
     Agreement,
     Agreements,
-    Change,
+    MapChange,
     Misfit,
     change_of,
     field_grids,
@@ -57,6 +58,7 @@ _WILL_DO = 10.8
 _USUAL_EQUATIONS = 4.0
 
 
+@checked
 @numerical("the check")
 def check(
     calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1
@@ -242,7 +244,7 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
     return answer if misfit is None else replace(answer, misfit=misfit)
 
 
-def _words(holds: bool, probability: float, misfit: Misfit, change: Change) -> str:
+def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -> str:
     worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
     if holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""

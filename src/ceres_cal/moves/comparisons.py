@@ -14,6 +14,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreement, Agreements, ImageDifference, change_of
 from ceres_cal.moves.contrast import NormalDistribution, contrast
@@ -25,6 +26,7 @@ from ceres_cal.problem.quantities import difference
 from ceres_cal.problem.structure import EXACT
 
 
+@checked
 @numerical("the comparison")
 def compare(a: Calibration, b: Calibration, height_m: float = 0.0, station: str | None = None) -> Agreements:
     """Compare two calibrations, station by station.

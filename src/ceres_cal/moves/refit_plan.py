@@ -9,6 +9,8 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked_fields
+from ceres_cal.base.words import no_such
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import matched, require_posterior
 from ceres_cal.moves.labels import TURNED, relabelled
@@ -26,6 +28,7 @@ WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
 LABELS = ("check", "as-given", "turned")
 
 
+@checked_fields
 @dataclass(frozen=True)
 class RefitOptions:
     """What a refit takes for granted.
@@ -45,7 +48,7 @@ class RefitOptions:
 
     def __post_init__(self) -> None:
         if self.labels not in LABELS:
-            raise InputError(f"labels={self.labels!r} is unknown: choose one of {', '.join(LABELS)}")
+            raise InputError(no_such("way to take labels", self.labels, LABELS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +111,7 @@ def make_plan(
         SolutionError: another camera or another field than those calibrated, by image size or dimensions.
     """
     if what not in WHAT:
-        raise InputError(f"what={what!r} is unknown: choose one of {', '.join(WHAT)}")
+        raise InputError(no_such("kind of refit (what)", what, WHAT))
     require_posterior(calibration)
     observed = matched(calibration, observations)
     observations = calibration.drawn_alike(observations)

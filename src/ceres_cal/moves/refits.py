@@ -14,6 +14,7 @@ import numpy as np
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.calibration.calibrating import Again, Watched, solved_from
 from ceres_cal.moves.explanations import (
@@ -40,6 +41,7 @@ _UNIQUE = 8
 _SMALL = (0.3, np.deg2rad(15.0))
 
 
+@checked
 @numerical("the refit")
 def refit(
     calibration: Calibration,

@@ -11,6 +11,7 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import Again, solved_from
 from ceres_cal.moves.agreement import Agreement, Agreements, Misfit, matched, require_stations
@@ -26,6 +27,7 @@ from ceres_cal.start.chaining import chained_poses
 from ceres_cal.start.initialise import Start
 
 
+@checked
 @numerical("the score")
 def score(
     calibration: Calibration,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.typed import take_types
+from ceres_cal.base.typed import checked_fields, take_types
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ _OFFSET = ".offset_m"
 PRIOR_OWNERS = ("camera", "station", "target")
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Prior:
     """What is known beforehand: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
@@ -89,7 +90,13 @@ class Prior:
         return cls("target", target, f"{curve}{_OFFSET}", (0.0,), (sigma_m,))
 
 
-TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
+TYPES: dict[str, type[np.generic]] = {
+    "view": np.int32,
+    "feature": np.int32,
+    "pixels": np.float64,
+    "sigma_px": np.float64,
+    "side": np.int8,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,8 +249,3 @@ def _block(columns: C, number: int) -> tuple[int, C]:
 def view_label(number: int, views: Sequence[View]) -> str:
     """How messages name a view."""
     return f"view {number} (frame {views[number].frame!r})"
-
-
-def choices(names: Iterable[str]) -> str:
-    """How messages say what there is."""
-    return "there are " + (", ".join(map(repr, names)) or "none")

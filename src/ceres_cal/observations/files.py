@@ -27,6 +27,7 @@ from ceres_cal.base.files import (
     read_bytes,
     write_bytes,
 )
+from ceres_cal.base.words import did_you_mean, no_such
 from ceres_cal.observations.columns import (
     NO_CURVES,
     NO_POINTS,
@@ -36,7 +37,6 @@ from ceres_cal.observations.columns import (
     Points,
     Prior,
     View,
-    choices,
     view_label,
 )
 from ceres_cal.observations.folders import ENDING, HEADER, read_folder, write_folder
@@ -190,9 +190,7 @@ def _from_json(content: bytes, where: str) -> Content:
     targets, views = header.targets, header.views
     for number, view in enumerate(views):
         if view.target not in targets:
-            raise InputError(
-                f"{view_label(number, views)} names target {view.target!r}, which is not there: {choices(targets)}"
-            )
+            raise InputError(f"{view_label(number, views)}: {no_such('target', view.target, targets)}")
     points = [(i, entry.points) for i, entry in enumerate(data.views) if entry.points is not None]
     curves = [(i, entry.curves) for i, entry in enumerate(data.views) if entry.curves is not None]
     point_index = {name: target.point_index for name, target in targets.items()}
@@ -229,8 +227,8 @@ def _columns(
             feature.append([names[name] for name in features])
         except KeyError as error:
             raise InputError(
-                f"{here}: {kind} feature {error.args[0]!r} is unknown in target {views[number].target!r}: "
-                "`ceres-cal targets` lists the names"
+                f"{here}: target {views[number].target!r} has no {kind} {error.args[0]!r}"
+                f"{did_you_mean(error.args[0], names) or ':'} `ceres-cal targets` lists the names"
             ) from None
         if isinstance(entry.sigma_px, list) and len(entry.sigma_px) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.sigma_px)} numbers in sigma_px")

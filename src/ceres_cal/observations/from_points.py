@@ -1,4 +1,4 @@
-"""Observations from what detectors give: pixels by frame, and what they show."""
+"""Observations from arrays, as detectors give them: pixels by frame or by line, and what they show."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import NO_CURVES, Points, View
+from ceres_cal.base.typed import numbers_in, rows, size_in
+from ceres_cal.base.words import no_such
+from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Curves, Points, View
 from ceres_cal.observations.files import Content
+from ceres_cal.scene.curves import SIDES
 from ceres_cal.scene.targets import Target
 
 
-def gathered(
+def gathered_points(
     pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
     shown: Target | ArrayLike,
     image_size: tuple[int, int],
@@ -27,50 +30,83 @@ def gathered(
     target = shown if isinstance(shown, Target) else _points_target(shown)
     frames = _frames(pixels)
     movable = target.movable if moves is None else moves
-    views, rows = [], []
+    views, seen_rows, name = [], [], _name(target) if isinstance(shown, Target) else "target"
     for number, (frame, values) in enumerate(frames.items()):
-        seen = _pixels(values, frame)
+        seen = _pixels(values, f"frame {frame!r}")
         if len(seen) != len(target.points):
             raise InputError(
                 f"frame {frame!r}: {len(seen)} pixels for {len(target.points)} points: give one for each, NaN where it "
                 "was not seen"
             )
-        views.append(View(frame, camera, camera, "target", frame if movable else None))
+        views.append(View(frame, camera, camera, name, frame if movable else None))
         found = np.flatnonzero(np.isfinite(seen).all(axis=1))
-        rows.append((np.full(len(found), number), found, seen[found]))
-    if not rows:
-        raise InputError("no frame was given: pixels are needed")
-    view, feature, where = (np.concatenate(part) for part in zip(*rows, strict=True))
+        seen_rows.append((np.full(len(found), number), found, seen[found]))
+    if not seen_rows:
+        raise InputError("pixels must hold at least one frame")
+    view, feature, where = (np.concatenate(part) for part in zip(*seen_rows, strict=True))
     points = Points(view, feature, where, np.full(len(view), float(sigma_px)))
-    width, height = (int(size) for size in image_size)
-    return Content({"target": target}, {camera: (width, height)}, tuple(views), points, NO_CURVES)
+    return Content({name: target}, {camera: size_in(image_size)}, tuple(views), points, NO_CURVES)
+
+
+def gathered_curves(
+    pixels: Mapping[str, ArrayLike],
+    target: Target,
+    image_size: tuple[int, int],
+    camera: str,
+    frame: str,
+    sigma_px: float,
+    side: str,
+) -> Content:
+    """See `Observations.from_curves`."""
+    if side not in SIDES:
+        raise InputError(no_such("side", side, SIDES))
+    if not pixels:
+        raise InputError("pixels must hold at least one line")
+    for curve in pixels:
+        if curve not in target.curves:
+            raise InputError(f"pixels: {no_such('line', curve, target.curves)}")
+    seen = [_pixels(values, f"line {curve!r}") for curve, values in pixels.items()]
+    feature = np.repeat([target.curve_index[curve] for curve in pixels], [len(one) for one in seen])
+    count, name = len(feature), _name(target)
+    curves = Curves(
+        np.zeros(count, np.int32),
+        feature.astype(np.int32),
+        np.concatenate(seen),
+        np.full(count, float(sigma_px)),
+        np.full(count, SIDES[side], np.int8),
+    )
+    view = View(frame, camera, camera, name, frame if target.movable else None)
+    return Content({name: target}, {camera: size_in(image_size)}, (view,), NO_POINTS, curves)
+
+
+def _name(target: Target) -> str:
+    """As detected targets are named."""
+    return "board" if target.movable else "field"
 
 
 def _points_target(places: Any) -> Target:
     """A target of points (N, 3) or (N, 2) m, named by their numbers."""
     from ceres_cal.scene.targets import custom
 
-    given = np.asarray(places, dtype=float)
+    given = numbers_in(places, "points")
     if given.ndim != 2 or given.shape[1] not in (2, 3):
         raise InputError(f"points must have shape (N, 3) or (N, 2), in metres, not {given.shape}")
     whole = np.column_stack([given, np.zeros((len(given), 3 - given.shape[1]))])
     return custom({str(number): (x, y, z) for number, (x, y, z) in enumerate(whole.tolist())})
 
 
-def _frames(pixels: Any) -> dict[str, Any]:
+def _frames(pixels: Any) -> Mapping[str, Any]:
     """By name of the frame; numbers where there are no names."""
     if isinstance(pixels, Mapping):
         return {str(frame): values for frame, values in pixels.items()}
     if isinstance(pixels, np.ndarray) and (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[1] == 1)):
         return {"0": pixels}
+    if not isinstance(pixels, Sequence | np.ndarray) or isinstance(pixels, str):
+        raise InputError(f"pixels must be an array (N, 2), or a list or dict of them, not {type(pixels).__name__}")
     return {str(number): values for number, values in enumerate(pixels)}
 
 
-def _pixels(values: Any, frame: str) -> Array:
+def _pixels(values: Any, where: str) -> Array:
     """(N, 2), from that or OpenCV's (N, 1, 2)."""
-    seen = np.asarray(values, dtype=float)
-    if seen.ndim == 3 and seen.shape[1] == 1:
-        seen = seen[:, 0]
-    if seen.ndim != 2 or seen.shape[1] != 2:
-        raise InputError(f"frame {frame!r}: pixels must have shape (N, 2) or OpenCV's (N, 1, 2), not {seen.shape}")
-    return seen
+    seen = numbers_in(values, "pixels")
+    return rows(seen[:, 0] if seen.ndim == 3 and seen.shape[1] == 1 else seen, 2, f"{where}: pixels")

@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.words import printable
+from ceres_cal.base.typed import checked
+from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (
     Alone,
@@ -29,7 +30,6 @@ from ceres_cal.observations.columns import (
     Points,
     Prior,
     View,
-    choices,
     each_block,
     in_blocks,
     taken,
@@ -37,7 +37,7 @@ from ceres_cal.observations.columns import (
 )
 from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
-from ceres_cal.observations.from_points import gathered
+from ceres_cal.observations.from_points import gathered_curves, gathered_points
 from ceres_cal.scene.targets import Target
 
 _NAMES = attrgetter("camera", "station", "target", "placement")
@@ -85,7 +85,19 @@ class Observations(Content):
         for prior in self.priors:
             self.require_owner(prior)
 
+    def __add__(self, other: Observations) -> Observations:
+        """Both together, as of several files: `field + board`."""
+        if not isinstance(other, Observations):
+            return NotImplemented
+        if twice := next((v for v in self.views if v.placement is not None and v in other.views), None):
+            raise InputError(
+                f"both show target {twice.target!r} in frame {twice.frame!r} of camera {twice.camera!r}: give the "
+                "frames different names, such as by a dict of pixels"
+            )
+        return combine([self, other])
+
     @classmethod
+    @checked
     def from_points(
         cls,
         pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
@@ -96,20 +108,46 @@ class Observations(Content):
         sigma_px: float = 1.0,
         moves: bool | None = None,
     ) -> Observations:
-        """Of one camera that saw the points of one target, in one frame or in many.
+        """Observations of points of one target by one camera, in one frame or in many.
 
         Args:
             pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
                 of the points, NaN where it was not seen.
             points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
-            image_size: (width, height) px.
+            image_size: (width, height) px. sigma_px: standard deviation of each coordinate.
             moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
                 are the world.
 
         Raises:
             InputError: shapes or counts that do not fit; naming the frame.
         """
-        return cls(**vars(gathered(pixels, points, image_size, camera, sigma_px, moves)))
+        return cls(**vars(gathered_points(pixels, points, image_size, camera, sigma_px, moves)))
+
+    @classmethod
+    @checked
+    def from_curves(
+        cls,
+        pixels: Mapping[str, ArrayLike],
+        target: Target,
+        image_size: tuple[int, int],
+        *,
+        camera: str = "camera",
+        frame: str = "0",
+        sigma_px: float = 1.0,
+        side: str = "centre",
+    ) -> Observations:
+        """Observations of painted lines and arcs of one target in one frame of one camera.
+
+        Args:
+            pixels: name of each line -> pixels (N, 2) that lie on it, anywhere along it, such as
+                `{"HalfwayLine": [[640.1, 92.4], [641.0, 180.2]]}`.
+            image_size: (width, height) px. sigma_px: standard deviation of the distance to the line.
+            side: "centre" of the paint, or its "left" or "right" edge, as seen along the line.
+
+        Raises:
+            InputError: a line that the target does not have, or a shape that does not fit; naming the line.
+        """
+        return cls(**vars(gathered_curves(pixels, target, image_size, camera, frame, sigma_px, side)))
 
     # ---- files --------------------------------------------------------------------------------------------------
 
@@ -239,9 +277,9 @@ class Observations(Content):
         """What is wrong with a view. owner, placed: camera of each station and target of each placement before."""
         here, view = view_label(number, self.views), self.views[number]
         if view.camera not in self.cameras:
-            return f"{here} names camera {view.camera!r}, which is not there: {choices(self.cameras)}"
+            return f"{here}: {no_such('camera', view.camera, self.cameras)}"
         if view.target not in self.targets:
-            return f"{here} names target {view.target!r}, which is not there: {choices(self.targets)}"
+            return f"{here}: {no_such('target', view.target, self.targets)}"
         if owner[view.station] != view.camera:
             return f"{here}: station {view.station!r} belongs to camera {owner[view.station]!r} already"
         return (
@@ -303,9 +341,9 @@ class Observations(Content):
         every: dict[str, Iterable[str]] = {"camera": self.cameras, "station": self.stations, "target": self.targets}
         names = every[prior.owner]
         if prior.name not in names:
-            raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {choices(names)}")
+            raise InputError(f"a prior: {no_such(prior.owner, prior.name, names)}")
         if prior.curve and prior.curve not in self.targets[prior.name].curves:
-            raise InputError(f"a prior names a curve {prior.curve!r}, which target {prior.name!r} does not have")
+            raise InputError(f"a prior: {no_such('curve', prior.curve, self.targets[prior.name].curves)}")
 
 
 def _counted(_: int, block: Alone) -> tuple[int, Indices]:

@@ -60,15 +60,16 @@ class Server:
     """Windows that show one session. All that solves is done in one thread, photographs are read in another."""
 
     def __init__(self, session: Session, token: str) -> None:
-        self.session, self.token = session, token
-        self.ended = asyncio.Event()
+        self.session: Session = session
+        self.token: str = token
+        self.ended: asyncio.Event = asyncio.Event()
         self._windows: set[web.WebSocketResponse] = set()
         self._work = self._drags = ThreadPoolExecutor(1, "work")  # one solve at a time
         self._pictures = ThreadPoolExecutor(1, "pictures")
         self._busy = ""
         self._weighing: asyncio.Handle = asyncio.get_running_loop().call_soon(lambda: None)
         self._pages = {one.name: one.read_bytes() for one in files("ceres_cal.page").joinpath("web").iterdir()}
-        self.port = 0
+        self.port: int = 0
 
     def application(self) -> web.Application:
         """Its routes: the page and its scripts, photographs by their number, and the socket."""

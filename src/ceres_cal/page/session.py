@@ -56,10 +56,11 @@ class Session:
     """What the page works on. One thread at a time changes it: `lock` is held meanwhile."""
 
     def __init__(self, sitting: Sitting, commands: Commands, state: State) -> None:
-        self.sitting, self.commands = sitting, commands
-        self.lock = threading.RLock()
-        self.revision = 0
-        self.message = ""
+        self.sitting: Sitting = sitting
+        self.commands: Commands = commands
+        self.lock: Any = threading.RLock()
+        self.revision: int = 0
+        self.message: str = ""
         self.written: tuple[str, ...] = ()
         self.said: tuple[str, ...] = ()
         self._strokes: dict[str, Any] = {}

@@ -17,7 +17,7 @@ from ceres_cal.scene.targets import Target
 FORMAT, VERSION = "ceres-cal/page", 1
 _MOST_PX = 1e6
 _MOST = 500  # of anything that somebody shows by hand
-FEW = Meta(max_length=_MOST)
+FEW: Meta = Meta(max_length=_MOST)
 
 Name = Annotated[str, Meta(max_length=200)]
 Text = Annotated[str, Meta(max_length=4000)]

@@ -15,8 +15,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.base.typed import take_types
+from ceres_cal.base.typed import checked_fields, take_types
+from ceres_cal.base.words import no_such
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.structure import Structure, Tolerance
@@ -29,13 +31,10 @@ PAPERS_POWERS = (2, 3)
 _OF_POWERS = "radial"  # the lens that powers stand for where none is named
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
 """The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
-_ENOUGH_VIEWS = 8  # that tell a skew beside a lens without a formula: no test decides there
-_LARGEST = 2**31 - 1  # whole number that Ceres counts with
-# Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
-_SIGMAS = (1e-3, 1e9)
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Options:
     """What to solve for and how.
@@ -96,6 +95,10 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out
+        # none.
+        sigmas = (1e-3, 1e9)
+        largest = 2**31 - 1  # whole number that Ceres counts with
         take_types(self)
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
@@ -106,7 +109,7 @@ class Options:
         elif self.terms:
             raise InputError("terms are of a lens that is named: leave them out, or name it")
         if self.loss not in LOSSES:
-            raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
+            raise InputError(no_such("loss", self.loss, LOSSES))
         if self.noise_scale not in ("estimate", "stated"):
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
         if self.as_built not in ("estimate", "as drawn"):
@@ -122,18 +125,18 @@ class Options:
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
         if self.reject_sigma == np.inf:  # as far as anything counts, which files can hold
-            object.__setattr__(self, "reject_sigma", _SIGMAS[1])
+            object.__setattr__(self, "reject_sigma", sigmas[1])
         for name in ("loss_scale", "reject_sigma"):
-            if not _SIGMAS[0] <= getattr(self, name) <= _SIGMAS[1]:
-                least, most = _SIGMAS
+            if not sigmas[0] <= getattr(self, name) <= sigmas[1]:
+                least, most = sigmas
                 raise InputError(f"{name} must be {least:g} to {most:g} sigmas, not {getattr(self, name)}")
         if not self.max_iterations > 0:
             raise InputError(f"max_iterations must be above 0, not {self.max_iterations}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
         for name in ("max_iterations", "threads"):
-            if getattr(self, name) > _LARGEST:
-                raise InputError(f"{name} must be {_LARGEST} at most, not {getattr(self, name):.3g}")
+            if getattr(self, name) > largest:
+                raise InputError(f"{name} must be {largest} at most, not {getattr(self, name):.3g}")
 
     @property
     def _which(self) -> str:
@@ -162,7 +165,8 @@ class Options:
         """These options with a skew, which displaces by the first power, of a lens whose powers are left open, where so
         many views tell it.
         """
-        if self.powers or views < _ENOUGH_VIEWS or not self.usual_camera:
+        enough_views = 8  # that tell a skew beside a lens without a formula: no test decides there
+        if self.powers or views < enough_views or not self.usual_camera:
             return self
         return replace(self, free_skew="skew" not in self.fixed)
 
@@ -219,6 +223,8 @@ class Estimate:
     structure: Structure
     """The targets as built."""
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
 
@@ -230,8 +236,10 @@ class Estimate:
         """
         if name is None and len(self.stations) == 1:
             return next(iter(self.stations))
-        if name is None or name not in self.stations:
-            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
+        if name is None:
+            raise InputError(f"which station? Name one of {', '.join(self.stations)}")
+        if name not in self.stations:
+            raise InputError(no_such("station", name, self.stations))
         return name
 
     def camera_at(self, station: str, placement: str | None = None) -> Camera:

@@ -20,6 +20,7 @@ from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import take_types
+from ceres_cal.base.words import no_such
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.scene.curves import Curve
@@ -27,7 +28,6 @@ from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
 
 Kind = Literal["lines", "points", "warp"]
 """What a tolerance speaks of."""
-_NONE = -1
 WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
 """What the warp of a board is made of: see `bends_of`."""
 
@@ -222,7 +222,7 @@ def make_structure(
     """
     for name in tolerances:
         if name not in targets:
-            raise InputError(f"a tolerance names target {name!r}: there are {', '.join(map(repr, targets))}")
+            raise InputError(f"a tolerance: {no_such('target', name, targets)}")
     if all(tolerance == Tolerance() for tolerance in tolerances.values()) and not dimensions:
         return EXACT
     every = [of for name, target in targets.items() for of in _tolerated(name, target, tolerances)]
@@ -266,16 +266,17 @@ def _parts_of(curve: Curve) -> tuple[str, ...]:
 
 def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Indices32, Array, Indices32]:
     """Point slots, bends and track slots, by the place of each offset."""
+    none = -1
     point_slots, bends, track_slots = [], [], []
     for name, target in targets.items():
         curves = []
         for curve_name, curve in target.curves.items():
-            slots = [place.get(f"{name}/{curve_name}{part}", _NONE) for part in _parts_of(curve)]
-            curves.append(slots + [_NONE] * (3 - len(slots)))
+            slots = [place.get(f"{name}/{curve_name}{part}", none) for part in _parts_of(curve)]
+            curves.append(slots + [none] * (3 - len(slots)))
         track_slots += curves * 3  # the paint's centre and both edges move together
-        warp = [place.get(f"{name}/{part}", _NONE) for part in WARP]
+        warp = [place.get(f"{name}/{part}", none) for part in WARP]
         for point_name in target.points:
-            point_slots.append([place.get(f"{name}/{point_name}.{axis}", _NONE) for axis in "xy"] + warp)
+            point_slots.append([place.get(f"{name}/{point_name}.{axis}", none) for axis in "xy"] + warp)
         bends.append(bends_of(target))
     return (
         np.array(point_slots, dtype=np.int32).reshape(-1, 2 + len(WARP)),
@@ -336,7 +337,7 @@ def dimension_slopes(
     columns = np.zeros((len(offsets), len(dimensions)))
     for column, name in enumerate(dimensions):
         if name not in known:
-            raise InputError(f"there is no dimension {name!r} to be solved for: there are {', '.join(known) or 'none'}")
+            raise InputError(no_such("dimension to solve for", name, known))
         target, _, dimension = name.partition("/")
         spec = targets[target].spec
         other = target_from_spec({**spec, dimension: (1.0 + _STEP) * known[name]}, target)

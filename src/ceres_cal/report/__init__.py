@@ -4,7 +4,8 @@ The only package that imports the plotting library. The page is loaded when it i
 quality of a calibration, few for the page.
 """
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.lazy import names_of
 
@@ -14,4 +15,6 @@ if TYPE_CHECKING:
     from ceres_cal.report.report import write_report as write_report
 
 __all__ = ["FramePhotographs", "make_report", "write_report"]
-__getattr__ = names_of(__name__, {"FramePhotographs": "material", "make_report": "report", "write_report": "report"})
+__getattr__: Callable[[str], Any] = names_of(
+    __name__, {"FramePhotographs": "material", "make_report": "report", "write_report": "report"}
+)

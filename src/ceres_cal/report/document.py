@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ceres_cal.report.canvas import Drawing, Hover
 
 WIDTH = 100
+_RESULTS = ("verdict", "check", "audit", "jobs", "advice")
 """Of a text for people, in letters."""
 
 
@@ -176,6 +177,14 @@ class Document(NamedTuple):
         """For people; of the sections with one of these titles, by default of all."""
         kept = (one for one in self.sections if titles is None or one.title in titles)
         return "\n".join(line for one in kept for line in one.shown())
+
+    @property
+    def one_line(self) -> str:
+        """The answer in one line, as with --quiet: the verdict, or what is said first."""
+        first = sorted(self.sections, key=lambda one: one.title not in _RESULTS)
+        lines = [" ".join(str(line).split()) for one in first for line in one.lines if str(line).strip()]
+        within = (line.removeprefix("verdict ") for line in lines if line.startswith("verdict "))  # of a step of `run`
+        return next(within, lines[0] if lines else "")
 
     @property
     def data(self) -> dict[str, Any]:

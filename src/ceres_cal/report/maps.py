@@ -11,8 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.posterior.image import image_grid
-from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.maps import FieldMap, image_grid
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table
@@ -36,7 +35,7 @@ _FEWEST_STEPS = 6
 _TABLE_SIZE = 7, 6
 _DOT, _DOT_ALPHA = 1.1, 0.45
 _MOST_LINES = 4
-_LABEL = "95 % within, mm"
+LABEL = "95 % within, mm"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         drawn.x_m,
         drawn.y_m,
         drawn.radius_95_mm,
-        _LABEL,
+        LABEL,
         [line[:, :2] for line in paint_of(material.fields)],
         image_border(posed, one.height_m),
         posed.position,
@@ -138,7 +137,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         f"{_reading(one)}. Dashed: the border of the image, open beyond it. Triangle: the camera."
         + (" Dots: observations." if one.height_m == 0.0 else ""),
         map_drawing.drawing,
-        grid_table(f"{_LABEL}, at y \\ x", one.radius_95_mm[::-1], one.x_m, one.y_m[::-1], "{:.1f} m"),
+        grid_table(f"{LABEL}, at y \\ x", one.radius_95_mm[::-1], one.x_m, one.y_m[::-1], "{:.1f} m"),
         hover=Hover.of(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
     )
 

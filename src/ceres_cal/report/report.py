@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ceres_cal.base.files import write_bytes
 from ceres_cal.base.progress import StepProgress
+from ceres_cal.base.typed import checked
 from ceres_cal.base.words import counted, first_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
@@ -63,6 +64,7 @@ def make_report(
     return page(", ".join(list(observations.cameras)[:4]), _about(material), chapters, _foot(calibration))
 
 
+@checked
 def write_report(
     path: str | Path,
     calibration: Calibration,

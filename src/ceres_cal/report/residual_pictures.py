@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,71 +49,81 @@ def _thinned(drawn: int, of: int) -> str:
 
 def vectors(material: Material, name: str) -> Figure:
     """Residual vectors over one camera's image."""
-    table, camera = material.diagnosis.table, material.calibration.cameras[name]
+    table, size = material.diagnosis.table, material.calibration.cameras[name].image_size
     own = material.of_camera(name)
     inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & table.outlier)
     step = stride(material, len(inliers) + len(outliers))
-    typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
-    means = significant_means(table, inliers, camera)
-    field = _VectorField(
-        camera, table, inliers[::step], outliers[::step], typical, means, _paint_in_image(material, name)
-    )
-    shape = camera.image_size[1] / camera.image_size[0]
+    means = significant_means(table, inliers, size)
+    shown, paint = (inliers[::step], outliers[::step]), _paint_in_image(material, name)
+
+    def draw(axes: Axes, width_in: float) -> None:
+        draw_vectors(axes, width_in, table, shown, size, means, paint)
+
+    shape = size[1] / size[0]
     return Figure(
         f"vectors-{_number_of(material, name)}",
         f"Residual vectors over the image{_owner_suffix(material, name)}",
-        f"Each stroke leads from an observation to where the model puts it, {field.enlarged} times enlarged; of a line "
-        "or arc it is the shortest way to the curve. Strokes that point anyhow are noise. Thick: means of regions that "
-        f"noise cannot explain ({len(means.places)} of {means.regions}); where they grow or turn together, the model "
-        f"is wrong.{_thinned(len(field.inliers) + len(field.outliers), len(inliers) + len(outliers))}",
-        Drawing(field.draw, 0.93 * shape + 0.07),
+        f"Each stroke leads from an observation to where the model puts it, enlarged {_enlarged(table, inliers, size)} "
+        "times. For a line or arc it is the shortest way to the curve. Strokes in random directions are noise. "
+        f"Thick: means of regions that noise cannot explain ({len(means[0])} of {means[2]}). Where they grow "
+        f"or turn together, the model is wrong.{_thinned(sum(map(len, shown)), len(inliers) + len(outliers))}",
+        Drawing(draw, 0.93 * shape + 0.07),
         _region_table(material.diagnosis.summaries.regions, name),
         wide=True,
-        narrow_drawing=Drawing(field.draw, 0.86 * shape + 0.18),
+        narrow_drawing=Drawing(draw, 0.86 * shape + 0.18),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _VectorField:
-    """What is drawn: rows of the table, the median length, means of regions, and paint (S, 2) px each."""
+def _enlarged(table: ResidualTable, inliers: Indices, size: tuple[int, int]) -> int:
+    """How many times strokes are enlarged, a round number."""
+    wanted = _TYPICAL * size[0] / max(_typical_px(table, inliers), 1e-12)
+    return max((e for e in _ENLARGED if e <= wanted), default=1)
 
-    camera: Camera
-    table: ResidualTable
-    inliers: Indices
-    outliers: Indices
-    typical_px: float
-    means: RegionMeans
-    paint: list[Array]
 
-    @property
-    def enlarged(self) -> int:
-        """So many times, a round number."""
-        wanted = _TYPICAL * self.camera.image_size[0] / max(self.typical_px, 1e-12)
-        return max((e for e in _ENLARGED if e <= wanted), default=1)
+def _typical_px(table: ResidualTable, inliers: Indices) -> float:
+    return float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
 
-    def draw(self, axes: Axes, width_in: float) -> None:
-        """Paint, vectors of points and of curves, means and outliers."""
-        table, enlarged, places = self.table, self.enlarged, self.means.places
-        _frame_image(axes, self.camera)
-        for line in self.paint:
-            axes.plot(*line.T, color=PAINT, linewidth=1.6 if width_in > canvas.NARROW_IN else 1.0, alpha=0.6)
-        is_curve = table.is_curve[self.inliers]
-        for rows, color, label in (
-            (self.inliers[~is_curve], POINT, "points"),
-            (self.inliers[is_curve], CURVE, "curves"),
-        ):
-            if len(rows):
-                ends = table.pixel[rows] + enlarged * table.residual_px[rows]
-                canvas.strokes(axes, table.pixel[rows], ends, color, 0.7, alpha=0.8, label=label)
-        if len(places):
-            ends = places + enlarged * self.means.vectors
-            canvas.strokes(axes, places, ends, INK, 1.6, label="mean of a region")
-            canvas.dots(axes, places, INK, 3.2)
-        if len(self.outliers):
-            canvas.crosses(axes, table.pixel[self.outliers], OUTLIER, 0.012 * self.camera.image_size[0])
-            axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
-        _scale_bar(axes, self.camera, enlarged, self.typical_px)
-        canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
+
+def draw_vectors(
+    axes: Axes,
+    width_in: float,
+    table: ResidualTable,
+    rows: tuple[Indices, Indices],
+    size: tuple[int, int],
+    means: tuple[Array, Array, int],
+    paint: Sequence[Array] = (),
+) -> None:
+    """Paint (S, 2) px each, vectors of points and of curves, means of regions, and outliers.
+
+    Args:
+        rows: of the table, inliers and outliers. means: see `significant_means`.
+    """
+    (inliers, outliers), (places, displaced, _) = rows, means
+    enlarged = _enlarged(table, inliers, size)
+    axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal", xlabel="px")
+    axes.grid(visible=False)
+    for side in axes.spines.values():
+        side.set_visible(True)
+    for line in paint:
+        axes.plot(*line.T, color=PAINT, linewidth=1.6 if width_in > canvas.NARROW_IN else 1.0, alpha=0.6)
+    is_curve = table.is_curve[inliers]
+    for own, color, label in ((inliers[~is_curve], POINT, "points"), (inliers[is_curve], CURVE, "curves")):
+        if len(own):
+            ends = table.pixel[own] + enlarged * table.residual_px[own]
+            canvas.strokes(axes, table.pixel[own], ends, color, 0.7, alpha=0.8, label=label)
+    if len(places):
+        canvas.strokes(axes, places, places + enlarged * displaced, INK, 1.6, label="mean of a region")
+        canvas.dots(axes, places, INK, 3.2)
+    if len(outliers):
+        canvas.crosses(axes, table.pixel[outliers], OUTLIER, 0.012 * size[0])
+        axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
+    typical = _typical_px(table, inliers)
+    start = np.array([[0.03 * size[0], 0.95 * size[1]]])  # a stroke as long as the median residual
+    end = start + np.array([enlarged * typical, 0.0])
+    canvas.strokes(axes, start, end, INK, 1.5)
+    text = axes.text(end[0, 0] + 0.012 * size[0], start[0, 1], f"median {short(typical)} px", va="center", fontsize=7.0)
+    text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85})
+    canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
 
 
 def _owner_suffix(material: Material, camera: str) -> str:
@@ -125,21 +134,13 @@ def _number_of(material: Material, camera: str) -> int:
     return list(material.observations.cameras).index(camera)
 
 
-@dataclass(frozen=True, eq=False)
-class RegionMeans:
-    """Mean displacements of C regions of an image: places (C, 2) and vectors (C, 2), px; `regions` had enough rows."""
-
-    places: Array
-    vectors: Array
-    regions: int
-
-
-def significant_means(table: ResidualTable, rows: Indices, camera: Camera) -> RegionMeans:
-    """Those of the image's regions that noise does not explain.
+def significant_means(table: ResidualTable, rows: Indices, size: tuple[int, int]) -> tuple[Array, Array, int]:
+    """Mean displacements (C, 2) px that noise does not explain, of regions of an image: their places (C, 2) px, the
+    displacements, and how many regions had enough rows.
 
     A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
     """
-    width, height = camera.image_size
+    width, height = size
     cell = max(width, height) / _MEAN_GRID
     columns, lines = int(np.ceil(width / cell)), int(np.ceil(height / cell))
     pixel, residual = table.pixel[rows], table.residual_px[rows]
@@ -158,7 +159,7 @@ def significant_means(table: ResidualTable, rows: Indices, camera: Camera) -> Re
     good = (count >= _FEWEST) & (sizes[:, 0] > 0.1 * sizes[:, 1])
     places, means = centre[good] / count[good, None], np.linalg.solve(normal[good], moved[good, :, None])[:, :, 0]
     significant = np.sum(means * moved[good], axis=1) > _NOT_NOISE
-    return RegionMeans(places[significant], means[significant], len(places))
+    return places[significant], means[significant], len(places)
 
 
 def _paint_in_image(material: Material, camera: str) -> list[Array]:
@@ -172,24 +173,6 @@ def _paint_in_image(material: Material, camera: str) -> list[Array]:
     with np.errstate(invalid="ignore"):
         inside = [np.all((line > -1.0) & (line < posed.image_size), axis=1) for line in lines]
     return [np.where(keep[:, None], line, np.nan) for line, keep in zip(lines, inside, strict=True)]
-
-
-def _frame_image(axes: Axes, camera: Camera) -> None:
-    width, height = camera.image_size
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px")
-    axes.grid(visible=False)
-    for side in axes.spines.values():
-        side.set_visible(True)
-
-
-def _scale_bar(axes: Axes, camera: Camera, enlarged: int, typical: float) -> None:
-    """A stroke as long as the median residual, in a corner."""
-    width, height = camera.image_size
-    start = np.array([[0.03 * width, 0.95 * height]])
-    end = start + np.array([enlarged * typical, 0.0])
-    canvas.strokes(axes, start, end, INK, 1.5)
-    text = axes.text(end[0, 0] + 0.012 * width, start[0, 1], f"median {short(typical)} px", va="center", fontsize=7.0)
-    text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85})
 
 
 def _region_table(summary: Summary, camera: str) -> Table:

@@ -195,24 +195,26 @@ def ideal_radii(camera: Camera, radii: Array) -> Array:
         return np.where((rays[:, 2] > 0.0) & (ideal <= _WIDEST * np.maximum(radii, 1.0)), ideal, np.nan)
 
 
+def draw_distortion(axes: Axes, camera: Camera, reach: float = np.inf) -> None:
+    """r' against r of a camera; dotted beyond the reach of observations, px."""
+    radii = np.linspace(0.0, camera.corner_radius, _STEPS)
+    ideal, known = ideal_radii(camera, radii), radii <= reach
+    axes.plot(radii, radii, color=QUIET, linewidth=0.9, dashes=(4, 3), label="no distortion")
+    axes.plot(radii[known], ideal[known], color=POINT, linewidth=1.8, label="this lens")
+    if not known.all():
+        axes.plot(radii[~known], ideal[~known], color=POINT, linewidth=1.2, dashes=(1, 1.5), label="not observed")
+    axes.set(xlim=(0.0, camera.corner_radius), ylim=(0.0, None))
+    axes.set(xlabel="measured radius r, px", ylabel="undistorted radius r', px")
+    canvas.key(axes)
+
+
 def distortion(material: Material, name: str) -> Figure:
     """r' against r of one camera, and how far observations reach."""
     camera, table = material.calibration.cameras[name], material.diagnosis.table
-    radii = np.linspace(0.0, camera.corner_radius, _STEPS)
-    ideal = ideal_radii(camera, radii)
     seen = table.radius_px[material.of_camera(name) & table.inlier]
     reach = float(seen.max()) if len(seen) else 0.0
     terms = [powered(term) for term in camera.lens.formula.split(" ")]
     model = " ".join(terms) if camera.lens.formula else f"the {camera.lens.kind} lens"
-
-    def draw(axes: Axes, width_in: float) -> None:
-        axes.plot(radii, radii, color=QUIET, linewidth=0.9, dashes=(4, 3), label="no distortion")
-        known = radii <= reach
-        axes.plot(radii[known], ideal[known], color=POINT, linewidth=1.8, label="this lens")
-        axes.plot(radii[~known], ideal[~known], color=POINT, linewidth=1.2, dashes=(1, 1.5), label="not observed")
-        axes.set(xlim=(0.0, camera.corner_radius), ylim=(0.0, None))
-        axes.set(xlabel="measured radius r, px", ylabel="undistorted radius r', px")
-        canvas.key(axes)
 
     steps = np.linspace(0.0, camera.corner_radius, _TABLE_STEPS + 1)[1:]
     table_rows = zip(steps.tolist(), ideal_radii(camera, steps).tolist(), strict=True)
@@ -222,7 +224,7 @@ def distortion(material: Material, name: str) -> Figure:
         f"The paper's figure 4: how far from the principal point a pixel is (across) and would be without "
         f"distortion (up), {model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px; "
         "dotted, beyond them, the curve is a guess.",
-        Drawing(draw, 0.66),
+        Drawing(lambda axes, _: draw_distortion(axes, camera, reach), 0.66),
         Table(
             ("r, px", "r', px", "r' - r, px", "r' / r"),
             tuple((f"{r:.1f}", *_row(r, ideal_radius)) for r, ideal_radius in table_rows),

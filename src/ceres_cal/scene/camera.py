@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.shown import drawn, html_of
 from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.base.typed import numbers_in, rows, size_in
 from ceres_cal.scene.foreign import (
     FISHEYE,
     LARGEST,
@@ -27,14 +31,6 @@ from ceres_cal.scene.foreign import (
     lens_fitted,
 )
 from ceres_cal.scene.lens import Lens
-
-
-def _rows(values: ArrayLike, columns: int, name: str) -> Array:
-    rows = np.asarray(values, dtype=float)
-    if rows.ndim != 2 or rows.shape[1] != columns:
-        raise ValueError(f"{name} must have shape (N, {columns}), not {rows.shape}")
-    return rows
-
 
 _ACROSS = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
 
@@ -63,10 +59,10 @@ class Camera:
     skew: float = 0.0
 
     def __post_init__(self) -> None:
-        width, height = (int(s) for s in self.image_size)
-        cx, cy = (float(c) for c in self.principal_point)
-        if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
-            raise InputError(f"image size must be two positive whole numbers, not {self.image_size}")
+        width, height = size_in(self.image_size)
+        cx, cy = (float(c) for c in numbers_in(self.principal_point, "principal_point"))
+        if max(width, height) > LARGEST_PX:
+            raise InputError(f"image_size must be at most {LARGEST_PX} px, not {self.image_size}")
         numbers = (self.phi, self.aspect, cx, cy, self.skew, *self.lens.values, *self.cam_from_world.translation)
         if not np.all(np.abs(numbers) < LARGEST) or self.phi <= 0.0 or self.aspect <= 0.0:
             raise InputError(
@@ -83,6 +79,22 @@ class Camera:
     def __repr__(self) -> str:
         (width, height), place = self.image_size, ", ".join(f"{x:.2f}" for x in self.position)
         return f"Camera({width} x {height} px, phi {self.phi:.1f} px, {self.lens.kind}, at ({place}) m)"
+
+    def _repr_html_(self) -> str:
+        (width, height), (cx, cy) = self.image_size, self.principal_point
+        rows = [
+            ("image", f"{width} x {height} px"),
+            ("phi", f"{self.phi:.2f} px"),
+            ("principal point", f"{cx:.2f}, {cy:.2f} px"),
+            *((name, f"{value:.5g}") for name, value in self.lens.coefficients.items()),
+            ("position", ", ".join(f"{one:.3f}" for one in self.position) + " m"),
+            ("tilt", f"{self.tilt_deg:.3f} deg"),
+        ]
+        return html_of((f"Camera with {self.lens.kind} lens", rows))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the distortion curve (undistorted against measured radius) into Matplotlib's Axes; returns the Axes."""
+        return drawn("plot_distortion", self, ax)
 
     @property
     def position(self) -> Array:
@@ -132,7 +144,7 @@ class Camera:
 
     def offsets(self, pixels: ArrayLike) -> Array:
         """Pixels (N, 2) as offsets (N, 2) from the principal point on square pixels."""
-        x, y = _rows(pixels, 2, "pixels").T
+        x, y = rows(pixels, 2, "pixels").T
         cx, cy = self.principal_point
         down = (y - cy) / self.aspect
         return np.column_stack([x - cx - self.skew * down, down])  # by columns: rows of two are slow to walk
@@ -146,7 +158,7 @@ class Camera:
         if np.ndim(points_world) == 1:
             return np.asarray(self.project(np.asarray(points_world)[None])[0])
         with np.errstate(invalid="ignore"):  # infinite points
-            rays = self.cam_from_world.transform(_rows(points_world, 3, "points_world"))
+            rays = self.cam_from_world.transform(rows(points_world, 3, "points_world"))
         offsets = self.lens.distort(rays, self.phi)
         offsets[:, 0] += self.skew * offsets[:, 1]
         return np.asarray(offsets * (1.0, self.aspect) + self.principal_point)
@@ -165,6 +177,8 @@ class Camera:
         Raises:
             InputError: a height far over the camera: it is one in metres.
         """
+        if not isinstance(height_m, Real):
+            raise InputError(f"height_m must be a number of metres, such as 0.15, not {height_m!r}")
         far_m = 10.0  # a height of as many metres, far over its camera, is one in millimetres
         if abs(height_m) > max(far_m, 2.0 * abs(self.position[2])):
             raise InputError(
@@ -172,7 +186,7 @@ class Camera:
                 f"for {height_m:g} mm give {1e-3 * height_m:g}"
             )
         if np.ndim(pixels) == 1:
-            return np.asarray(self.locate(np.asarray(pixels)[None], height_m)[0])
+            return np.asarray(self.locate(rows(np.asarray(pixels)[None], 2, "pixels"), height_m)[0])
         directions = self.rays(pixels) @ self.cam_from_world.rotation
         drop = height_m - self.position[2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,8 +220,8 @@ class Camera:
         Args:
             matrix: K (3, 3) of the straight image, by default the camera's own. size: (width, height), too.
         """
-        inverse = np.linalg.inv(self.matrix if matrix is None else np.asarray(matrix, dtype=float))
-        width, height = size or self.image_size
+        inverse = np.linalg.inv(self.matrix if matrix is None else numbers_in(matrix, "matrix"))
+        width, height = size_in(size or self.image_size, "size")
         pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))], axis=-1)
         places = self.at(Pose.identity()).project(pixels.reshape(-1, 3) @ inverse.T).reshape(height, width, 2)
         return places[..., 0].astype(np.float32), places[..., 1].astype(np.float32)
@@ -297,10 +311,12 @@ class Camera:
         Raises:
             InputError: numbers that make no camera.
         """
-        pose = Pose.exp(np.concatenate([np.ravel(rvec), np.ravel(tvec)]))
-        foreign = ForeignCamera.opencv(image_size, matrix, np.ravel(distortion), pose)
+        vectors = (numbers_in(one, name).ravel() for one, name in ((rvec, "rvec"), (tvec, "tvec")))
+        given = numbers_in(distortion, "distortion").ravel()
+        pose = Pose.exp(np.concatenate([*vectors]))
+        foreign = ForeignCamera.opencv(size_in(image_size), numbers_in(matrix, "matrix"), given, pose)
         if fisheye:
-            foreign = replace(foreign, model=FISHEYE, coefficients=tuple(float(v) for v in np.ravel(distortion)))
+            foreign = replace(foreign, model=FISHEYE, coefficients=tuple(given.tolist()))
         return cls.from_foreign(foreign)[0]
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.words import no_such
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
@@ -152,5 +153,5 @@ def built_in_scene(name: str) -> tuple[Scene, Disturbance]:
         InputError: there is none of this name.
     """
     if name not in _SCENES:
-        raise InputError(f"there is no scene {name!r}: choose one of {', '.join(_SCENES)}, or name a file")
+        raise InputError(f"{no_such('scene', name, _SCENES)} (or name a file)")
     return _SCENES[name][1]()

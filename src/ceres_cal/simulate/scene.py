@@ -9,6 +9,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.words import did_you_mean
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import SIDES, Target
@@ -89,8 +90,7 @@ class Scene:
             for name in chosen or ():
                 if name not in known:
                     raise InputError(
-                        f"{here}: {kind} {name!r} is unknown in target {plan.target!r}: "
-                        "`ceres-cal targets` lists the names"
+                        f"{here}: target {plan.target!r} has no {kind} {name!r}: `ceres-cal targets` lists the names"
                     )
             if len(set(chosen or ())) != len(chosen or ()):
                 raise InputError(f"{here}: a {kind} is named twice: name each once")
@@ -153,7 +153,8 @@ class Disturbance:
 
 def _require(name: str, known: Collection[str], what: str) -> None:
     if name not in known:
-        raise InputError(f"{what} {name!r}, which is not there: there are {', '.join(map(repr, known)) or 'none'}")
+        there = f": there are {', '.join(map(repr, known)) or 'none'}"
+        raise InputError(f"{what} {name!r}, which is not there{did_you_mean(name, known) or there}")
 
 
 def _require_finite(pose: Pose, what: str) -> None:

@@ -38,6 +38,14 @@ class Labels:
     open: tuple[str, ...]
 
 
+def open_words(station: str) -> str:
+    """What to say of an open station."""
+    return (
+        f"station {station!r}: nothing shows which way round its boards are labelled: show the board to it and to the "
+        "first camera at once in more poses, or take a board of odd columns + rows"
+    )
+
+
 def with_same_labels(observations: Observations) -> Labels:
     """The observations with every symmetric board labelled alike by all stations that see it at a placement.
 

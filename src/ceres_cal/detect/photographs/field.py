@@ -11,6 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import InputError, NothingShownError, naming
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.shown import brief
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_light
@@ -50,6 +51,8 @@ class FieldDetections:
     found: dict[str, Followed]
     missed: tuple[tuple[str, str], ...]
     searched: dict[str, SearchResult]
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)

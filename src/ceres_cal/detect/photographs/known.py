@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.shown import brief
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs.field import FieldOptions, detect_field
@@ -38,6 +39,8 @@ class KnownDetections:
     shown: dict[str, int]
     missed: tuple[tuple[str, str], ...]
     images: int
+
+    __repr__ = brief
 
     def require(self) -> Observations:
         """The observations; NothingShownError where there are none."""

@@ -13,6 +13,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.progress import StepProgress
+from ceres_cal.base.shown import brief, text_of
+from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, still
 from ceres_cal.diagnostics.advice.measurements import Ground, Measurement
@@ -49,6 +51,8 @@ class Promise:
     rough: bool = False
     valley: tuple[tuple[float, Errors], ...] = ()
 
+    __repr__ = brief
+
     @property
     def worst_range_mm(self) -> tuple[float, float]:
         """Least and largest worst error, over what phi may be."""
@@ -76,7 +80,13 @@ class Advice:
     then: Promise | None
     good_enough_mm: float | None
 
+    def __repr__(self) -> str:
+        rows = [(f"{one.after.worst_mm:.2g} mm", one.measurement.words) for one in self.promises]
+        title = f"Advice for station {self.station!r}: {self.before.worst_mm:.2g} mm at worst, which becomes"
+        return text_of((title, rows))
 
+
+@checked
 @numerical("the advice")
 def advise(
     calibration: Calibration,

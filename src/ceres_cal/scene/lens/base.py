@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import no_such
 
 LinearEquations = tuple[dict[str, Array], Array]
 _BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache
@@ -318,7 +319,7 @@ def lens_class(kind: str) -> type[Lens]:
         InputError: there is none.
     """
     if kind not in LENSES:
-        raise InputError(f"unknown lens {kind!r}: choose one of {', '.join(LENSES)}")
+        raise InputError(no_such("lens", kind, LENSES))
     return LENSES[kind]
 
 

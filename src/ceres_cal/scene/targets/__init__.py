@@ -1,6 +1,7 @@
 """Targets: rigid things of known geometry, one module for each kind of them, and the table of the kinds."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.lazy import names_of
 from ceres_cal.scene.curves import SIDES as SIDES
@@ -11,6 +12,7 @@ from ceres_cal.scene.targets.painted_fields import painted_field as painted_fiel
 from ceres_cal.scene.targets.painted_fields import ssl_field as ssl_field
 from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS
 from ceres_cal.scene.targets.registry import target_from_spec as target_from_spec
+from ceres_cal.scene.targets.registry import target_named as target_named
 from ceres_cal.scene.targets.registry import targets_by_name as targets_by_name
 from ceres_cal.scene.targets.registry import targets_from_specs as targets_from_specs
 from ceres_cal.scene.targets.target import Grid as Grid
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets.ring_sheets import rings as rings
     from ceres_cal.scene.targets.tape_grids import tape_grid as tape_grid
 
-__getattr__ = names_of(
+__getattr__: Callable[[str], Any] = names_of(
     __name__,
     {
         "april_grid": "april_grids",

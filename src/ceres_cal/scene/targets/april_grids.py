@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments, require_size
 
 
+@checked
 def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
     """The corners of the tags: feature "c,r" counts them from the top left, c < 2 columns, r < 2 rows.
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.targets.paper import Footprints, Paper, Square, share_inside
 from ceres_cal.scene.targets.target import Grid, Target, TargetKind, from_arguments, require_size
 
 
+@checked
 def checkerboard(columns: int, rows: int, square_m: float) -> Target:
     """The inner corners of a checkerboard: feature "c,r" lies at (c, r, 0) squares, c < columns, r < rows.
 

@@ -9,10 +9,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, share_inside
 from ceres_cal.scene.targets.target import Grid, Target, TargetKind, from_arguments, require_size
 
 
+@checked
 def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *, asymmetric: bool = False) -> Target:
     """The centres of a grid of circles, features "c,r", c < columns, r < rows.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Arc, Curve, Segment, xyz
 from ceres_cal.scene.targets.crossings import with_crossings
 from ceres_cal.scene.targets.target import Target, TargetKind, require_places
@@ -23,6 +24,7 @@ class _CustomSpec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
     movable: bool = False
 
 
+@checked
 def custom(
     points: Mapping[str, tuple[float, float, float]] | None = None,
     curves: Mapping[str, Curve] | None = None,

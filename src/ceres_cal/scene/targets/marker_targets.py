@@ -10,6 +10,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
 CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
@@ -45,6 +46,7 @@ class _MarkersSpec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=Tru
     movable: bool = False
 
 
+@checked
 def markers(dictionary: str, places: Mapping[int, Marker], *, movable: bool = False) -> Target:
     """The corners of markers: feature "7.top_left" and so on of marker 7, as it is seen upright.
 

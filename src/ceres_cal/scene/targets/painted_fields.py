@@ -19,6 +19,8 @@ import msgspec
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.typed import checked
+from ceres_cal.base.words import no_such
 from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.targets.crossings import with_crossings
 from ceres_cal.scene.targets.target import LARGEST_M, Target, TargetKind
@@ -207,6 +209,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         return TargetKind(self.kind, what, given, self.features, self.examples, self.from_spec)
 
 
+@checked
 def painted_field(kind: str, variant: str | None = None, **given: float | bool) -> Target:
     """A field or court by its rules, such as `painted_field("vss-field", "3v3", center_circle=False)`.
 
@@ -222,11 +225,12 @@ def painted_field(kind: str, variant: str | None = None, **given: float | bool) 
             that make no field.
     """
     if kind not in templates():
-        raise InputError(f"there is no field {kind!r}: choose one of {', '.join(templates())}")
+        raise InputError(no_such("field", kind, templates()))
     plain = {name: value if isinstance(value, bool) else float(value) for name, value in given.items()}
     return _made(kind, variant, tuple(plain.items()))
 
 
+@checked
 def ssl_field(division: str | None = None, **given: float | bool) -> Target:
     """A field of the RoboCup small-size league, its lines, circle, corners and crossings under the league's names.
 

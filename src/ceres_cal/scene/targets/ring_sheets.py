@@ -9,11 +9,13 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, Square, share_inside
 from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments
 
 
+@checked
 def rings(radii_m: Sequence[float]) -> Target:
     """The paper's concentric circles (section 2): edges "ring_1", "ring_2", ... from the inside out, point "centre".
 

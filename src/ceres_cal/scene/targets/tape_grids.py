@@ -8,10 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Curve, Segment
 from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments, require_size
 
 
+@checked
 def tape_grid(columns: int, rows: int, pitch_m: float, line_thickness_m: float) -> Target:
     """Lines "column_c" at x = c pitches and "row_r" at y = r pitches, and points "c,r" where they cross.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from inspect import signature
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -104,7 +104,7 @@ class Target:
             and self.curve_names == other.curve_names
         )
 
-    __hash__ = None  # type: ignore[assignment]
+    __hash__: ClassVar[None] = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         return f"Target({self.kind}, {len(self.points)} points, {len(self.curves)} curves)"

@@ -1,0 +1,47 @@
+"""Image files as people name them: single ones, folders, patterns and videos."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Sequence
+from os import PathLike
+from pathlib import Path
+
+from ceres_cal.base.errors import InputError
+
+Images = str | PathLike[str] | Sequence[str | PathLike[str]]
+"""A photograph, a folder, a pattern such as "board_*.png", a video, or several of them."""
+IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+VIDEO_ENDINGS = {".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+
+
+def image_files(given: Images) -> list[Path]:
+    """The files that are named; those of folders, and of patterns, in the order of their names.
+
+    Raises:
+        InputError: there is no such file, or no image in a folder.
+    """
+    each = [given] if isinstance(given, str | PathLike) else given
+    return [path for name in each for path in _files(str(name))]
+
+
+def _files(name: str) -> Iterable[Path]:
+    path = Path(name)
+    if path.is_dir():
+        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
+        if not inside:
+            raise InputError(f"{name}: there are no images in this folder")
+        return inside
+    if path.exists():
+        return [path]
+    matches = sorted(glob.glob(name))  # noqa: PTH207, Path.glob refuses absolute patterns
+    if not matches:
+        raise InputError(f"{name}: no such file")
+    return map(Path, matches)
+
+
+def images_and_videos(given: Images) -> tuple[list[Path], list[Path]]:
+    """The images as `image_files` has them, and the videos among what is given."""
+    files = image_files(given)
+    videos = [path for path in files if path.suffix.lower() in VIDEO_ENDINGS]
+    return [path for path in files if path not in videos], videos

@@ -1,0 +1,74 @@
+"""How objects show themselves: a few lines in a shell, a table in a notebook, a picture in somebody's Axes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import grouped
+
+_MOST_LINES, _MOST_LETTERS = 9, 70  # of a text; and of a value in it
+_PICTURES = "ceres_cal.report.plots"  # far above: it is loaded when somebody draws
+
+Shown = tuple[str, Sequence[tuple[str, ...]]]
+"""A line that says what an object is, and rows on what it holds."""
+
+
+def brief(instance: Any) -> str:
+    """The `__repr__` of an object with large parts: its class, and a line for each of its first fields."""
+    every = {name: value for name, value in vars(instance).items() if name[0] != "_"}
+    lines = [f"  {name}={_short(value)}" for name, value in list(every.items())[: _MOST_LINES - 1]]
+    return "\n".join([f"{type(instance).__name__}(", *lines]) + ")"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<array {' x '.join(map(str, value.shape))}>"
+    if isinstance(value, tuple | list | Mapping) and len(value) > 3:
+        return f"<{grouped(len(value))} entries>"
+    text = repr(value)
+    return text if len(text) <= _MOST_LETTERS and "\n" not in text else f"<{type(value).__name__}>"
+
+
+def text_of(shown: Shown) -> str:
+    """A text of at most ten lines."""
+    title, rows = shown
+    most = len(rows) if len(rows) < _MOST_LINES else _MOST_LINES - 1
+    widths = [max(map(len, column)) for column in zip(*rows[:most], strict=True)]
+    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows[:most]]
+    more = [f"  and {grouped(len(rows) - most)} more"] if len(rows) > most else []
+    return "\n".join([title, *(f"  {line}" for line in lines), *more])
+
+
+def html_of(shown: Shown) -> str:
+    """A table for a notebook; the first column names its row."""
+    title, rows = shown
+    return f"<table><caption>{escape(title)}</caption>{''.join(map(_html_row, rows))}</table>"
+
+
+def _html_row(row: Iterable[str]) -> str:
+    first, *rest = map(escape, row)
+    return f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in rest)}</tr>'
+
+
+def drawn(picture: str, thing: Any, ax: Any, **how: Any) -> Any:
+    """Draw a picture of the report into the given Axes, or into those that pyplot draws in; returns the Axes.
+
+    Raises:
+        InputError: Matplotlib is not installed, or ax is something else.
+    """
+    if ax is None:
+        try:
+            from matplotlib import pyplot
+        except ImportError:
+            raise InputError("plot() needs Matplotlib: pip install matplotlib") from None
+        ax = pyplot.gca()
+    if not hasattr(ax, "contourf"):
+        raise InputError(f"ax must be Matplotlib's Axes, not {type(ax).__name__}")
+    getattr(import_module(_PICTURES), picture)(thing, ax, **how)
+    return ax

@@ -1,0 +1,318 @@
+"""The commands as functions, with their options: photographs and observations in, Python objects out."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Literal
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.images import Images, image_files, images_and_videos
+from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.typed import checked
+from ceres_cal.base.words import no_such
+from ceres_cal.calibration import Calibration
+from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
+from ceres_cal.observations import Observations, Prior, combine
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+if TYPE_CHECKING:
+    from ceres_cal.detect.boards import BoardDetections
+    from ceres_cal.detect.photographs import Clicks, FieldDetections, SearchResult
+    from ceres_cal.moves.refit_plan import RefitOptions
+    from ceres_cal.problem.bundle import Progress
+
+# ---- detection ------------------------------------------------------------------------------------------------------
+
+
+@checked
+def detect_board(
+    images: Images,
+    board: Target,
+    *,
+    camera: str = "camera",
+    station: str | None = None,
+    corner_fit: str = "saddle",
+    charuco: str | None = None,
+    marker_m: float | None = None,
+    legacy: bool = False,
+    frames: int = 30,
+    progress: ImageProgress | None = None,
+) -> BoardDetections:
+    """Find a board in photographs or videos of one camera: `detect_board("photographs/", checkerboard(9, 6, 0.025))`.
+
+    Args:
+        images: photographs, folders, patterns or videos. board: a checkerboard, circle grid, AprilGrid or markers.
+        camera, station: names in the observations; the station's is that of the camera by default.
+        corner_fit: "saddle", which also measures boards partly out of the picture, or "opencv".
+        charuco: OpenCV's dictionary of a ChArUco board, such as "DICT_4X4_50"; marker_m: side of its markers, m.
+        legacy: the ChArUco board was made with OpenCV before 4.6. frames: how many to take out of each video.
+        progress: called after each image with (steps done, steps in all, file name).
+
+    Raises:
+        InputError: an image cannot be read, or no image shows the board.
+    """
+    from ceres_cal.detect.boards import detect_boards
+    from ceres_cal.detect.charuco import CharucoSpec
+    from ceres_cal.detect.video import frames_of_videos
+
+    if (charuco is None) != (marker_m is None):
+        raise InputError("charuco and marker_m belong together: give both or neither")
+    corners = corner_fit if charuco is None or marker_m is None else CharucoSpec(charuco, marker_m, legacy)
+    photographs, videos = images_and_videos(images)
+    with TemporaryDirectory() as folder:
+        photographs += frames_of_videos(videos, frames, Path(folder), progress)
+        return detect_boards(photographs, board, camera, station, corners, progress)
+
+
+@checked
+def detect_field(
+    images: Images,
+    target: Target | None = None,
+    start: Calibration | Camera | Clicks | Mapping[str, tuple[float, float]] | None = None,
+    *,
+    auto: bool = False,
+    facing: Mapping[str, str] | None = None,
+    not_painted: Sequence[str] = (),
+    estimate: Sequence[Prior] = (),
+    mask: str | PathLike[str] | None = None,
+    edges: bool = False,
+    lines_only: bool = False,
+    keep_start: bool = False,
+    camera: str | None = None,
+    station: str | None = None,
+    refused: Callable[[Path, SearchResult], None] | None = None,
+    progress: ImageProgress | None = None,
+) -> FieldDetections:
+    """Find the painted lines, corners and crossings of a field in photographs of one station.
+
+    Args:
+        images: photographs that one camera took at one station. target: the field, such as `ssl_field("B")`; by
+            default that of the calibration to start from.
+        start: where the camera was before, or four named points or more with their pixels, roughly. Without a start
+            the field is found in the photograph.
+        auto: find the field also where a calibration is given as start, however far the camera has moved.
+        facing: which way round a symmetric field is: a line or point -> the side of the picture that it lies towards,
+            such as {"LeftGoalLine": "top"}.
+        not_painted: lines of the target that this field does not have. estimate: dimensions to solve for.
+        mask: a picture of the same size; what is black in it is left out. edges: both edges of each line.
+        lines_only: no corners and crossings. keep_start: the start is good to 12 px.
+        camera, station: names in the observations; by default those of the calibration, or "camera".
+        refused: called with the path of each image that does not show the field, and what was seen in it.
+        progress: called after each image with (steps done, steps in all, file name).
+
+    Raises:
+        InputError: an image cannot be read, or a name does not fit. NothingShownError: no image shows the field.
+    """
+    from ceres_cal.detect.images import read_grey
+    from ceres_cal.detect.photographs import SIDES, Auto, Clicks, Facing, FieldOptions
+    from ceres_cal.detect.photographs import detect_field as detected
+
+    sides = facing or {}
+    for feature, side in sides.items():
+        if side not in SIDES:
+            raise InputError(f"facing {feature!r}: {no_such('side', side, SIDES)}")
+    if sides and not auto and start is not None:
+        raise InputError("facing is for a search without a start: a start says which way round the field is")
+    posed: Camera | Clicks | Auto
+    if isinstance(start, Calibration):
+        posed, station = start.station(station), start.estimate.station_name(station)
+        camera = camera or start.estimate.stations[station].camera
+        target = target or field_of(start)
+    elif isinstance(start, Mapping):
+        if auto:
+            raise InputError("auto looks for the field without points: leave out auto, or the points")
+        posed = Clicks(dict(start))
+    elif start is not None:
+        posed = start
+    if start is None or auto:
+        before = None if start is None or not isinstance(posed, Camera) else posed
+        posed = Auto(tuple(Facing(*one) for one in sides.items()), before)
+    if target is None:
+        raise InputError("target is missing: name the field, such as ssl_field('B')")
+    for feature in sides:
+        if feature not in target.point_index and feature not in target.curves:
+            raise InputError(f"facing: {no_such('line or point', feature, (*target.curves, *target.point_index))}")
+    for name in not_painted:
+        if name not in target.curves:
+            raise InputError(f"not_painted: {no_such('line', name, target.curves)}")
+    options = FieldOptions(
+        camera or "camera",
+        station or camera or "camera",
+        points=not lines_only,
+        edges=edges,
+        lengths=tuple(estimate),
+        left_out=None if mask is None else read_grey(Path(mask)) == 0,
+        keep_start=keep_start,
+        refused=refused,
+    )
+    painted = [name for name in target.curves if name not in not_painted]
+    return detected(image_files(images), target, posed, painted, options, progress)
+
+
+def field_of(calibration: Calibration) -> Target | None:
+    """The only target of a calibration with painted lines; None where there are several, or none."""
+    from ceres_cal.detect.photographs.known import is_painted
+
+    fields = [one for one in calibration.targets.values() if is_painted(one)]
+    return fields[0] if len(fields) == 1 else None
+
+
+# ---- observations and calibrations ----------------------------------------------------------------------------------
+
+
+def join(*observations: Observations, same_frame: str | None = None) -> Observations:
+    """The observations of a rig's cameras together, with board labels that agree between the cameras.
+
+    Args:
+        same_frame: which frames are one moment, such as "left*,right*" or "index"; by default those of one name.
+
+    Raises:
+        InputError: sets that contradict one another, or a rule that fits no frames.
+    """
+    from ceres_cal.observations.same_frame import with_same_frames
+    from ceres_cal.start.same_labels import open_words, with_same_labels
+
+    if not observations or not all(isinstance(one, Observations) for one in observations):
+        raise InputError("join(): give Observations, one or more: read files with Observations.load")
+    every = combine(observations)
+    labels = with_same_labels(every if same_frame is None else with_same_frames(every, same_frame))
+    for name in labels.open:
+        warnings.warn(open_words(name), stacklevel=2)
+    return labels.observations
+
+
+@checked
+def check(
+    calibration: Calibration,
+    observations: Observations | Images,
+    false_alarms: float = FALSE_ALARMS,
+    checks: int = 1,
+    *,
+    station: str | None = None,
+    not_painted: Sequence[str] = (),
+    progress: ImageProgress | None = None,
+) -> Agreements:
+    """Test whether a calibration still holds, by new observations of its stations or by photographs of one.
+
+    A yes means that no movement is seen, not that there is none: each answer says how large it may be.
+
+    Args:
+        observations: new observations; or photographs, which are searched for the field of the calibration.
+        false_alarms: how often unmoved cameras may be said to have moved, in so many `checks` together.
+        station: that took the photographs; may be left out where there is only one.
+        not_painted: lines that the photographed field does not have. progress: called after each photograph.
+
+    Raises:
+        InputError: a station that the calibration does not have, or an image that cannot be read.
+        SolutionError: another camera or another field than those calibrated.
+    """
+    from ceres_cal.moves import checks as moves
+
+    if isinstance(observations, Observations):
+        return moves.check(calibration, observations, false_alarms, checks)
+    from ceres_cal.detect.photographs import check_photographs
+
+    images = image_files(observations)
+    how = {"checks": checks, "not_painted": not_painted, "progress": progress}
+    return check_photographs(calibration, images, station, false_alarms, **how)[0]  # type: ignore[arg-type]
+
+
+@checked
+def refit(
+    calibration: Calibration,
+    observations: Observations | Images,
+    what: Literal["pose", "pose-only", "zoom", "iris", "everything"] = "pose",
+    *,
+    moved: Sequence[str] | None = None,
+    options: RefitOptions | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    station: str | None = None,
+    not_painted: Sequence[str] = (),
+) -> Calibration:
+    """Calibrate again after cameras were moved, from few new observations or photographs and all that was known.
+
+    Args:
+        observations: new observations; or photographs of one station, searched for the targets of the calibration.
+        what: what is free. "pose": poses, the intrinsics under what is known of them; "pose-only": poses alone; "zoom":
+            phi, too; "iris": the lens's coefficients, too; "everything": all intrinsics, too.
+        moved: observed stations that moved; by default all. progress: called at every iteration of every solve.
+        station: that took the photographs. not_painted: lines that the photographed field does not have.
+
+    Raises:
+        InputError: names that do not fit, or a calibration that does not say how well it is known.
+        DegenerateError: the observations cannot determine a pose.
+        SolutionError: nothing explains the observations, or something that `what` does not allow for.
+    """
+    from ceres_cal.moves import refits
+
+    if not isinstance(observations, Observations):
+        from ceres_cal.detect.photographs import detect_known
+
+        images = image_files(observations)
+        observations = detect_known(calibration, images, station, not_painted=not_painted).require()
+    return refits.refit(calibration, observations, what, moved=moved, options=options, progress=progress)
+
+
+# ---- everything at once ---------------------------------------------------------------------------------------------
+
+
+@checked
+def run(
+    images: Images,
+    output: str | PathLike[str],
+    *,
+    target: Target | str | None = None,
+    facing: Mapping[str, str] | None = None,
+    not_painted: Sequence[str] = (),
+    board: Target | str | None = None,
+    lens: str = "auto",
+    prior: Sequence[str] = (),
+    estimate: Sequence[str] = (),
+    camera: str = "camera",
+    to: Sequence[str] = (),
+    frames: int = 30,
+) -> Calibration:
+    """Calibrate a camera from photographs or a video in one call, as `ceres-cal run` does.
+
+    Args:
+        images: photographs of one camera, a folder of them, or a video. output: folder for everything that is made.
+        target: the field, such as `ssl_field("B")` or "ssl-b". board: a checkerboard, such as "9x6x25mm".
+        facing: which way round the field is, such as {"LeftGoalLine": "top"}. not_painted: lines that it lacks.
+        lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to solve for.
+        to: formats to export to. frames: how many photographs to take out of a video.
+
+    Raises:
+        InputError: an argument does not fit, or no photograph shows the target. SolutionError: no usable camera.
+    """
+    from ceres_cal.cli.command import COMMANDS
+    from ceres_cal.cli.run import RunArguments
+
+    given = RunArguments(
+        images=tuple(map(str, image_files(images))),
+        output=Path(output),
+        target=json.dumps(target.spec) if isinstance(target, Target) else target,
+        facing=tuple(f"{name}={side}" for name, side in (facing or {}).items()),
+        not_painted=",".join(not_painted),
+        board=_board_words(board) if isinstance(board, Target) else board,
+        lens=lens,
+        prior=tuple(prior),
+        estimate=tuple(estimate),
+        camera=camera,
+        to=tuple(to),
+        frames=frames,
+        quiet=True,
+    )
+    COMMANDS["run"].run(given)
+    return Calibration.load(given.output / "calibration.json")
+
+
+def _board_words(board: Target) -> str:
+    if board.grid is None or not board.grid.checkered:
+        raise InputError(f"board must be a checkerboard, not of kind {board.kind!r}: use detect_board and calibrate")
+    return f"{board.grid.columns}x{board.grid.rows}x{1e3 * board.grid.spacing_m:.9g}mm"
