@@ -287,14 +287,18 @@ def _drawn(equations: Equations, weights: Weights, stated: Structure, end: Robus
 
 def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
     """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
-    radius. Linear ones no camera of square pixels can follow: beside them a board of 90 mm was sheared by 2 mm.
+    radius. Of what is moved about none that are linear, which no camera of square pixels can follow: beside them a
+    board of 90 mm was sheared by 2 mm.
     """
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
+    fixed = np.array([key.placement is None for key in equations.sights.keys])[equations.sight]
     for name in equations.sights.cameras:
         camera = estimate.cameras[name]
         place = (equations.pixel - camera.principal_point) / unit_px(camera)
         x, y = place.T
-        smooth = [x**i * y**j for i in range(_DEGREE + 1) for j in range(max(2 - i, 0), _DEGREE + 1 - i)]
+        least = 0 if np.any(fixed & (owner == name)) else 2
+        powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i) if i + j >= least]
+        smooth = [x**i * y**j * (fixed | (i + j > 1)) for i, j in powers]
         along = np.sum(place * equations.direction, axis=1)
         radial = [np.sum(place**2, axis=1) ** power * along for power in _POWERS]
         every = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
