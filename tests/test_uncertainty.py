@@ -32,8 +32,7 @@ from ceres_cal.posterior.mixture import radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
-from ceres_cal.posterior.uncertainty import Uncertainty
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Options, make_layout, unit_px

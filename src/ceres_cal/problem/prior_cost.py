@@ -14,8 +14,6 @@ from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, logarithmic
 
-_NEAR = 1e-6  # residuals that Cauchy's loss leaves as they are
-
 
 class _Linear(NamedTuple):
     """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
@@ -95,9 +93,10 @@ class PriorCost(CachedCost):
 
 def _bent(residuals: Array) -> tuple[Array, Array]:
     """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
+    near = 1e-6  # residuals that Cauchy's loss leaves as they are
     weight = 1.0 / (1.0 + (residuals / USUAL_BENDS) ** 2)
     bent = USUAL_BENDS * np.sign(residuals) * np.sqrt(np.log1p((residuals / USUAL_BENDS) ** 2))
-    far = np.abs(residuals) > _NEAR
+    far = np.abs(residuals) > near
     return bent, np.where(far, weight * residuals / np.where(far, bent, 1.0), 1.0)
 
 
