@@ -407,7 +407,7 @@ def test_the_default_grid_is_the_field() -> None:
 
 def test_what_no_map_can_be_made_of() -> None:
     known = calibrated(25.0).uncertainty
-    with pytest.raises(InputError, match="there is no station 'gone': there are 'overhead'"):
+    with pytest.raises(InputError, match="there is no station 'gone': choose one of overhead"):
         known.map_sd_mm("gone")
     with pytest.raises(InputError, match="has no free number 'aspect'"):
         known.verdict("camera", "overhead", "aspect")

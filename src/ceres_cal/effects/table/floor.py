@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, Wrong, amounts
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
 
 
-class _Floor(Effect):
-    """What moves the places of targets that are part of the world up or down."""
-
-    wrong: ClassVar[Wrong] = "model"
-    absorbed = True
-
-
-class FloorBowed(_Floor):
+class FloorBowed(Effect):
     """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
 
     kind = "floor bowed"
