@@ -255,11 +255,11 @@ def test_from_photographs_alone_to_a_calibration(
     corners = tmp_path / "corners.json"
     corners.write_text(json.dumps({"format": "ceres-cal/corners", "version": 1, "points": {}}))
     for arguments, message in (
-        (("--facing", "LeftGoalLine=up"), "write NAME=SIDE"),
+        (("--facing", "LeftGoalLine=up"), "no side 'up': choose one of left, right, top"),
         (("--facing", "LeftGoalLine"), "write NAME=SIDE"),
         (("--corner", "TopLeftCorner=1,2"), "give one of them"),
-        (("--start", str(corners)), "only a calibration is of use"),
-        (("--facing", "Nowhere=left"), "has no line, arc or point 'Nowhere'"),
+        (("--start", str(corners)), "--auto takes a calibration as start"),
+        (("--facing", "Nowhere=left"), "facing: there is no line or point 'Nowhere'"),
     ):
         assert main([*detect, "--target", "ssl-b", *arguments]) == 2
         assert message in capsys.readouterr().err

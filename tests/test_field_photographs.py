@@ -309,11 +309,11 @@ def test_command(tmp_path: Path, shot: script.Shot, capsys: pytest.CaptureFixtur
         ((), "say where to start"),
         (("--start", str(corners), *clicked), "say where to start"),
         (("--start", str(corners)), "name the field with --target"),
-        (("--start", other, "--target", "ssl-b"), 'must be "ceres-cal/corners"'),
+        (("--start", other, "--target", "ssl-b"), "it holds observations, where corners to start from must be given"),
         (("--corner", "A=1", "--target", "ssl-b"), "write NAME=X,Y"),
         ((*clicked, *clicked[:2], "--target", "ssl-b"), "is given twice"),
-        ((*clicked, "--target", "ssl-c"), ", nor a file"),
-        ((*clicked, "--target", "ssl-b", "--not-painted", "Nowhere"), "is not one of the target's"),
+        ((*clicked, "--target", "ssl-c"), "there is no target 'ssl-c': did you mean 'ssl-b'?"),
+        ((*clicked, "--target", "ssl-b", "--not-painted", "Nowhere"), "there is no line 'Nowhere': choose one of"),
     ):
         assert main([*detect, *arguments]) == 2
         assert message in capsys.readouterr().err
