@@ -37,7 +37,9 @@ def paint(places: Array) -> Array:
         bits = np.pad(bits, 1, constant_values=1.0)
         turn = np.radians(marker.turn_deg)
         near = np.flatnonzero(np.abs(places - marker.at_m[:2]).max(axis=1) < marker.side_m)
-        away = (places[near] - marker.at_m[:2]) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        away = (places[near] - marker.at_m[:2]) @ np.array(
+            [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        )
         column, row = np.floor(away.T * _CELLS / marker.side_m * [[1.0], [-1.0]] + 0.5 * len(bits)).astype(int)
         on = (np.minimum(column, row) >= 0) & (np.maximum(column, row) < len(bits))
         light[near[on]] = bits[row[on], column[on]]
