@@ -28,7 +28,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.quantities import moved
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import Tolerance
-from ceres_cal.robust.poses import mirrored
+from ceres_cal.robust.other_minima import mirrored
 from ceres_cal.simulate import simulate
 
 RUNS = 20

@@ -17,8 +17,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.effects.evidence import VIEW_ASIDE, RandomEffects
-from ceres_cal.effects.offsets import Offsets
+from ceres_cal.effects.evidence import VIEW_ASIDE, Offsets, RandomEffects
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key

@@ -18,13 +18,13 @@ from ceres_cal.effects.evidence import (
     RandomEffects,
     SizePrior,
     agreement,
-    likeliest_sizes,
     logsum,
+    measure_offsets,
 )
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.offsets import measure_offsets
 from ceres_cal.effects.score_tests import score_all
+from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.effects.strands import decay, distances_of, families_of, views_or_placements
 from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations
@@ -110,17 +110,17 @@ def test_likeliest_sizes_are_the_maximum_of_the_evidence() -> None:
     seen = columns @ truth + rng.standard_normal(600)
     forms = [np.diag(np.repeat([1.0, 0.0], 60)), np.diag(np.repeat([0.0, 1.0], 60))]
     normal, slope = columns.T @ columns, columns.T @ seen
-    found = likeliest_sizes(normal, slope, forms, np.array([1.0, 1.0]), np.array([1e-3, 1e-3]), 1e-6)
+    sigmas, _, _ = likeliest_sizes(normal, slope, forms, np.array([1.0, 1.0]), np.array([1e-3, 1e-3]), 1e-6)
     one = RandomEffects.of(normal, slope, 1e-12)
 
     def evidence(sigmas: Array) -> float:
         return float(one.log_evidence(one.modes(np.diag(np.repeat(sigmas, 60)))[None])[0, 0])
 
-    best = evidence(found.sigmas)
+    best = evidence(sigmas)
     for factor in (0.9, 1.1):
-        assert evidence(found.sigmas * [factor, 1.0]) < best
-        assert evidence(found.sigmas * [1.0, factor]) < best
-    np.testing.assert_allclose(found.sigmas, [0.3, 2.0], rtol=0.2)  # 0.05 measured
+        assert evidence(sigmas * [factor, 1.0]) < best
+        assert evidence(sigmas * [1.0, factor]) < best
+    np.testing.assert_allclose(sigmas, [0.3, 2.0], rtol=0.2)  # 0.05 measured
 
 
 def test_agreement_is_of_different_groups_alone() -> None:
@@ -222,12 +222,12 @@ def test_a_rough_lens(seen: Seen) -> None:
     waves = outward[:, None] * np.cos(np.pi * np.arange(4, 64) * radius[:, None]) * seen.model.weight[:, None]
     rough = seen.model.score + waves @ np.random.default_rng(0).normal(0.0, 0.3, 60)
     slope, normal = waves.T @ seen.left @ rough, waves.T @ seen.left @ waves
-    found = likeliest_sizes(normal, slope, [np.eye(60)], np.array([1.0]), np.array([1e-3]), 1e-6)
+    sigmas, _, _ = likeliest_sizes(normal, slope, [np.eye(60)], np.array([1.0]), np.array([1e-3]), 1e-6)
 
     def log(sigma: float) -> float:
         return restricted(seen.left, waves, rough, sigma**2 * np.eye(60), None, seen.basis)
 
-    assert log(float(found.sigmas[0])) > max(log(0.85 * found.sigmas[0]), log(1.15 * found.sigmas[0]))
+    assert log(float(sigmas[0])) > max(log(0.85 * sigmas[0]), log(1.15 * sigmas[0]))
 
 
 def test_correlated_errors() -> None:

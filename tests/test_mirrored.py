@@ -13,7 +13,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate, Options, make_layout
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.robust.poses import mirrored, without_mirrored_poses
+from ceres_cal.robust.other_minima import mirrored, without_mirrored_poses
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import checkerboard

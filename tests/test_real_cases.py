@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from ceres_cal.moves.scores import score
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 
 HELD = ("--lens", "brown", *(part for name in ("k1", "k2", "k3", "p1", "p2") for part in ("--fix", f"{name}=0")))
 
@@ -47,6 +50,43 @@ def test_lens_none_field_keeps_its_stated_height(case: Callable[[str], Path]) ->
     calibration = calibrate(Observations.load(case("lens_none_field.json")), Options(lens="radial", priors=(prior,)))
     assert calibration.uncertainty.verdict("station", "camera", "height").sd <= 0.02 * (1.0 + 1e-9)  # 1.049 before
     assert 0.1 < calibration.uncertainty.map_sd_mm().mean_mm < 0.5  # 0.18 measured, 97 before; 0.25 off
+
+
+def test_a_wrong_height_is_set_aside(case: Callable[[str], Path]) -> None:
+    """It was named, and phi 654.8 ± 2.5 px stood beside it."""
+    calibration = calibrate(Observations.load(case("height_wrong.json")))
+    assert [one.quantity for one in calibration.conflicts] == ["height"]
+    phi, height = (
+        calibration.uncertainty.verdict(*key) for key in (("camera", "c", "phi"), ("station", "s", "height"))
+    )
+    assert phi.value == pytest.approx(820.0, rel=0.03) and phi.low < 655.0 < 820.0 < phi.high  # 802 measured
+    assert height.low < 3.36 < 4.2 < height.high
+
+
+def test_swapped_pixels_of_boards_are_no_reason_for_distrust(case: Callable[[str], Path]) -> None:
+    """What other lenses do in corners that no board reached turned the whole picture: known to 1114 px, no longer."""
+    observations = Observations.load(case("swapped.json"))
+    calibration = calibrate(observations)
+    phi = calibration.uncertainty.verdict("camera", "camera", "phi")
+    assert phi.value == pytest.approx(800.0, abs=2.0 * phi.sd) and phi.sd < 3.0
+    quality = quality_of(calibration, observations)
+    assert quality.observed_px < 5.0 and judge_quality(quality).level != "no"  # 3.4 measured
+
+
+@pytest.mark.parametrize("share, off_px", [(0.0, 74.0), (0.0, 8.0), (0.2, 20.0)])
+def test_outliers_do_not_decide_the_lens(case: Callable[[str], Path], share: float, off_px: float) -> None:
+    """Lenses are compared over the rows that one robust solve keeps, and by the logarithm of what groups leave:
+    one stray corner of 408 once left kannala-brandt k1, at .37 px.
+    """
+    observations, rng = Observations.load(case("stray_corner.json")), np.random.default_rng(5)
+    strays = rng.choice(len(observations.points), max(1, int(share * len(observations.points))), replace=False)
+    pixels = observations.points.pixels.copy()
+    pixels[strays] += off_px * rng.standard_normal((len(strays), 2))
+    pixels = np.clip(pixels, 0.0, np.array(observations.cameras["c"]) - 1.0)
+    calibration = calibrate(replace(observations, points=replace(observations.points, pixels=pixels)))
+    assert calibration.lens_choice and calibration.lens_choice.chosen.startswith("kannala-brandt k1 k2 k3 ")
+    assert calibration.fit.points_rms_px < 0.12  # 0.112 measured, 0.106 with a fifth aside
+    assert calibration.cameras["c"].phi == pytest.approx(189.6, abs=0.5)  # 0.24 its standard deviation
 
 
 def test_stereo_left_is_solved_as_built(case: Callable[[str], Path]) -> None:
@@ -96,9 +136,8 @@ def test_an_impossible_number_is_named(
 
 def test_as_many_equations_as_numbers(case: Callable[[str], Path], capfd: pytest.CaptureFixture[str]) -> None:
     """soak48: four views of four corners are 32 equations for 32 numbers."""
-    assert "its observations do not tell k3 of the brown lens" in refused(
-        capfd, str(case("soak48.json")), "--lens", "brown"
-    )
+    said = refused(capfd, str(case("soak48.json")), "--lens", "brown")
+    assert "its observations do not tell" in said and "k3 of the brown lens" in said
 
 
 @pytest.mark.parametrize("name", ["zero_division.json", "no_agree.json"])

@@ -32,8 +32,7 @@ from ceres_cal.posterior.mixture import radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
-from ceres_cal.posterior.uncertainty import Uncertainty
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Options, make_layout, unit_px
@@ -408,7 +407,7 @@ def test_the_default_grid_is_the_field() -> None:
 
 def test_what_no_map_can_be_made_of() -> None:
     known = calibrated(25.0).uncertainty
-    with pytest.raises(InputError, match="there is no station 'gone': there are 'overhead'"):
+    with pytest.raises(InputError, match="there is no station 'gone': choose one of overhead"):
         known.map_sd_mm("gone")
     with pytest.raises(InputError, match="has no free number 'aspect'"):
         known.verdict("camera", "overhead", "aspect")

@@ -36,6 +36,13 @@ def median(values: Array) -> float:
     return float(medians(values))
 
 
+def medians_known(values: Array) -> Array:
+    """(...) those of the numbers along the last axis of (..., N) that are not NaN; NaN where none is there."""
+    ordered, count = np.sort(values, axis=-1), np.sum(~np.isnan(values), axis=-1, keepdims=True)
+    middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=-1)
+    return np.asarray(np.mean(np.take_along_axis(ordered, middle, axis=-1), axis=-1))
+
+
 def medians(values: Array) -> Array:
     """(...) those of the numbers along the last axis of (..., N)."""
     count = values.shape[-1]

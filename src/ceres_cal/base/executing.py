@@ -13,8 +13,6 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.threads import share_cores
 
 _T = TypeVar("_T")
-_ASKED_AGAIN_S = 0.1
-_ORPHANED = 143  # as by SIGTERM; nobody is left to ask
 
 
 def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor | None = None) -> Iterator[_T]:
@@ -36,12 +34,13 @@ def _begin(jobs: int) -> None:
 
 def _end_with_the_parent() -> None:
     """The parent alone holds the other end of a pipe, which the system closes with it."""
+    orphaned = 143  # as by SIGTERM; nobody is left to ask
     import multiprocessing
 
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os._exit(_ORPHANED)
+        os._exit(orphaned)
 
 
 @contextmanager
@@ -53,6 +52,7 @@ def processes(jobs: int) -> Iterator[Executor | None]:
     Raises:
         InputError: fewer than 0.
     """
+    asked_again_s = 0.1
     if jobs < 0:
         raise InputError(f"{jobs} jobs at a time: give 1 or more, or 0 for one a core")
     jobs = jobs or os.cpu_count() or 1
@@ -71,7 +71,7 @@ def processes(jobs: int) -> Iterator[Executor | None]:
         for child in set(multiprocessing.active_children()) - before:
             while child.is_alive():  # what writes its results does not hear the first time
                 child.terminate()  # what waits fails with them; to cancel it besides makes Python 3.11 complain
-                child.join(_ASKED_AGAIN_S)
+                child.join(asked_again_s)
         raise
     finally:
         pool.shutdown()

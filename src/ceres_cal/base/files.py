@@ -31,9 +31,6 @@ PIXEL_ORIGIN: PixelOrigin = "centre of the top-left pixel"
 """What files of ours state, and are refused for where they state anything else."""
 
 LIMIT = "CERES_CAL_MOST_MB"
-_MOST_MB = 512  # 10 million observations in an NPZ file, one million in JSON, a photograph of 500 megapixels in grey
-_BYTES_PER_MARK = 80  # of memory, for what stands between two commas, colons or brackets of JSON
-_BYTES_PER_LETTER = 4  # a string takes so much for each letter once one of them is rare
 _NOT_MARKS = bytes(set(range(256)) - set(b"{}[]:,"))
 _NOT_KEYS = bytes(set(range(256)) - set(b"{}:"))
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
@@ -78,7 +75,9 @@ _MEANING = {  # of fields that may be missing
 
 def most_bytes() -> float:
     """What the content of one file may take in memory: 512 MB, or what CERES_CAL_MOST_MB says."""
-    text = os.environ.get(LIMIT, str(_MOST_MB))
+    # 10 million observations in an NPZ file, one million in JSON, a photograph of 500 megapixels in grey
+    most_mb = 512
+    text = os.environ.get(LIMIT, str(most_mb))
     if not text.isdecimal() or int(text) < 1:
         raise InputError(f"{LIMIT} is {text!r}: give a whole number of megabytes")
     return 1e6 * int(text)
@@ -178,8 +177,10 @@ def decode_json(content: bytes, kind: type[T], where: str) -> T | None:
 
 
 def _require_few_marks(content: bytes, where: str) -> None:
+    bytes_per_letter = 4  # a string takes so much for each letter once one of them is rare
+    bytes_per_mark = 80  # of memory, for what stands between two commas, colons or brackets of JSON
     marks = len(content.translate(None, _NOT_MARKS))
-    require_room(_BYTES_PER_LETTER * len(content) + _BYTES_PER_MARK * marks, where)
+    require_room(bytes_per_letter * len(content) + bytes_per_mark * marks, where)
 
 
 def _require_unique_keys(content: bytes, where: str) -> None:

@@ -9,8 +9,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 
 _STEP = 1e-6  # of a number's size, for derivatives
-_MOST_STEPS = 100
-_RESTS = 1e-9  # relative fall of the cost below which nothing is left to gain
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a step there is not taken
@@ -21,9 +19,11 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, sizes: Arra
         residuals: numbers -> (N,), finite at the start; where they are not, the step there is not taken.
         sizes: (K,) by how much each number changes the residuals about as much as the others do.
     """
+    rests = 1e-9  # relative fall of the cost below which nothing is left to gain
+    most_steps = 100
     scaled, at = start / sizes, residuals(start)
     cost, damping = float(at @ at), 1e-4
-    for _ in range(_MOST_STEPS):
+    for _ in range(most_steps):
         jacobian = np.empty((len(at), len(scaled)))
         for k in range(len(scaled)):
             step = np.zeros(len(scaled))
@@ -42,6 +42,6 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, sizes: Arra
                 scaled, at, cost, damping = there, moved, lower, 0.1 * damping
                 break
             damping *= 10.0
-        if not cost < before * (1.0 - _RESTS):
+        if not cost < before * (1.0 - rests):
             break
     return np.asarray(scaled * sizes)

@@ -10,9 +10,6 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 _T = TypeVar("_T")
-# Of glibc's mallopt: what it comes to by itself, at most, once a process has freed something large.
-_TRIM, _MAP = (-1, 1 << 26), (-3, 1 << 25)
-_LOOK_S = 0.05  # how often Python looks up from native work, for Ctrl-C
 _unfinished: list[threading.Thread] = []
 
 
@@ -31,12 +28,14 @@ def keep_freed_memory() -> None:
     It does by itself, but not where a process was told otherwise, as Dask's workers are: there each array is had from
     the system anew, which is a third of the time of sums over many rows.
     """
+    # Of glibc's mallopt: what it comes to by itself, at most, once a process has freed something large.
+    trim, mapped = (-1, 1 << 26), (-3, 1 << 25)
     import ctypes
 
     library = ctypes.CDLL(None)
     if hasattr(library, "mallopt"):
-        library.mallopt(*_TRIM)
-        library.mallopt(*_MAP)
+        library.mallopt(*trim)
+        library.mallopt(*mapped)
 
 
 def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) -> _T:
@@ -47,6 +46,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
     Raises:
         TimeoutError: it takes longer than `timeout_s`.
     """
+    look_s = 0.05  # how often Python looks up from native work, for Ctrl-C
     results: list[tuple[Any, BaseException | None]] = []
 
     def work() -> None:
@@ -62,7 +62,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
     while thread.is_alive():
         if end is not None and time.monotonic() > end:
             raise TimeoutError
-        thread.join(_LOOK_S)
+        thread.join(look_s)
     _unfinished.remove(thread)
     result, error = results[0]
     if error is not None:

@@ -16,7 +16,6 @@ NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
 1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
 _REGULAR = 1e6  # the inverse of such an eigenvalue; plain inverses are good to 1e-9 there
-_RESIDUE = 1e-11  # what a Schur complement leaves of a direction that is unknown, relative to what went in
 
 
 def _nothing(count: int) -> float:
@@ -72,11 +71,12 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
     Args:
         here: (n, n). coupling: (m, n). others: (m, m), their limits (m,) see `Spread.of`.
     """
+    residue = 1e-11  # what a Schur complement leaves of a direction that is unknown, relative to what went in
     left = here - coupling.T @ known_inverses(others, limits) @ coupling
     diagonal = np.diagonal(here)
     scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
     values, vectors = np.linalg.eigh(0.5 * (left + left.T) * scale[:, None] * scale)
-    root = vectors * np.sqrt(np.where(values > _RESIDUE, values, 0.0)) / scale[:, None]  # the rest is rounding
+    root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) / scale[:, None]  # the rest is rounding
     return np.asarray(root @ root.T)
 
 

@@ -18,12 +18,8 @@ NORMAL_95 = 1.959963984540054
 """Half width, in standard deviations, of the interval that holds 95 % of a normal variable."""
 NORMAL_95_ONE_SIDED = 1.645
 """Standard deviations that 95 % of a normal variable stay below."""
-_PARTS, _REACH = 40, 6.0  # of a mean over a normal variable: steps to either side, and how far in sigmas
 _FEW, _FAR = 12, 1e3  # degrees of freedom; a value
-_TINY = 1e-300
-_FARTHEST = 40.0  # standard deviations beyond which a tail is no number
 _MOST_TERMS = 20_000
-_LEAST_TERM = 1e-16  # of a series' sum so far: what comes after is lost in rounding
 _lgamma = np.vectorize(math.lgamma, otypes=[float])
 
 
@@ -44,7 +40,8 @@ _CHEBYSHEV = (
 
 def normal_cdf(x: ArrayLike) -> Array:
     """Probability that a standard normal variable is smaller, to seven digits."""
-    z = np.clip(np.asarray(x, dtype=float), -_FARTHEST, _FARTHEST) / -math.sqrt(2.0)
+    farthest = 40.0  # standard deviations beyond which a tail is no number
+    z = np.clip(np.asarray(x, dtype=float), -farthest, farthest) / -math.sqrt(2.0)
     t = np.asarray(1.0 / (1.0 + 0.5 * np.abs(z)))
     series = np.zeros_like(t)
     for coefficient in _CHEBYSHEV:
@@ -106,10 +103,11 @@ def quadratic_tail(value: float, variances: Array, squares: Array, freedom: floa
 
 def _over_noise(value: float, freedom: float) -> tuple[Array, Array]:
     """A value at what the noise behind it may be, and the weights of these, after Wilson and Hilferty."""
+    parts, reach = 40, 6.0  # of a mean over a normal variable: steps to either side, and how far in sigmas
     if math.isinf(freedom):
         return np.array([value]), np.ones(1)
     spread = 2.0 / (9.0 * max(freedom, 3.0))
-    z = np.linspace(-_REACH, _REACH, 2 * _PARTS + 1)
+    z = np.linspace(-reach, reach, 2 * parts + 1)
     return value * np.maximum(1.0 - spread + z * math.sqrt(spread), 0.0) ** 3, np.exp(-0.5 * z * z)
 
 
@@ -155,12 +153,13 @@ def _log_gamma_front(a: Array, x: Array) -> Array:
 
 def _lower_series(a: Array, x: Array) -> Array:
     """1 / a + x / (a (a + 1)) + ... of the lower tail, DLMF 8.7.1; it converges fast for x up to about a."""
+    least_term = 1e-16  # of a series' sum so far: what comes after is lost in rounding
     one = 1.0 / a
     total = one.copy()
     for n in range(1, _MOST_TERMS):
         one = one * x / (a + n)
         total += one
-        if np.all(one < _LEAST_TERM * total):
+        if np.all(one < least_term * total):
             break
     return total
 
@@ -202,14 +201,15 @@ def _log_beta_fraction(a: Array, b: Array, x: Array) -> Array:
 
 def _lentz(term: Callable[[int], tuple[Array, Array]], first: Array) -> Array:
     """first + a_1 / (b_1 + a_2 / (b_2 + ...)) with term(n) = (a_n, b_n)."""
-    value = np.where(np.abs(first) > _TINY, first, _TINY)
+    tiny = 1e-300
+    value = np.where(np.abs(first) > tiny, first, tiny)
     c, d = value, np.zeros_like(value)
     for n in range(1, _MOST_TERMS):
         upper, lower = term(n)
         d = lower + upper * d
-        d = 1.0 / np.where(np.abs(d) > _TINY, d, _TINY)
+        d = 1.0 / np.where(np.abs(d) > tiny, d, tiny)
         c = lower + upper / c
-        c = np.where(np.abs(c) > _TINY, c, _TINY)
+        c = np.where(np.abs(c) > tiny, c, tiny)
         value = value * c * d
         if np.all(np.abs(c * d - 1.0) < 1e-15):
             break

@@ -17,9 +17,6 @@ from threadpoolctl import ThreadpoolController
 if TYPE_CHECKING:
     from concurrent.futures import Future, ThreadPoolExecutor
 
-_WORTH_US = 180.0  # of work in a part; below it a thread costs more than it brings
-_LATER_US = 100.0  # that another thread begins after this one
-_MOST = 8
 _allowed: ContextVar[int] = ContextVar("allowed", default=0)
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
@@ -38,7 +35,8 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has the pool, b
 
 @cache
 def _cores() -> int:
-    return min(os.cpu_count() or 1, _MOST)
+    most = 8
+    return min(os.cpu_count() or 1, most)
 
 
 @cache
@@ -84,9 +82,11 @@ def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
     Args:
         rows: how many they hold in all. row_ns: about how long one of them takes.
     """
+    later_us = 100.0  # that another thread begins after this one
+    worth_us = 180.0  # of work in a part; below it a thread costs more than it brings
     work_us = 1e-3 * row_ns * rows
-    count = max(1, min(available(), int(work_us / _WORTH_US)))
-    ahead = items * _LATER_US / work_us if count > 1 else 0.0
+    count = max(1, min(available(), int(work_us / worth_us)))
+    ahead = items * later_us / work_us if count > 1 else 0.0
     return [0, *(int(ahead + (items - ahead) * number / count) for number in range(1, count)), items]
 
 

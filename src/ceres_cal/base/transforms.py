@@ -18,7 +18,6 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import numbers_in
 
-_ROUNDING = 1e-6  # numbers that somebody copied have six digits or more
 _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
 
 
@@ -92,9 +91,10 @@ def left_jacobian(rotation_vector: ArrayLike) -> Array:
 
 def require_rotation(matrix: ArrayLike, name: str) -> Array:
     """A 3 x 3 matrix that somebody wrote with six digits or more; InputError where it is no rotation matrix."""
+    rounding = 1e-6  # numbers that somebody copied have six digits or more
     m = np.asarray(matrix, dtype=float)
     off = float(np.max([*np.abs(m @ m.T - np.eye(3)).flat, abs(np.linalg.det(m) - 1.0)]))
-    if not off < _ROUNDING:
+    if not off < rounding:
         raise InputError(
             f"{name} is no rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"
         )

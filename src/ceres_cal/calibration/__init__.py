@@ -1,8 +1,17 @@
 """The result of a calibration, how it came about, and its file."""
 
 from ceres_cal.calibration.calibration import Calibration
-from ceres_cal.calibration.file import FORMAT, CalibrationFile
-from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, TriedLens, package_versions
+from ceres_cal.calibration.file import (
+    COPY,
+    FORMAT,
+    CalibrationFile,
+    Fit,
+    LensChoice,
+    Refitted,
+    Rejected,
+    TriedLens,
+    package_versions,
+)
 
 __all__ = [
     "COPY",

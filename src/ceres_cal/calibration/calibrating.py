@@ -32,7 +32,7 @@ from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.posterior.assess import assess, with_doubts, with_other_lenses, with_roughness
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.bundle import Progress, Solution
 from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, problem_of
@@ -45,8 +45,8 @@ from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, contradicted_by, find_conflicts
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
-from ceres_cal.robust.robust import RobustSolution, require_fits, solve_robustly
-from ceres_cal.robust.usable import require_possible, require_usable
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.usable import require_fits, require_possible, require_usable
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
 
@@ -55,10 +55,6 @@ if TYPE_CHECKING:
     from ceres_cal.robust.bulk import Bulk, Settled, Subset
 
 
-# Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
-# outliers are those of the right drawing; and how many there may be.
-_REDRAWN, _MOST_DRAWINGS = 0.005, 4
-_LONG_TO_DIGEST = 20_000  # observations: fewer take less than a thread, and what makes one
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
     "priors and their units"
@@ -116,19 +112,22 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(start, observations, sights, options, Watched()).redrawn()
+        return _of_lens(start, observations, sights, options, Watched(bends=False)).redrawn()
 
 
 def _measured(
     observations: Observations, options: Options, progress: Callable[[Progress], None] | None, client: Any
 ) -> Calibration:
     """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
-    for _ in range(_MOST_DRAWINGS):
+    # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start
+    # and outliers are those of the right drawing; and how many there may be.
+    redrawn, most_drawings = 0.005, 4
+    for _ in range(most_drawings):
         calibration = _calibrated(observations, options, progress, client)
         before = calibration.estimate.structure
         calibration = calibration.redrawn()
         moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
-        if float(np.max(np.abs(moved), initial=0.0)) < _REDRAWN:
+        if float(np.max(np.abs(moved), initial=0.0)) < redrawn:
             break
         observations = calibration.drawn_alike(observations)
     return calibration
@@ -259,10 +258,12 @@ class Watched:
 
     Attributes:
         progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
+        bends: whether it matters how the uncertainty bends.
     """
 
     progress: Callable[[Progress], None] | None = None
     settle: Callable[..., Settled] | None = None
+    bends: bool = True
 
 
 def solved_from(
@@ -273,7 +274,8 @@ def solved_from(
     Raises:
         CalibrationError: see `calibrate`.
     """
-    takes_long = len(observations.points) + len(observations.curves) > _LONG_TO_DIGEST
+    long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
+    takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
@@ -294,13 +296,22 @@ def solved_from(
 
         beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
         problem, end = beside.problem, beside.end
-    end, others = least_of_few(problem, observations, end, start.others) if again is None else (end, ())
+    others: tuple[Solution, ...] = ()
+    if again is None and end.problem.sights.equations == problem.sights.equations:
+        least, others = least_of_few(end.problem, end.solution.estimate, start.others)
+        if least is not end.solution.estimate:
+            end = replace(end.moved_to(least, observations, problem), reduced=None)
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     posterior, conflicts, settled = None, Conflicts(), None
     assessed = again is None or again.assessed
     if assessed:
-        conflicts = find_conflicts(problem, observations, end, usual)
+        part = taking_part(problem, observations, explanations) if again is None else None
+        conflicts = find_conflicts(problem, observations, end, usual, part)
+    if conflicts.answer is not None:
+        problem = replace(problem, priors=conflicts.answer.problem.priors)
+        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        end, others = replace(conflicts.answer, residuals=shown), ()
     if watched.settle is not None:
         settled = watched.settle(problem, end, explanations, watched.progress)
         end = settled.end
@@ -308,13 +319,13 @@ def solved_from(
     effects = beside.estimates if beside else ()
     warnings = (*warnings, *(one.warning for one in effects))
     if assessed:
-        end, posterior = _assess(end, observations, problem, again)
+        end, posterior = _assess(end, observations, problem, again, watched.bends)
         if again is None:
             require_lens_told(end.solution.estimate, posterior)
         posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
         posterior = with_roughness(posterior, end, observations) if again is None else posterior
         posterior = with_doubts(posterior, end, conflicts, explanations, others)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *conflicts.words, *unknown_phi(end, posterior))
         warnings = (
             *warnings,
             *resting_phi(end, problem),
@@ -325,7 +336,8 @@ def solved_from(
     calibration = came_out(start.phi_from, observations, problem, end, explanations)
     if settled is not None:
         calibration = of_all(calibration, settled)
-    warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
+    wholes = [one.rows for one in explanations if one.is_taken]
+    warnings = (*calibration.warnings, *require_usable(end, problem, wholes), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
     options = replace(problem.options, tolerances=tolerances)
@@ -344,7 +356,7 @@ def _as_long_as_asked(
 
 
 def _assess(
-    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None
+    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None, bends: bool
 ) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
@@ -360,7 +372,8 @@ def _assess(
         found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
         return measure_scatter(observations, known, found, there, says)
 
-    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
+    freedom = end.inliers.degrees_of_freedom
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, bends=bends)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 

@@ -17,15 +17,20 @@ from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_
 from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
+    COPY,
     FORMAT,
     VERSION,
     CalibrationFile,
+    Fit,
+    LensChoice,
+    Refitted,
     RefittedFile,
+    Rejected,
     StationFile,
     options_from_json,
     options_to_json,
+    package_versions,
 )
-from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
@@ -39,7 +44,7 @@ from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import every_key
 from ceres_cal.problem.structure import redrawn
-from ceres_cal.robust.stated import Conflict
+from ceres_cal.robust.stated import Conflict, agreed
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
@@ -202,9 +207,11 @@ class Calibration:
         weighting = Weighting(*self.fit.scales, options.loss, options.loss_scale)
         if new_data or prior is None or self.posterior is None:
             priors = gather_priors(observations, options, self.estimate.structure)
-            return Problem(sights, make_layout(observations, options), priors, weighting, options)
-        priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
-        return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
+            layout = make_layout(observations, options)
+        else:
+            priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
+            layout = self.posterior.layout(self.estimate)
+        return Problem(sights, layout, agreed(priors, self.conflicts), weighting, options)
 
     def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
         """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
@@ -260,12 +267,17 @@ class Calibration:
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
         estimate = data.estimate(targets, options)
-        known = every_key(estimate)
+        known, told = every_key(estimate), data.posterior
+        posterior = None if told is None else told.posterior(known)
+        if told is not None and posterior is not None and (told.profiles or told.bends):
+            from ceres_cal.posterior.files_before import as_mixtures
+
+            posterior = as_mixtures(told, posterior)
         return cls(
             estimate,
             targets,
             options=options,
-            posterior=None if data.posterior is None else data.posterior.posterior(known),
+            posterior=posterior,
             refitted=None if data.refitted is None else data.refitted.refitted(known),
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},

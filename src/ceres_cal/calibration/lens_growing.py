@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.observations import Observations
-from ceres_cal.posterior.roughness import AGREES, agreement
+from ceres_cal.posterior.other_lenses import AGREES, agreement
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, problem_of

@@ -15,7 +15,7 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.words import bounds_text, two_digits
 from ceres_cal.calibration.calibration import Calibration
-from ceres_cal.calibration.origin import COPY, Fit, Rejected
+from ceres_cal.calibration.file import COPY, Fit, Rejected
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.uncertainty import Uncertainty

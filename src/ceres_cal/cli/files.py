@@ -41,15 +41,14 @@ def spelled_target(text: str, where: str) -> Target | None:
 
 def read_target(text: str, name: str) -> Target:
     """The target of `--target`: by its name, spelled out, or in a file, alone or as one of that name among several."""
-    from ceres_cal.scene.targets import target_from_spec, targets_by_name
+    from ceres_cal.scene.targets import target_from_spec, target_named, targets_by_name
 
     if (spelled := spelled_target(text, "--target")) is not None:
         return spelled
-    by_name = targets_by_name()
-    if text in by_name:
-        return by_name[text]
+    if (known := target_named(text)) is not None:
+        return known
     if not Path(text).exists():
-        raise InputError(f"--target: {no_such('target', text, by_name)} (or a file)")
+        raise InputError(f"--target: {no_such('target', text, targets_by_name())} (or a file)")
     content = json_object(Path(text))
     named = content.get("targets")
     spec = named.get(name) if isinstance(named, dict) else content

@@ -26,7 +26,7 @@ _BLACK, _WHITE = 0, 255
 
 
 @dataclass(frozen=True)
-class Step:
+class PageStep:
     """A command with its arguments, and what it writes."""
 
     name: str
@@ -54,10 +54,10 @@ class PageCommands:
             CalibrationError: what a command raises, or there is nothing to look for.
         """
         write_inputs(state, self.sitting, folder, auto=auto)
-        done: list[Step] = []
+        done: list[PageStep] = []
         boards = () if known is None else known.boards
 
-        def observe(step: Step) -> Any:
+        def observe(step: PageStep) -> Any:
             done.append(step)
             if known is None:
                 return _answer(step).data["found"]
@@ -79,13 +79,13 @@ class PageCommands:
         return Made(tuple(step.typed for step in done), observed, calibrated.output, boards)
 
 
-def _answer(step: Step) -> Document:
+def _answer(step: PageStep) -> Document:
     """What the command answers; nothing of how far it is."""
     quiet = [] if step.name == "export" else ["--quiet"]
     return COMMANDS[step.name].run(COMMANDS[step.name].parse([*step.arguments, *quiet]))
 
 
-def board_step(state: State, sitting: Sitting, folder: Path) -> Step:
+def board_step(state: State, sitting: Sitting, folder: Path) -> PageStep:
     """Boards in all photographs."""
     size = state.board.lower().split("x")
     if len(size) != 3:
@@ -94,12 +94,12 @@ def board_step(state: State, sitting: Sitting, folder: Path) -> Step:
     images = [str(path) for path in sitting.photographs]
     output = folder / "board.json"
     words = ["--columns", size[0], "--rows", size[1], "--square", square, "--camera", CAMERA, "-o", str(output)]
-    return Step("detect board", (*images, *words), output)
+    return PageStep("detect board", (*images, *words), output)
 
 
 def field_steps(
     state: State, target: Target, sitting: Sitting, folder: Path, boards: Collection[Path], *, auto: bool
-) -> Iterator[Step]:
+) -> Iterator[PageStep]:
     """The field in the photographs that show no board: those with a mask of their own one by one.
 
     Raises:
@@ -130,23 +130,23 @@ def field_steps(
             words += ["--mask", str(folder / _mask_name(group[0]))]
         output = folder / (f"field-{number}.json" if number > 1 else "field.json")
         words += [] if sitting.start is not None else ["--camera", CAMERA]  # else by the names of the calibration
-        yield Step("detect field", (*map(str, group), *words, "-o", str(output)), output)
+        yield PageStep("detect field", (*map(str, group), *words, "-o", str(output)), output)
 
 
-def calibrate_step(state: State, observed: Sequence[Path], folder: Path, report: bool) -> Step:
+def calibrate_step(state: State, observed: Sequence[Path], folder: Path, report: bool) -> PageStep:
     """One calibration of all that was observed."""
     priors = [word for prior in state.priors for word in ("--prior", prior)]
     lengths = ["--estimate", ",".join(state.solved)] if state.solved else []
     page = ["--report", str(folder / "report.html")] if report else []
     output = folder / "calibration.json"
-    return Step("calibrate", (*map(str, observed), *priors, *lengths, "-o", str(output), *page), output)
+    return PageStep("calibrate", (*map(str, observed), *priors, *lengths, "-o", str(output), *page), output)
 
 
-def export_steps(state: State, folder: Path) -> Iterator[Step]:
+def export_steps(state: State, folder: Path) -> Iterator[PageStep]:
     """Each format that was chosen."""
     for name in state.exports:
         output = folder / f"{name}{(export_format(name).endings or ('',))[0]}"
-        yield Step("export", (str(folder / "calibration.json"), "--to", name, "-o", str(output)), output)
+        yield PageStep("export", (str(folder / "calibration.json"), "--to", name, "-o", str(output)), output)
 
 
 # ---- what commands read ---------------------------------------------------------------------------------------------

@@ -12,14 +12,14 @@ from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.scene.targets import Target
 
-_BORDER_BITS = (2, 1)  # of dark cells around a tag's code: Kalibr's own, and others' grids
 _CORNERS = ((0, 0), (0, 1), (1, 1), (1, 0))  # row and column within a tag, in OpenCV's order
 
 
 def measured_april_grid(image: Image, levels: Image8, board: Target) -> Array | str:
     """Corners (2 rows, 2 columns, 2) px, NaN where one was not seen, or why there are none."""
+    border_bits = (2, 1)  # of dark cells around a tag's code: Kalibr's own, and others' grids
     columns, rows = board.spec["columns"], board.spec["rows"]
-    found = max((_tags(levels, bits, columns * rows) for bits in _BORDER_BITS), key=len)
+    found = max((_tags(levels, bits, columns * rows) for bits in border_bits), key=len)
     if len(found) < 2:
         return f"{len(found)} of {columns * rows} tags found"
     places = board.point_array[:, :2].reshape(2 * rows, 2 * columns, 2)

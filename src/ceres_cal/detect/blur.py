@@ -14,8 +14,6 @@ _WINDOWS = 150  # that tell a blur
 # Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
 # windows that count as much as no direction having any.
 _SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
-_AS_SMEARED = 2.5  # of the Gaussian that suits a smeared line best: the smear that it is
-_IN_FOCUS_PX = 1.0  # of a lens: what is blurred more in every direction is smeared
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +40,11 @@ class Blur:
 
     def smeared(self, rows: Indices) -> EdgeShape:
         """What these places look like if what is beyond a lens's blur is a smear."""
-        lens = min(float(np.min(self.blur_px)), _IN_FOCUS_PX)
+        in_focus_px = 1.0  # of a lens: what is blurred more in every direction is smeared
+        as_smeared = 2.5  # of the Gaussian that suits a smeared line best: the smear that it is
+        lens = min(float(np.min(self.blur_px)), in_focus_px)
         here = float(np.median(self.blur_px[rows]))
-        smear = _AS_SMEARED * np.sqrt(max(here**2 - lens**2, 0.0))
+        smear = as_smeared * np.sqrt(max(here**2 - lens**2, 0.0))
         return EdgeShape(lens if smear > 0.0 else here, self.stretch, float(smear))
 
 

@@ -12,9 +12,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, along_curve, along_track, curve_points, nearest_on_curve
 from ceres_cal.scene.targets import Target
 
-_WIDEST_PX = 100.0
-_PIECES = 240  # of a curve, to measure its length in the image
-
 
 @dataclass(frozen=True, eq=False)
 class Course:
@@ -49,21 +46,23 @@ def predict(
     Args:
         camera: its cam_from_world is cam_from_target. margin_px: how far inside the image they must lie.
     """
+    widest_px = 100.0
     painted = [i for i, (name, curve) in enumerate(target.curves.items()) if name in curves and curve.width_m > 0.0]
     number, s = _places(target, camera, np.array(painted, dtype=np.int32), spacing_px, margin_px)
     course = course_at(target, camera, number, s)
     # Where the lens folds over, paint may have one edge only; and what is wider no search is meant for.
     whole = np.isfinite(course.curvature + np.sum(course.pixels + course.normals, axis=1))
-    return course.take(whole & (course.width_px < _WIDEST_PX))
+    return course.take(whole & (course.width_px < widest_px))
 
 
 def _places(
     target: Target, camera: Camera, curves: Indices32, spacing_px: float, margin_px: float
 ) -> tuple[Indices32, Array]:
     """Curve (N,) and parameter (N,) of the places; what is projected is projected at once, which spares most of it."""
+    pieces = 240  # of a curve, to measure its length in the image
     low, high = np.array([curve.parameter_range for curve in target.curves.values()]).reshape(-1, 2)[curves].T
-    s = np.linspace(low, high, _PIECES + 1, axis=1)
-    pixels = _seen(target, camera, np.repeat(curves, _PIECES + 1), s.ravel()).reshape(*s.shape, 2)
+    s = np.linspace(low, high, pieces + 1, axis=1)
+    pixels = _seen(target, camera, np.repeat(curves, pieces + 1), s.ravel()).reshape(*s.shape, 2)
     size = np.array(camera.image_size)
     with np.errstate(invalid="ignore"):
         near = np.all((pixels > -0.5 * size) & (pixels < 1.5 * size), axis=2)

@@ -13,13 +13,9 @@ from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import distance_to_curve, nearest_on_curve
 from ceres_cal.scene.targets import Target
 
-_ON_CURVE_M = 1e-6
-_EACH_WAY, _ONE_WAY, _FEWEST = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
-_REACH_PX = 100.0
 # Places that scatter as stated, beside those of a branch, which are few: where these scatter more (worn paint ends in
 # one, a shadow in another), so does where it leads. From 0 to 8 nothing changes but the largest errors.
 _AS_STATED = 2.0
-_MOST_STRETCHED = 3.0  # of the crossing's longest standard deviation over its shortest
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +49,7 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
     Each branch is a straight line through the offsets of its nearest places from the course; the course itself bends as
     lens and arc do.
     """
+    on_curve_m = 1e-6
     used = np.zeros(len(lines.course), dtype=bool)
     features, pixels, sigmas = [], [], []
     seen = [
@@ -60,7 +57,7 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
         for number in np.unique(lines.course.curve[lines.found])
     ]
     for number, point in enumerate(target.point_array):
-        curves = [curve for curve, shape in seen if distance_to_curve(shape, point[None])[0] < _ON_CURVE_M]
+        curves = [curve for curve, shape in seen if distance_to_curve(shape, point[None])[0] < on_curve_m]
         branches = [b for curve in curves if (b := _branch(target, camera, lines, curve, point, used)) is not None]
         met = _met(branches)
         if met is None:
@@ -76,6 +73,8 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
 
 
 def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:
+    reach_px = 100.0
+    each_way, one_way, fewest = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
     course = lines.course
     foot = nearest_on_curve(target.curves[target.curve_names[curve]], point[None])
     here = course_at(target, camera, np.array([curve], np.int32), foot)
@@ -83,11 +82,11 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
     away = course.pixels[rows] - here.pixels[0]
     along = away @ np.array([here.normals[0, 1], -here.normals[0, 0]])
     order = np.argsort(np.abs(along))
-    order = order[np.linalg.norm(away[order], axis=1) < _REACH_PX]
+    order = order[np.linalg.norm(away[order], axis=1) < reach_px]
     before, after = order[along[order] <= 0.0], order[along[order] > 0.0]
-    most = _EACH_WAY if len(before) and len(after) else _ONE_WAY
+    most = each_way if len(before) and len(after) else one_way
     chosen = np.concatenate([before[:most], after[:most]])
-    if len(chosen) < _FEWEST:
+    if len(chosen) < fewest:
         return None
     rows, along = rows[chosen], along[chosen]
     weight = lines.sigma_px[rows] ** -2.0
@@ -101,13 +100,14 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
 
 def _met(branches: list[_Branch]) -> tuple[Array, float] | None:
     """Where branches meet, (2,) px from where they should, and its sigma; None where they do not tell it."""
+    most_stretched = 3.0  # of the crossing's longest standard deviation over its shortest
     if len(branches) < 2:
         return None
     normals = np.array([branch.normal for branch in branches])
     weight = np.array([1.0 / branch.variance for branch in branches])
     information = normals.T @ (weight[:, None] * normals)
     least, most = np.linalg.eigvalsh(information)
-    if not least > most / _MOST_STRETCHED**2:
+    if not least > most / most_stretched**2:
         return None
     covariance = np.linalg.inv(information)
     offset = covariance @ (normals.T @ (weight * np.array([branch.offset_px for branch in branches])))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask
+from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
 from ceres_cal.detect.blur import blur_of, no_blur
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows, fit_profiles
@@ -150,7 +150,7 @@ def _preferred(response: Array, away: Array) -> Array:
     """(N, S) how much a step (S,) is to be taken for the line: a peak that is near. Brighter than paint usually is no
     more paint: a boundary line beside the field's own is wider.
     """
-    bright, usual = np.maximum(response, 0.0), max(float(np.median(np.max(response, axis=1))), _TINY)
+    bright, usual = np.maximum(response, 0.0), max(median(np.max(response, axis=1)), _TINY)
     preferred = _is_peak(response) * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2)
     return np.where(np.isfinite(response), preferred, -np.inf)
 
@@ -193,7 +193,7 @@ def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | fl
     fits = fit_profiles(windows, blur.stretch * edges, blur.blur_px, 1.5, blur.smear_px)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     offset = rough + fits.offset_px
-    found = _is_paint(course, fits, contrast, np.median(windows.values, axis=1))
+    found = _is_paint(course, fits, contrast, medians(windows.values))
     found = _goes_on(course, found, offset, fits.sigma_px)
     aside, remains = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
     offset, sigma = offset - aside, np.hypot(fits.sigma_px, remains)
@@ -233,14 +233,14 @@ def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) ->
     clear = fitted & (contrast > _LEAST_CLARITY * fits.noise)
     if not np.any(clear):
         return clear
-    usual = float(np.median(contrast[clear]))
+    usual = median(contrast[clear])
     clear &= contrast > _LEAST_CONTRAST * usual
     alike = np.zeros(len(clear), dtype=bool)
     for height in (contrast, contrast / np.maximum(around, 1.0)):
         nearby = _medians(np.where(clear, height, np.nan), course.curve)
         alike |= (height > _OF_NEARBY[0] * nearby) & (height < _OF_NEARBY[1] * nearby)
     clear &= alike
-    return np.asarray(clear & (fits.noise < _NOISY * np.median(fits.noise[clear])))
+    return np.asarray(clear & (fits.noise < _NOISY * median(fits.noise[clear])))
 
 
 def _neighbours(values: Array, curve: Indices32) -> Array:
@@ -257,7 +257,7 @@ def _medians(values: Array, curve: Indices32) -> Array:
     """(N,) the median of each place's neighbours, its own value where there are none."""
     around = np.column_stack([_neighbours(values, curve), values])
     around[np.all(np.isnan(around), axis=1), 0] = 0.0
-    return np.asarray(np.nanmedian(around, axis=1))
+    return medians_known(around)
 
 
 def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
@@ -265,9 +265,9 @@ def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
     around = _neighbours(np.where(found, offset, np.nan), course.curve)
     alone = np.count_nonzero(np.isfinite(around), axis=1) < 2
     around[np.all(np.isnan(around), axis=1), 0] = 0.0
-    middle = np.nanmedian(around, axis=1)
+    middle = medians_known(around)
     # Paint that wanders is still paint: what its neighbours do among themselves, it may do too.
-    wander = np.nanmedian(np.abs(around - middle[:, None]), axis=1) / 0.6745
+    wander = medians_known(np.abs(around - middle[:, None])) / 0.6745
     near = np.abs(offset - middle) < np.maximum(np.maximum(_FAR * sigma, _FAR_PX), _WANDERING * wander)
     return np.asarray(found & near & ~alone)
 
@@ -291,5 +291,5 @@ def _scatter(three: Indices, offset: Array, sigma: Array) -> float:
         return 0.0
     change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
     more = _SCATTER_PX[:, None]
-    usual = np.median(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2), axis=1)
+    usual = medians(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2))
     return float(_SCATTER_PX[np.argmin(np.abs(usual / 0.6745 - 1.0))])

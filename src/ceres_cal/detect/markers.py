@@ -17,12 +17,6 @@ from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profi
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.marker_targets import CORNERS
 
-_ENDS = 0.12  # share of a side at either end where the corner's rounding is
-_EVERY_PX, _MOST_PLACES = 2.0, 24  # along a side
-_HALF_WIDTH_PX, _MOST_HALF_LENGTH_PX = 1, 5.0
-_LEAST_HALF_LENGTH_PX = 1.5  # of a window; sides of smaller cells cannot be measured
-_CELL = 0.5  # of a cell of the marker: how far a window reaches, for its border is one cell wide, or two
-_SAG = 0.003  # of a side: standard deviation of how far a lens bends it, beforehand
 _FAR = 4.0  # medians beyond which a place on a side shows something else
 _FEWEST_PLACES = 5
 
@@ -73,17 +67,22 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
     """(4, 3) how far each side lies outside the quad's, px, as a polynomial of the place along it from -1 to 1; None
     where one is not seen, or its cells are too small.
     """
+    cell = 0.5  # of a cell of the marker: how far a window reaches, for its border is one cell wide, or two
+    least_half_length_px = 1.5  # of a window; sides of smaller cells cannot be measured
+    half_width_px, most_half_length_px = 1, 5.0
+    every_px, most_places = 2.0, 24  # along a side
+    ends = 0.12  # share of a side at either end where the corner's rounding is
     along = np.roll(quad, -1, axis=0) - quad
     lengths = np.linalg.norm(along, axis=1)
-    half_px = min(_CELL * float(lengths.min()) / cells, _MOST_HALF_LENGTH_PX)
-    if half_px < _LEAST_HALF_LENGTH_PX:
+    half_px = min(cell * float(lengths.min()) / cells, most_half_length_px)
+    if half_px < least_half_length_px:
         return None
     outward = np.column_stack([along[:, 1], -along[:, 0]]) / lengths[:, None]  # corners go round clockwise
-    count = int(np.clip(lengths.min() / _EVERY_PX, _FEWEST_PLACES, _MOST_PLACES))
-    share = np.linspace(_ENDS, 1.0 - _ENDS, count)
+    count = int(np.clip(lengths.min() / every_px, _FEWEST_PLACES, most_places))
+    share = np.linspace(ends, 1.0 - ends, count)
     places = (quad[:, None] + share[:, None] * along[:, None]).reshape(-1, 2)
     normals = np.repeat(outward, count, axis=0)
-    windows = cut_windows(image, places, normals, np.zeros(len(places)), half_px, _HALF_WIDTH_PX)
+    windows = cut_windows(image, places, normals, np.zeros(len(places)), half_px, half_width_px)
     inside = windows.inside
     if not inside.any():
         return None
@@ -99,6 +98,7 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
 
 def _side(place: Array, offset_px: Array, sigma_px: Array, length_px: float) -> Array | None:
     """(3,) the polynomial through most of the offsets (N,) of a side; None where too few were measured."""
+    sag = 0.003  # of a side: standard deviation of how far a lens bends it, beforehand
     terms = np.column_stack([np.ones_like(place), place, 1.0 - place**2])
     used = np.isfinite(offset_px)
     solution = np.zeros(3)
@@ -106,7 +106,7 @@ def _side(place: Array, offset_px: Array, sigma_px: Array, length_px: float) -> 
         if np.count_nonzero(used) < _FEWEST_PLACES:
             return None
         spread = max(float(np.median(sigma_px[used])), 1e-3)
-        rows = np.vstack([terms[used] / spread, [0.0, 0.0, 1.0 / (_SAG * length_px)]])
+        rows = np.vstack([terms[used] / spread, [0.0, 0.0, 1.0 / (sag * length_px)]])
         solution = np.linalg.lstsq(rows, np.append(offset_px[used] / spread, 0.0), rcond=None)[0]
         away = np.abs(offset_px - terms @ solution)
         used = np.isfinite(offset_px) & (away <= _FAR * max(float(np.median(away[used])), spread))

@@ -24,10 +24,8 @@ MOST_PICTURES = 25
 _MOVED_PX = 0.2
 # Share of the usual sharpness below which a picture is blurred. Noise is smoothed away before.
 _BLURRED = 0.5
-_SMOOTH_PX = 1.5
 _BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # to a side; pixels that count of each, and so that it does
 _CLEAR = 4.0  # times the median gradient, which is noise and texture
-_ALIKE = 0.6  # correlation of a block that shows the same; most must, as people hide some
 _ROUNDS, _BEND = 8, 2.0  # of the fit, and of what agrees; standard deviations from which on a level counts less
 _BAND, _EVERY = 64, 31  # rows worked on at once; pixels apart that tell the noise
 _NEAR = 3.0  # times the noise
@@ -115,7 +113,8 @@ def _read(pictures: Iterable[tuple[str, Image]]) -> tuple[list[str], list[Image]
 
 
 def _smooth(grey: Image | Array32) -> Array32:
-    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SMOOTH_PX))
+    smooth_px = 1.5
+    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), smooth_px))
 
 
 def _sharpness(grey: Image) -> float:
@@ -172,8 +171,9 @@ class _Reference:
 
     def _alike(self, seen: Array) -> dict[int, bool]:
         """Whether each part of the picture that shows anything shows the same."""
+        alike = 0.6  # correlation of a block that shows the same; most must, as people hide some
         return {
-            int(number): bool(np.corrcoef(self.grey[own], seen[own])[0, 1] > _ALIKE)
+            int(number): bool(np.corrcoef(self.grey[own], seen[own])[0, 1] > alike)
             for number, own in ((number, self.block == number) for number in np.unique(self.block))
             if np.count_nonzero(own) >= _FEWEST and np.ptp(seen[own]) > 0.0
         }

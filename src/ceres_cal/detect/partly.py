@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Image, Mask
+from ceres_cal.base.arrays import Array, Image, Mask, medians_known
 from ceres_cal.detect.saddles import Saddles, fit_saddles, is_begun_dark, measure_saddles
 
 # Of the contrast, root mean square: where the board ends dark squares meet the margin, which no saddle describes.
@@ -150,7 +150,7 @@ def _places(seen: Saddles, shape: tuple[int, ...], columns: int, rows: int) -> I
 def _ends(grid: Array, shape: tuple[int, ...], axis: int, end: int) -> bool:
     """Whether the next line of corners on a side would be well in the picture: there is none, so the board ends."""
     wider = np.pad(grid, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-    clear_px = _CLEAR * float(np.nanmedian(_steps(grid)))
+    clear_px = _CLEAR * float(medians_known(_steps(grid)))
     return bool(np.any(_inside(np.take(_foreseen(wider), end, axis=axis), shape, clear_px)))
 
 

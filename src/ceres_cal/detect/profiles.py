@@ -190,10 +190,12 @@ def fit_shape(windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8)
             np.sum(schur / noise[:, None, None], axis=0) + pull,
             np.sum(left / noise[:, None], axis=0) + pull @ (begin - shape),
         )
-        shape = np.clip(shape + np.clip(change, -0.3, 0.3), *(limit[:free] for limit in _SHAPE_RANGE))
+        change = np.clip(change, -0.3, 0.3)
+        before, solution = shape, solution - away @ change
+        shape = np.clip(shape + change, *(limit[:free] for limit in _SHAPE_RANGE))
         offset = offset + np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
         heights = solution[:, 2:-1]
-        if np.all(np.abs(change) < 1e-3):
+        if np.all(np.abs(shape - before) < 1e-3):
             break
     return EdgeShape(*np.exp(shape).tolist())
 

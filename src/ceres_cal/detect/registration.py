@@ -16,10 +16,7 @@ from ceres_cal.detect.courses import Course
 
 _REDUCED = 4
 _NEAR_PX = 8.0
-_SPECK_PX = 25  # fewer connected pixels are no line
 _TURNS_DEG = np.arange(-7.5, 7.6, 1.25)
-_SCALES = (0.92, 1.0, 1.08)
-_APART_PX = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +46,7 @@ class Nearness:
 
 def nearness(grey: Array32, width_px: float) -> Nearness:
     """How near each pixel is to something brighter than its surroundings and about `width_px` wide, or less."""
+    speck_px = 25  # fewer connected pixels are no line
     soft = cv2.GaussianBlur(grey, (0, 0), 0.8)
     size = 2 * int(np.ceil(width_px) + 2) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -56,7 +54,7 @@ def nearness(grey: Array32, width_px: float) -> Nearness:
     limit = max(0.3 * float(np.quantile(bright, 0.99)), 4.0 * float(np.median(bright)))
     mask = (bright > limit).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    kept = stats[:, cv2.CC_STAT_AREA] >= _SPECK_PX
+    kept = stats[:, cv2.CC_STAT_AREA] >= speck_px
     kept[0] = False
     return nearness_to(kept[labels])
 
@@ -75,10 +73,12 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
     """The best places (N, 2) px for a course that may be off by `reach_px` and some degrees: each a shift, turn and
     scale of its pixels about the image's middle, the best first, `most` at most.
     """
+    apart_px = 25.0
+    scales = (0.92, 1.0, 1.08)
     middle = 0.5 * np.array(image_size)
     steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * near.reduced)
     away, scored = course.pixels - middle, []
-    for turn, scale in product(np.deg2rad(_TURNS_DEG), _SCALES):
+    for turn, scale in product(np.deg2rad(_TURNS_DEG), scales):
         cosine, sine = scale * np.cos(turn), scale * np.sin(turn)
         turned = middle + away @ np.array([[cosine, sine], [-sine, cosine]])
         score = np.empty((len(steps), len(steps)))
@@ -90,7 +90,7 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
     scored.sort(key=lambda one: -one[0])
     chosen: list[Array] = []
     for _, places in scored:
-        if all(np.mean(np.linalg.norm(places - other, axis=1)) > _APART_PX for other in chosen):
+        if all(np.mean(np.linalg.norm(places - other, axis=1)) > apart_px for other in chosen):
             chosen.append(places)
         if len(chosen) == most:
             break

@@ -8,11 +8,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import InputError
 
-_CLEAR = 12.0  # from black to white over the noise: rings have been found from 8 on
-
 
 def ring_centre(grey: Array32) -> Array:
     """Where the gradients' lines meet, (2,) px: by votes on a grid, then by least squares."""
+    clear = 12.0  # from black to white over the noise: rings have been found from 8 on
     soft = cv2.GaussianBlur(grey, (0, 0), 1.5)
     gradient = np.dstack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)]).astype(float)
     strength = np.hypot(gradient[..., 0], gradient[..., 1])
@@ -32,7 +31,7 @@ def ring_centre(grey: Array32) -> Array:
     share = float(np.mean(np.abs(np.sum((places - centre) * normal, axis=1)) < 6.0))
     if share < 0.3:
         contrast, noise = float(np.ptp(np.quantile(soft, (0.01, 0.99)))), 1.48 * float(np.median(np.abs(grey - soft)))
-        if contrast < _CLEAR * noise:
+        if contrast < clear * noise:
             raise InputError(
                 f"no rings found: too dark, from black to white {contrast:.0f} grey levels in a noise of {noise:.1f}: "
                 "give more light, expose longer, or take the mean of several pictures"

@@ -31,7 +31,6 @@ _STEP_PX = 0.5
 _FEWEST_RAYS = 0.25
 _HARMONICS = 3  # of a ring's radius over its angle: what tilt and a centre beside the axis make of it
 _HALF_LENGTH_PX, _HALF_WIDTH_PX = 5.0, 2
-_LEAST_SPACING_PX = 3.0
 # Times the noise. Nothing changes from half to double.
 _LEAST_CONTRAST = 8.0
 # Times the usual misfit of a window: something else is in it. Half of it takes out 0.5 % of the edges, double none
@@ -122,6 +121,7 @@ def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
 
     One more than `most` is an error.
     """
+    least_spacing_px = 3.0
     angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
     slope, reach = _slopes(grey, centre, angle)
     limit = 0.25 * float(np.quantile(np.abs(slope[np.isfinite(slope)]), 0.995))
@@ -134,7 +134,7 @@ def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
             break
         if len(tracks) == most:
             raise InputError(f"more than {most} rings found, for {most} radii: give the radius of every edge")
-        if tracks and np.median(track.radius(angle) - tracks[-1].radius(angle)) < _LEAST_SPACING_PX:
+        if tracks and np.median(track.radius(angle) - tracks[-1].radius(angle)) < least_spacing_px:
             break
         tracks.append(track)
     if len(tracks) < min(3, most):

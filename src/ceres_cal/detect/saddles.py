@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import AnyArray, Array, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Mask, medians_known
 
 REACH = 0.6
 """Radius of the disc around a corner as a part of the distance to the next edges: further, they would be in it."""
@@ -84,7 +84,7 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
     fitted = fit_saddles(image, grid, np.ones(grid.shape[:2], dtype=bool), reach)
     rows, columns = np.indices(fitted.contrast.shape)
     signed = np.where((rows + columns) % 2 == 0, fitted.contrast, -fitted.contrast)
-    usual = np.nanmedian(signed) if np.any(np.isfinite(signed)) else np.nan
+    usual = float(medians_known(signed.ravel()))
     wrong = ~(signed * np.sign(usual) > max(_FAINT * np.abs(usual), _ROUNDING * float(np.max(image))))
     contrast, misfit = (np.where(wrong, np.nan, values) for values in (fitted.contrast, fitted.misfit))
     return Saddles(np.where(wrong[..., None], np.nan, fitted.grid), contrast, misfit)
@@ -145,7 +145,7 @@ def _shrink(fitted: Array, grid: Array, reach: float) -> int:
     sharp, distance = fitted[..., _SHARP], _distances(grid)[2]
     if not np.any(np.isfinite(sharp + distance)):
         return 1
-    blur_px, radius_px = _BLUR / np.nanmedian(sharp), reach * np.nanmedian(distance)
+    blur_px, radius_px = (float(medians_known(each.ravel())) for each in (_BLUR / sharp, reach * distance))
     return int(2 ** max(0.0, np.floor(np.log2(min(blur_px, 2.0 * radius_px / _RADIUS_PX[1])))))
 
 

@@ -13,13 +13,9 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.detect.courses import Course
 
-_HARMONICS = (1.0, 2.0)
-_PRIOR_PX = 0.1  # standard deviation of the error's amplitude, beforehand
 _REMAINS = 0.15  # of the error, what is left once it is taken off
 _AROUND = 10  # places to either side, of which the mean tells where in its pixel a line lies
 _ROUNDS, _FEWEST = 5, 20
-_LEAST_PX = 1e-4
-_ROBUST = 2.0  # of the usual residual: Cauchy's scale
 _CURVATURE = np.array([1.0, -2.0, 1.0])
 
 
@@ -66,12 +62,15 @@ def _smooth(curve: Indices32, offset_px: Array) -> Array:
 
 def _amplitudes(columns: Array, bends: Array) -> Array:
     """(K,) of what, times columns (M, K), explains the bends (M,) but for a few."""
+    robust = 2.0  # of the usual residual: Cauchy's scale
+    least_px = 1e-4
+    prior_px = 0.1  # standard deviation of the error's amplitude, beforehand
     amplitude: Array = np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
         left = bends - columns @ amplitude
-        usual = max(float(np.median(np.abs(left))) / 0.6745, _LEAST_PX)
-        weighted = columns / (1.0 + (left / (_ROBUST * usual)) ** 2)[:, None]
-        normal = weighted.T @ columns + (usual / _PRIOR_PX) ** 2 * np.eye(len(amplitude))
+        usual = max(float(np.median(np.abs(left))) / 0.6745, least_px)
+        weighted = columns / (1.0 + (left / (robust * usual)) ** 2)[:, None]
+        normal = weighted.T @ columns + (usual / prior_px) ** 2 * np.eye(len(amplitude))
         amplitude = np.asarray(np.linalg.solve(normal, weighted.T @ bends), dtype=float)
     return np.asarray(amplitude)
 
@@ -80,6 +79,7 @@ def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
     """(N, 4) complex: how far round its pixel a line is, the mean over each window, along the normal: of level lines,
     then of upright ones.
     """
+    harmonics = (1.0, 2.0)
     places, normals = course.pixels + offset_px[:, None] * course.normals, course.normals
     level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])
     along, across = (np.where(level, places[:, axis], places[:, 1 - axis]) for axis in (0, 1))
@@ -87,5 +87,5 @@ def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
     du = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1) - along[:, None]
     bent = 0.5 * course.curvature[:, None] * (du / n_across[:, None]) ** 2
     crossed = across[:, None] + (bent - du * n_along[:, None]) / n_across[:, None]
-    turns = [n_across * np.mean(np.exp(2j * np.pi * times * crossed), axis=1) for times in _HARMONICS]
+    turns = [n_across * np.mean(np.exp(2j * np.pi * times * crossed), axis=1) for times in harmonics]
     return np.column_stack([np.where(chosen, turn, 0.0) for chosen in (level, ~level) for turn in turns])

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, median
 
 USUAL_PX = 0.1
 _MOST_DEGREES = 6
@@ -31,7 +31,7 @@ def scatter_px(grids: Iterable[Array], places: Array) -> float:
         The median over the boards; USUAL_PX where none has corners enough to tell.
     """
     scatters = [one for grid in grids if (one := _of_board(grid, places)) is not None]
-    return max(float(np.median(scatters)), _LEAST_PX) if scatters else USUAL_PX
+    return max(median(np.array(scatters)), _LEAST_PX) if scatters else USUAL_PX
 
 
 def _of_board(grid: Array, board: Array) -> float | None:

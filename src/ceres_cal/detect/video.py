@@ -17,8 +17,6 @@ from ceres_cal.detect.images import encoded
 
 MOST_FRAMES = 200_000
 """Of a video, an hour and a half: each has to be passed over."""
-_JUDGED_PX = 5e5
-_LOOKED_AT = 10  # frames of each stretch: a hand that holds a board comes to rest in between
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +97,7 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
     Raises:
         InputError: see `open_video` and `Video.frames`.
     """
+    looked_at = 10  # frames of each stretch: a hand that holds a board comes to rest in between
     opened = open_video(video)
     stretches = min(count, opened.total)
     written: list[Path] = []
@@ -109,7 +108,7 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
         written.append(folder / f"{len(written) + 1:04d}.png")
         write_bytes(written[-1], encoded(frame, ".png", 100))
 
-    for number, frame in opened.frames(max(1, opened.total // (stretches * _LOOKED_AT))):
+    for number, frame in opened.frames(max(1, opened.total // (stretches * looked_at))):
         stretch, sharp = number * stretches // opened.total, _sharpness(frame)
         if best and best[0] != stretch:
             write(best[2])
@@ -123,8 +122,9 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
 
 
 def _sharpness(frame: Image) -> float:
-    """The variance of the Laplacian, in a picture of _JUDGED_PX at most: what is blurred by less does not matter."""
-    scale = min(1.0, float(np.sqrt(_JUDGED_PX / (frame.shape[0] * frame.shape[1]))))
+    """The variance of the Laplacian, in half a megapixel at most: what is blurred by less does not matter."""
+    judged_px = 5e5
+    scale = min(1.0, float(np.sqrt(judged_px / (frame.shape[0] * frame.shape[1]))))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return float(np.var(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_32F)))
 

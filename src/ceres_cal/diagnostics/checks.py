@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail, log_f_tail
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.labels import Mislabelled, Mislabelling
+from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words, Wrong
 from ceres_cal.effects.linearised import Linearised
@@ -141,14 +141,12 @@ def _correlation(model: Linearised, pairs: tuple[Indices, Indices], variance: fl
     return float(total / (variance * max(float(np.sum(np.sqrt(kept))), 1e-9))), float(log_p)
 
 
-_MOST_NAMED = 5
-
-
 @dataclass(frozen=True, eq=False)
 class DiagnosisCase(Case):
     """What is diagnosed.
 
     Attributes:
+        labels: groups of observations that another feature explains. labels_tried: how many were looked at.
         calibration: of other observations, which may not hold on these; None where these are its own.
         as_built, effects: what the calibration found not to be as drawn, and what else displaces the observations;
             both were solved for.
@@ -156,7 +154,8 @@ class DiagnosisCase(Case):
 
     inliers: Inliers
     table: ResidualTable
-    labels: Mislabelling
+    labels: Sequence[Mislabelled]
+    labels_tried: int
     calibration: Calibration | None
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
@@ -179,7 +178,7 @@ class Check(ABC):
         kind: its name. wrong: see `Finding`.
     """
 
-    kind: ClassVar[str]
+    kind: str
     wrong: ClassVar[Wrong] = "observations"
 
     @abstractmethod
@@ -197,11 +196,11 @@ class WrongLabel(Check):
     kind = "wrong label"
 
     def tests(self, case: DiagnosisCase) -> int:
-        return case.labels.tried
+        return case.labels_tried
 
     def findings(self, tested: TestResults) -> Iterator[Finding]:
         groups: dict[tuple[bool, str, int, int], list[Mislabelled]] = defaultdict(list)
-        for label in tested.case.labels.mislabelled:
+        for label in tested.case.labels:
             if label.log_p <= tested.selection.log_level:
                 name = tested.case.observations.views[label.view].target
                 groups[label.is_curve, name, label.feature, label.instead].append(label)
@@ -209,6 +208,7 @@ class WrongLabel(Check):
             yield self._finding(tested, target, labels)
 
     def _finding(self, tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
+        most_named = 5
         observations, table, one = tested.case.observations, tested.case.table, labels[0]
         described = observations.targets[target]
         names = described.curve_names if one.is_curve else described.point_names
@@ -216,7 +216,7 @@ class WrongLabel(Check):
         rows = np.concatenate([label.rows for label in labels])
         at = rows + (len(observations.points) if one.is_curve else 0)
         frames = list(dict.fromkeys(observations.views[label.view].frame for label in labels))
-        listing = ", ".join(map(repr, frames[:_MOST_NAMED])) + (" ..." if len(frames) > _MOST_NAMED else "")
+        listing = ", ".join(map(repr, frames[:most_named])) + (" ..." if len(frames) > most_named else "")
         away = float(np.mean(np.concatenate([label.distance_px for label in labels])))
         px, mm = _mean(np.abs(table.distance_px[at])), _mean(np.abs(table.error_mm[at]))
         sentence = (
@@ -236,15 +236,18 @@ def _mean(values: Array) -> float:
     return float(np.mean(known)) if len(known) else float("nan")
 
 
-class _OfNoise(Check):
-    """What the noise of points and of curves is like."""
+class OfNoise(Check):
+    """What the noise of points and of curves is like.
+
+    Attributes:
+        about: of either, log P of as much by chance, px that it is of, and its words.
+    """
+
+    def __init__(self, kind: str, about: Callable[[Noise], tuple[float, float, Words]]) -> None:
+        self.kind, self.about = kind, about
 
     def tests(self, case: DiagnosisCase) -> int:
         return 2
-
-    @abstractmethod
-    def about(self, noise: Noise) -> tuple[float, float, Words]:
-        """log P of as much by chance, px that it is of, and its words."""
 
     def findings(self, tested: TestResults) -> Iterator[Finding]:
         case = tested.case
@@ -260,35 +263,27 @@ class _OfNoise(Check):
                 )  # fmt: skip
 
 
-class LargerNoise(_OfNoise):
+def larger(noise: Noise) -> tuple[float, float, Words]:
     """Noise beyond what was stated."""
-
-    kind = "noise"
-
-    def about(self, noise: Noise) -> tuple[float, float, Words]:
-        sentence = (
-            f"the noise of {noise.kind} is {noise.scale:.2f} times what was stated: {noise.sigma_px:.3f} px, not "
-            f"{noise.sigma_px / noise.scale:.3f}"
-        )
-        amount = Amount("scale", noise.scale, noise.scale / float(np.sqrt(2.0 * noise.observations)), "")
-        advice = "state the larger sigma where sigmas are taken as stated; the estimated scale is right already"
-        return noise.log_p, noise.sigma_px, Words(sentence, advice, (amount,))
+    sentence = (
+        f"the noise of {noise.kind} is {noise.scale:.2f} times what was stated: {noise.sigma_px:.3f} px, not "
+        f"{noise.sigma_px / noise.scale:.3f}"
+    )
+    amount = Amount("scale", noise.scale, noise.scale / float(np.sqrt(2.0 * noise.observations)), "")
+    advice = "state the larger sigma where sigmas are taken as stated; the estimated scale is right already"
+    return noise.log_p, noise.sigma_px, Words(sentence, advice, (amount,))
 
 
-class Correlated(_OfNoise):
+def correlated(noise: Noise) -> tuple[float, float, Words]:
     """Neighbouring residuals that agree."""
-
-    kind = "correlated"
-
-    def about(self, noise: Noise) -> tuple[float, float, Words]:
-        sentence = (
-            f"neighbouring residuals of {noise.kind} agree (correlation {noise.correlation:.2f}): "
-            f"{noise.observations} observations say as much as {noise.effective:.0f} independent ones"
-        )
-        amount = Amount("correlation", noise.correlation, 1.0 / float(np.sqrt(noise.observations)), "")
-        advice = "look for what shifts whole features; the standard deviations have it in them"
-        shared_px = noise.sigma_px * float(np.sqrt(max(noise.correlation, 0.0)))
-        return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))
+    sentence = (
+        f"neighbouring residuals of {noise.kind} agree (correlation {noise.correlation:.2f}): "
+        f"{noise.observations} observations say as much as {noise.effective:.0f} independent ones"
+    )
+    amount = Amount("correlation", noise.correlation, 1.0 / float(np.sqrt(noise.observations)), "")
+    advice = "look for what shifts whole features; the standard deviations have it in them"
+    shared_px = noise.sigma_px * float(np.sqrt(max(noise.correlation, 0.0)))
+    return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))
 
 
 class DoesNotHold(Check):
@@ -330,7 +325,8 @@ class DoesNotHold(Check):
         )  # fmt: skip
 
 
-CHECKS: dict[str, Check] = {one.kind: one for one in (WrongLabel(), LargerNoise(), Correlated(), DoesNotHold())}
+_EVERY = (WrongLabel(), OfNoise("noise", larger), OfNoise("correlated", correlated), DoesNotHold())
+CHECKS: dict[str, Check] = {one.kind: one for one in _EVERY}
 
 
 def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:

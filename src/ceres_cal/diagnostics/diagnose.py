@@ -20,7 +20,7 @@ from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResul
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.effects.columns import EffectSums
+from ceres_cal.effects.columns import EffectSums, least_absolute
 from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import select
@@ -28,11 +28,11 @@ from ceres_cal.effects.table import EFFECTS, columns_of_all
 from ceres_cal.effects.table.target import CurveAside, PointAside
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import write_equations
-from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
+from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, judge, relative_lengths
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.robust.poses import with_lost_boards_posed
+from ceres_cal.robust.other_minima import with_lost_boards_posed
 from ceres_cal.robust.stated import Conflict
 
 FALSE_ALARM_RATE = 0.01
@@ -178,9 +178,9 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
     if calibration.refitted is not None and not new_data:
         model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
-    labels = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
+    labels, tried = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
     known = (calibration,) if new_data else (None, calibration.as_built, calibration.effects)
-    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, *known)
+    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, tried, *known)
     used = _recalled(case)
     if np.array_equal(used, model.used):
         return case
@@ -192,7 +192,7 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
 def _judged(calibration: Calibration, observations: Observations, there: Residuals, new_data: bool) -> Inliers:
     """The calibration's own verdict on its observations, a fresh one on new ones."""
     if new_data:
-        return judge(observations, there, Redundancy(1.0, 1.0), calibration.options)
+        return judge(observations, there, (1.0, 1.0), calibration.options)
     inliers, posterior = calibration.inlier_masks(observations), calibration.posterior
     points, curves = relative_lengths(observations, there)
     p, c = calibration.fit.point_scale, calibration.fit.curve_scale
@@ -251,22 +251,17 @@ def _mislabelled(case: DiagnosisCase) -> Mask:
     """(N + M,) the observations that a wrong label explains."""
     points = len(case.observations.points)
     explained = np.zeros(len(case.table), dtype=bool)
-    for label in case.labels.mislabelled:
+    for label in case.labels:
         explained[label.rows + (points if label.is_curve else 0)] = True
     return explained
 
 
 def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
     """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
-    columns = columns[:, np.any(columns != 0.0, axis=0)]
-    amount: Array = np.zeros(columns.shape[1])
-    for _ in range(30):
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
-        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
+    amount = least_absolute(columns, residual)
     _, of = np.unique(observation, return_inverse=True)
     lengths = np.sqrt(np.bincount(of, (residual + columns @ amount) ** 2))
-    agree = (lengths <= reject_sigma)[of]
-    return agree if np.all(np.abs(amount) < _FAR_M) else np.zeros(len(agree), dtype=bool)
+    return np.asarray((lengths <= reject_sigma)[of] & np.all(np.abs(amount) < _FAR_M))
 
 
 # ---- new observations ------------------------------------------------------------------------------------------------

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 FOLDS = 5
 MOST_OBSERVATIONS = 10_000
-_UNSEEN_SIGMA = 10.0  # what an observation counts that the fold's camera cannot show at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,11 +260,12 @@ def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observation
 
 def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array:
     """Lengths in px and mm of the residuals, (N + M, 2); what is not seen counts 10 sigma in px, NaN in mm."""
+    unseen_sigma = 10.0  # what an observation counts that the fold's camera cannot show at all
     sights = gather_sights(observations).used(*np.split(rows, [len(observations.points)]))
     there = residuals(observations, sights, estimate)
     equations = write_equations(observations, sights, estimate, there)
     px = np.concatenate([np.linalg.norm(there.points, axis=1), np.abs(there.curves)])
-    px = np.where(np.isfinite(px), px, _UNSEEN_SIGMA * column_of(observations, "sigma_px"))
+    px = np.where(np.isfinite(px), px, unseen_sigma * column_of(observations, "sigma_px"))
     return np.column_stack([px, np.abs(error_mm(equations, equations.residual, len(px)))])
 
 

@@ -29,11 +29,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_on
 from ceres_cal.scene.targets import Target
 
-_PIECES = 199  # of a curve, to measure its length in the image
-_MOST = 20_000  # rejected observations looked at: of more, evenly spread ones
-_SAME_LINE = 1e-6  # m and rad, within which two curves lie on one line or circle
-_LEAST_ROWS = 2  # of a feature that is renamed: one observation lies on some curve by chance
-
 
 @dataclass(frozen=True, eq=False)
 class Mislabelled:
@@ -55,18 +50,11 @@ class Mislabelled:
     log_p: float
 
 
-@dataclass(frozen=True, eq=False)
-class Mislabelling:
-    """All such groups, and how many groups were looked at."""
-
-    mislabelled: tuple[Mislabelled, ...]
-    tried: int
-
-
 def find_mislabelled(
     observations: Observations, estimate: Estimate, inliers: Inliers, reject_sigma: float
-) -> Mislabelling:
-    """Every group of observations that another feature explains within the noise."""
+) -> tuple[list[Mislabelled], int]:
+    """Every group of observations that another feature explains within the noise, and how many were looked at."""
+    most = 20_000  # rejected observations looked at: of more, evenly spread ones
     mislabelled: list[Mislabelled] = []
     tried = 0
 
@@ -82,7 +70,7 @@ def find_mislabelled(
     for column, rejected, scale in both:
         looked_at = rejected | _may_lie_beyond(observations, column)
         rows = np.flatnonzero(looked_at)
-        rows = rows[:: max(1, len(rows) // _MOST)]
+        rows = rows[:: max(1, len(rows) // most)]
         for number in distinct(column.view[rows]):
             own, view = rows[column.view[rows] == number], observations.views[number]
             if view.placement is None or view.placement in estimate.placements:
@@ -91,7 +79,7 @@ def find_mislabelled(
                 groups = _of_view(seen, column, int(number), own, bound)
                 tried += len(distinct(column.feature[own[rejected[own]]]))
                 mislabelled += groups
-    return Mislabelling(tuple(mislabelled), tried)
+    return mislabelled, tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,21 +149,23 @@ def _may_lie_beyond(observations: Observations, column: Columns) -> Mask:
 
 def _shares_its_line(target: Target) -> Mask:
     """(C,) curves that lie on one straight line, or one circle, with another."""
+    same_line = 1e-6  # m and rad, within which two curves lie on one line or circle
     tracks, is_arc = target.tracks[0], target.is_arc
     c, a = tracks[:, 0], tracks[:, 1]
     along = a / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-12)
     between = c[:, None] - c
     beside = np.linalg.norm(np.cross(along[:, None], between), axis=2)  # of a line: how far the other's start is off it
     turned = np.linalg.norm(np.cross(along[:, None], along), axis=2)
-    lines = (beside < _SAME_LINE) & (turned < _SAME_LINE) & ~is_arc[:, None] & ~is_arc
+    lines = (beside < same_line) & (turned < same_line) & ~is_arc[:, None] & ~is_arc
     size = np.linalg.norm(a, axis=1)
-    arcs = (np.linalg.norm(between, axis=2) < _SAME_LINE) & (np.abs(size[:, None] - size) < _SAME_LINE)
+    arcs = (np.linalg.norm(between, axis=2) < same_line) & (np.abs(size[:, None] - size) < same_line)
     same = (lines | (arcs & is_arc[:, None] & is_arc)) & ~np.eye(len(c), dtype=bool)
     return np.asarray(same.any(axis=1))
 
 
 def _visible_length_px(camera: Camera, curve: Curve) -> float:
-    pixels = camera.project(curve_points(curve, 0, _PIECES))
+    pieces = 199  # of a curve, to measure its length in the image
+    pixels = camera.project(curve_points(curve, 0, pieces))
     inside = np.all((pixels >= 0.0) & (pixels <= np.array(camera.image_size)), axis=1)
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     return float(np.sum(steps[inside[1:] & inside[:-1]]))
@@ -229,20 +219,17 @@ def renamings(observations: Observations, calibration: Calibration) -> Iterator[
     """Features of the world all of whose observations in a view lie where another feature does: two and more of a
     curve, or two features that lie where each other's should.
     """
+    least_rows = 2  # of a feature that is renamed: one observation lies on some curve by chance
     points, curves = calibration.inlier_masks(observations)
     nothing, fit = np.empty(0), calibration.fit
     inliers = Inliers(points, curves, fit.point_scale, fit.curve_scale, nothing, nothing)
-    found = find_mislabelled(observations, calibration.estimate, inliers, calibration.options.reject_sigma)
-    whole = {
-        (one.is_curve, one.view, one.feature): one
-        for one in found.mislabelled
-        if _is_whole(one, observations, calibration)
-    }
+    found, _ = find_mislabelled(observations, calibration.estimate, inliers, calibration.options.reject_sigma)
+    whole = {(one.is_curve, one.view, one.feature): one for one in found if _is_whole(one, observations, calibration)}
     for one in whole.values():
         back = whole.get((one.is_curve, one.view, one.instead))
         exchanged = back is not None and back.instead == one.feature
         rows = _rows_of(one, observations)
-        if not one.is_curve or len(rows) >= _LEAST_ROWS or exchanged:
+        if not one.is_curve or len(rows) >= least_rows or exchanged:
             view = observations.views[one.view]
             target = observations.targets[view.target]
             names = target.curve_names if one.is_curve else target.point_names

@@ -21,7 +21,6 @@ from ceres_cal.problem.equations import Equations, pairs_of, plane_shift
 from ceres_cal.problem.noise import Inliers
 from ceres_cal.scene.camera import Camera
 
-FORMAT, VERSION = "ceres-cal/residuals", 1
 INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3
 REASONS = ("", "too far off", "cannot be seen from there", "a copy of another")
 """Why an observation was taken out, by its code in `ResidualTable.reason`."""
@@ -118,6 +117,7 @@ class ResidualTable:
         Raises:
             InputError: another ending, or the file cannot be written.
         """
+        format, version = "ceres-cal/residuals", 1
         if path.suffix not in (".csv", ".json", ".npz"):
             raise InputError(f"{path}: the table is written as .csv, .json or .npz: give one of these endings")
         columns = self.columns()
@@ -127,7 +127,7 @@ class ResidualTable:
             write_bytes(path, stream.getvalue())
         elif path.suffix == ".json":
             plain = {name: _plain(column) for name, column in columns.items()}
-            write_json(path, {"format": FORMAT, "version": VERSION, "columns": plain})
+            write_json(path, {"format": format, "version": version, "columns": plain})
         else:
             text = io.StringIO(newline="")
             writer = csv.writer(text, lineterminator="\n")

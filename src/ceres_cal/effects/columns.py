@@ -9,7 +9,7 @@ times amounts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,26 +51,56 @@ def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
     return numbers, group
 
 
+def least_absolute(columns: Array, residual: Array) -> Array:
+    """(Q,) amounts of columns (N, Q) that leave the least absolute deviations of residuals (N,), all in standard
+    deviations: by least squares again and again, each residual weighed by what was left of it.
+    """
+    amount = np.zeros(columns.shape[1])
+    for _ in range(30):
+        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
+        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
+    return amount
+
+
 @dataclass(frozen=True, eq=False)
-class _GroupedRows:
-    """The equations in use that an effect moves, by group of it.
+class EffectSums:
+    """What the equations say of each of an effect's G groups: X its columns beyond the free numbers of a model, and r
+    the residuals, both in standard deviations.
 
     Attributes:
-        rows: (N,) which they are. columns: (N, Q) of the effect, in standard deviations.
+        rows: (N,) the equations in use that it moves, by group. columns: (N, Q) of the effect there.
+        sizes: (G, Q) squared lengths of the columns as they are. normals: (G, Q, Q) X'X. scores: (G, Q) X'r.
+        directions: how many shared directions of the model X is beyond.
     """
 
     effect: EffectColumns
     rows: Indices
     columns: Array
+    sizes: Array = field(default_factory=lambda: np.empty(0))
+    normals: Array = field(default_factory=lambda: np.empty(0))
+    scores: Array = field(default_factory=lambda: np.empty(0))
+    directions: int = 0
 
     @classmethod
-    def of(cls, model: Linearised, effect: EffectColumns) -> _GroupedRows:
-        """By an effect."""
+    def of(cls, model: Linearised, effect: EffectColumns) -> EffectSums:
+        """Of an effect."""
         inside = np.flatnonzero((effect.group >= 0) & model.used)
         rows = inside[np.argsort(effect.group[inside], kind="stable")]
-        return cls(effect, rows, effect.columns[rows] * model.weight[rows, None])
+        blank = cls(effect, rows, effect.columns[rows] * model.weight[rows, None])
+        sums = blank._products(np.column_stack([blank.columns, model.placed_score[rows]]))
+        normals, scores = sums[:, :, :-1], sums[:, :, -1]
+        sizes = np.diagonal(normals, axis1=1, axis2=2)
+        whole = replace(blank, sizes=sizes, normals=normals - blank._private_squares(model), scores=scores)
+        return whole.beside(model)
 
-    def products(self, values: Array) -> Array:
+    def beside(self, model: Linearised) -> EffectSums:
+        """The same beyond all that is free in a model that has more of it."""
+        new = slice(self.directions, None)
+        taken = self._products(model.shared[:, new].take(self.rows, axis=0))
+        normals, scores = taken @ taken.transpose(0, 2, 1), taken @ model.step[new]
+        return replace(self, normals=self.normals - normals, scores=self.scores - scores, directions=len(model.step))
+
+    def _products(self, values: Array) -> Array:
         """(G, Q, K) of each group's columns with values (N, K) of the rows."""
         products = np.zeros((len(self.effect.subjects), self.columns.shape[1], values.shape[1]))
         for number, first, last in self._runs:
@@ -88,7 +118,7 @@ class _GroupedRows:
         ends = np.append(starts, len(group))[1:]
         return list(zip(group[starts].tolist(), starts.tolist(), ends.tolist(), strict=True))
 
-    def private_squares(self, model: Linearised) -> Array:
+    def _private_squares(self, model: Linearised) -> Array:
         """(G, Q, Q) squares of what each group's columns have in the private bases."""
         size, count = self.columns.shape[1], len(self.effect.subjects)
         squares, held = np.zeros((count + 1, size, size)), np.flatnonzero(model.of_private[self.rows])
@@ -113,43 +143,6 @@ class _GroupedRows:
         np.add.at(squares, before, inside @ inside.transpose(0, 2, 1))
         np.subtract.at(squares, group, inside @ inside.transpose(0, 2, 1))
         return np.cumsum(squares, axis=0)[:-1]
-
-
-@dataclass(frozen=True, eq=False)
-class EffectSums:
-    """What the equations say of each of an effect's G groups: X its columns beyond the free numbers of a model, and r
-    the residuals, both in standard deviations.
-
-    Attributes:
-        sizes: (G, Q) squared lengths of the columns as they are. normals: (G, Q, Q) X'X. scores: (G, Q) X'r.
-        directions: how many shared directions of the model X is beyond.
-    """
-
-    moved: _GroupedRows
-    sizes: Array
-    normals: Array
-    scores: Array
-    directions: int = 0
-
-    @classmethod
-    def of(cls, model: Linearised, effect: EffectColumns) -> EffectSums:
-        """Of an effect."""
-        moved = _GroupedRows.of(model, effect)
-        sums = moved.products(np.column_stack([moved.columns, model.placed_score[moved.rows]]))
-        normals, scores = sums[:, :, :-1], sums[:, :, -1]
-        sizes = np.diagonal(normals, axis1=1, axis2=2)
-        return cls(moved, sizes, normals - moved.private_squares(model), scores).beside(model)
-
-    def beside(self, model: Linearised) -> EffectSums:
-        """The same beyond all that is free in a model that has more of it."""
-        new = slice(self.directions, None)
-        taken = self.moved.products(model.shared[:, new].take(self.moved.rows, axis=0))
-        normals, scores = taken @ taken.transpose(0, 2, 1), taken @ model.step[new]
-        return replace(self, normals=self.normals - normals, scores=self.scores - scores, directions=len(model.step))
-
-    @property
-    def effect(self) -> EffectColumns:
-        return self.moved.effect
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,9 +45,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Residuals
 
-_FEWEST_ROWS = 12
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
-_NEGLIGIBLE = 1e-3  # weight below which a place on the grid is left out
 
 
 @dataclass(frozen=True)
@@ -67,32 +65,18 @@ class Correlation:
     lasting: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Covariances:
-    """What correlated errors make of the scores.
-
-    Attributes:
-        scores: (G, P, P) covariance of each group's score. private: factor on the variance of private placements.
-        inverse_freedom: 1 / degrees of freedom of these covariances. kinds: those that are correlated.
-    """
-
-    scores: Array
-    private: float
-    inverse_freedom: float
-    kinds: tuple[Correlation, ...] = ()
-
-
-def correlated(model: Linearised, group: Indices, informations: Array) -> Covariances:
-    """The covariance of each group's score, with what errors have in common.
+def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[Array, Dependence]:
+    """(G, P, P) the covariance of each group's score, with what errors have in common, and what that rests on.
 
     Args:
         model: of some views, in directions in which everything is known to one. group: (E,) of the G views or
             placements that are compared. informations: (G, P, P) of each, were errors independent.
     """
+    fewest_rows = 12
     scores, private, inverse, kinds = informations.copy(), [1.0], 0.0, []
     for is_curve, kind in ((False, "points"), (True, "curves")):
         rows = model.equations.is_curve == is_curve
-        if np.count_nonzero(rows) < _FEWEST_ROWS:
+        if np.count_nonzero(rows) < fewest_rows:
             continue
         families = families_of(model, group, is_curve)
         if not any(map(is_loud, families)):
@@ -103,7 +87,7 @@ def correlated(model: Linearised, group: Indices, informations: Array) -> Covari
         private.append(factor)
         inverse += average.inverse_freedom
         kinds.append(average.correlation(kind))
-    return Covariances(scores, max(private), inverse, tuple(kinds))
+    return scores, Dependence(tuple(kinds), None, max(private), inverse)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +108,13 @@ class _Average:
     @classmethod
     def of(cls, shared: Array, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
         """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
+        negligible = 1e-3  # weight below which a place on the grid is left out
         own = np.sum(shared[rows] ** 2)
         at = likelihoods(families, may_be_smooth, float(own))
         variance = at.variance / at.variance[0]  # the noise scale is that of independent errors
         weight = DEPENDENCE.over(len(at.share) - 1) * np.exp(at.log - at.log.max())
         weight /= weight.sum()
-        weight[weight < _NEGLIGIBLE] = 0.0
+        weight[weight < negligible] = 0.0
         weight /= weight.sum()
         used, rest = weight > 0.0, shared.shape[1] - own  # what all other rows say
         mixed = 1.0 / _freedom_of_mixture(weight[used], (rest + variance * at.trace)[used])
@@ -270,6 +255,18 @@ class Scatter:
         return Information(seen.keys, seen.matrix + 0.5 * (change + change.T))
 
 
+def scattered(reduced: ReducedInformation, scatter: Scatter | None) -> Information:
+    """What observations and priors say of everything shared, as the observations scatter.
+
+    What targets may be off is a scatter of theirs: trusted more than that where errors go together, it made halves of
+    real boards differ by 1.7 times what was stated.
+    """
+    if scatter is None:
+        return reduced.shared
+    built = reduced.built.over(reduced.shared.keys)
+    return scatter.widened(reduced.points + reduced.curves + built) + reduced.priors.less(built)
+
+
 def measure_scatter(
     observations: Observations, problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
 ) -> Scatter | None:
@@ -285,16 +282,15 @@ def measure_scatter(
     group = views_or_placements(model.equations)
     prior = model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root
     groups = GroupNormals.of(model, group, prior)
-    within = correlated(model, group, groups.normal)
-    whole = _whole(groups, within.scores)
-    lasting = any(kind.lasting for kind in within.kinds) and go_over_groups(model.equations, group)
-    between, inverse = None, within.inverse_freedom
+    scores, dependence = correlated(model, group, groups.normal)
+    whole = _whole(groups, scores)
+    lasting = any(kind.lasting for kind in dependence.correlations) and go_over_groups(model.equations, group)
     enough = len(groups.counts) >= FEWEST_GROUPS and not lasting
-    compared = compare_groups(groups, within.scores, whole) if enough else None
-    if compared is not None:
+    if enough and (compared := compare_groups(groups, scores, whole)) is not None:
         between, whole = compared
-        inverse += between.probability / between.degrees_of_freedom
-    return Scatter(model.root, whole, Dependence(within.kinds, between, within.private, inverse))
+        inverse = dependence.inverse_freedom + between.probability / between.degrees_of_freedom
+        dependence = replace(dependence, between=between, inverse_freedom=inverse)
+    return Scatter(model.root, whole, dependence)
 
 
 def _whole(groups: GroupNormals, scores: Array) -> Array:

@@ -281,7 +281,7 @@ class Effect(ABC):
         rows = np.any(score.columns != 0.0, axis=1) & case.model.used
         shift = score.columns @ score.amount
         if self.absorbed:
-            shift = case.model.unabsorbed(shift)
+            shift = case.model.left_of_column(shift * case.model.weight) / case.model.weight
         effect = case.effect(shift, rows)
         return Evidence(case, score, others, shift, effect, effect.px / case.noise_px(left_over, rows))
 

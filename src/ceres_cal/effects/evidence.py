@@ -14,6 +14,11 @@ integrated out. Hypotheses are weighed by this evidence (Kass and Raftery, JASA 
 Where amounts repeat from view to view, as those of a target as built, what goes together within a view counts as noise:
 u has the covariance kappa V + tau^2 V V with kappa by Cochran's Q of the views about their mean. Sizes of several such
 effects are found one after the other, each beside the others (`RepeatedAmounts`).
+
+Groups of equations (a line in one frame, say) may each lie aside by a few modes. Errors that go together along a line
+offset it, too, so all groups scatter by tau along each mode; one that does not belong has an offset of much larger
+variance besides. With tau, the size of the wrong offset and the noise integrated out nothing is a fault that the
+scatter of the others explains (`Offsets`).
 """
 
 from __future__ import annotations
@@ -25,8 +30,7 @@ from typing import TypeVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.base.spread import known_inverses
-from ceres_cal.effects.columns import SparseColumns
+from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
 
@@ -86,13 +90,13 @@ independent in four of five calibrations. The sizes are those of a grid, or of a
 _FEWEST = 4
 LIKELY = 0.5
 """Probability from which on an effect is solved for: it is then the more likely explanation."""
-_SWEEPS = 2  # over the effects, each beside the others
 LEAST_PX = 1e-3
 """Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
+# The same of directions that tell a size. What is free besides takes up nearly all of those that are less determined,
+# and what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a lens had left over.
+_TELLS = 1e-3
 _Name = TypeVar("_Name", bound=Hashable)
-_STEPS = 200
-_ONE = 1.0  # directions of the least size that count along, so that few data do not make a size zero
 _NO_SCATTER = np.zeros(1)
 
 
@@ -191,55 +195,6 @@ def agreement(scores: Array) -> float:
     return float(np.sum(total**2 - squares)) / np.sqrt(variance) if variance > 0.0 else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Sizes:
-    """The likeliest sizes of several effects, and what is then known of their numbers.
-
-    Attributes:
-        sigmas: (K,) of each effect. amount: (Q,) likeliest numbers. precision: (Q, Q) inverse of their covariance.
-    """
-
-    sigmas: Array
-    amount: Array
-    precision: Array
-
-
-def likeliest_sizes(
-    normal: Array, slope: Array, forms: Sequence[Array], sigmas: Array, least: Array, at_rest: float
-) -> Sizes:
-    """The standard deviations sigma of effects whose numbers c have the prior information sum F / sigma^2.
-
-    The fixed point of MacKay (Neural Computation 4, 1992), sigma^2 = c^T F c / gamma, with gamma = rank F - tr(C F) /
-    sigma^2 the number of directions that the data determine: the maximum of the restricted likelihood. One more
-    direction of the least size counts along (an inverse gamma distribution beforehand).
-
-    Args:
-        normal, slope: (Q, Q) and (Q,) what data say of the numbers, whose best is normal^-1 slope. forms: (Q, Q) F of
-            each. sigmas: (K,) to begin from. least: (K,) what data cannot talk a size below. at_rest: relative change
-            of a size that ends the search.
-    """
-    ranks, unlimited = np.array([_rank(form) for form in forms]), np.full(len(slope), np.inf)
-    for _ in range(_STEPS):
-        precision = normal + sum(form / sigma**2 for form, sigma in zip(forms, sigmas, strict=True))
-        covariance = known_inverses(precision, unlimited)
-        amount = covariance @ slope
-        known = ranks - np.array([np.sum(covariance * form) for form in forms]) / sigmas**2
-        squares = np.array([amount @ form @ amount for form in forms])
-        moved = np.sqrt((np.maximum(squares, 0.0) + _ONE * least**2) / (np.maximum(known, 0.0) + _ONE))
-        done = np.max(np.abs(np.log(moved / sigmas))) < at_rest
-        sigmas = moved
-        if done:
-            break
-    return Sizes(sigmas, amount, np.asarray(precision))
-
-
-def _rank(form: Array) -> int:
-    rows = np.any(form != 0.0, axis=1)
-    own = form[np.ix_(rows, rows)]
-    diagonal = np.count_nonzero(own) == len(own)
-    return len(own) if diagonal else int(np.linalg.matrix_rank(own, hermitian=True))
-
-
 def shifts_by(taken: Array, moment: Array) -> Array:
     """(R, K) shifts of the free numbers whose products with themselves add up to what amounts do to their covariance.
 
@@ -330,7 +285,7 @@ class RepeatedAmounts:
             return 0.0, 0.0
         within = max(within, 1.0)
         score, information = self._beside(numbers, others, sigmas)
-        least = _DETERMINED * float(np.linalg.eigvalsh(information)[-1]) / within
+        least = _TELLS * float(np.linalg.eigvalsh(information)[-1]) / within
         effects = RandomEffects.of(information / within, score / within, least, self.rest)
         effects = replace(effects, freedom=self.spare + len(effects.size))
         sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))
@@ -340,11 +295,72 @@ class RepeatedAmounts:
         self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior]
     ) -> dict[_Name, tuple[float, float]]:
         """Sigma and probability of each effect by name, beside those of the others that are likely."""
+        sweeps = 2  # over the effects, each beside the others
         found: dict[_Name, tuple[float, float]] = {}
-        for name, own in [*numbers.items()] * _SWEEPS if self.spare >= _FEWEST else ():
+        for name, own in [*numbers.items()] * sweeps if self.spare >= _FEWEST else ():
             others = [one for one, (_, probability) in found.items() if one != name and probability > LIKELY]
             at = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[one] for one in others)])
             sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[one]), found[one][0]) for one in others)])
             found.pop(name, None)  # the last one looked at stands last
             found[name] = self.size(own, at, sigmas, priors[name])
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """What residuals say of the offsets of G groups.
+
+    Attributes:
+        effects: their modes as random effects. modes: (G, R, M) what an offset of each group does to them.
+        prior: of a group that does not belong, and of its offset.
+    """
+
+    effects: RandomEffects
+    modes: Array
+    prior: SizePrior
+
+    def log_evidence(self, wrong: Sequence[int] = ()) -> float:
+        """Of these groups not belonging, all others scattering alike."""
+        return float(self._log_evidence(self._together(wrong)[None], len(wrong))[0])
+
+    def log_evidence_with_each(self, wrong: Sequence[int] = ()) -> Array:
+        """(G,) the same with each one of the groups besides; -inf for those that are there already."""
+        known = np.broadcast_to(self._together(wrong), (len(self.modes), *self._together(wrong).shape))
+        evidence = self._log_evidence(np.concatenate([known, self.modes], axis=2), len(wrong) + 1)
+        evidence[list(wrong)] = -np.inf
+        return evidence
+
+    def _together(self, groups: Sequence[int]) -> Array:
+        """(R, K) modes of some groups side by side."""
+        return np.concatenate([np.zeros((self.modes.shape[1], 0)), *self.modes[list(groups)]], axis=1)
+
+    def _log_evidence(self, modes: Array, count: int) -> Array:
+        """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
+        sizes, scatter = self.prior.sizes[: None if count else 1], OFFSETS_SCATTER.scatter
+        logs = np.stack([self.effects.log_evidence(aside * modes, scatter) for aside in sizes], axis=1)
+        priors = np.tile(OFFSETS_SCATTER.probabilities / len(sizes), len(sizes))
+        total = logsum(logs.reshape(len(modes), -1) + np.log(priors))
+        return np.asarray(total + count * np.log((1.0 - self.prior.absent) / len(self.modes)))
+
+
+def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) -> Offsets:
+    """What a model's residuals say of offsets.
+
+    Args:
+        effect: its columns, here in standard deviations of an equation, of order one. prior: of a group that does not
+            belong.
+    """
+    columns, group = effect.columns, effect.group
+    groups, width = int(group.max()) + 1, columns.shape[1]
+    rows = np.flatnonzero((group >= 0) & model.used)
+    every = SparseColumns.of_groups(model, columns, group, groups)
+    there = np.flatnonzero(every.summed(every.values))
+    normal, slope = every.left_of(model)
+    normal, slope = normal[np.ix_(there, there)], slope[there]
+    least = 1e-5 * float(np.bincount(group[rows]).max())  # what the model leaves of directions that can be judged
+    effects = RandomEffects.of(normal, slope, least)
+    rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
+    exact = model.spare * (LEAST_PX * median(model.weight[rows])) ** 2
+    modes = effects.modes(np.eye(groups * width)[there]).reshape(-1, groups, width)
+    effects = replace(effects, rest=max(rest, exact), freedom=float(model.spare))
+    return Offsets(effects, np.swapaxes(modes, 0, 1), prior)

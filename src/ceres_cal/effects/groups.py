@@ -36,7 +36,6 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.reduced import normals_with_residuals, owned_columns, steps_of
 
-_ROUNDING = 1e-12  # of a sum over a group's rows
 _RIDGE = 1e-3  # of everything's information: a group that tells a direction alone cannot be left out
 
 
@@ -192,9 +191,10 @@ def _alike(groups: Sights, alone: Set[str | None]) -> Iterator[Indices]:
 
 def _drop_rounding(columns: Mapping[tuple[str, str], Indices], sizes: Array, products: Array) -> None:
     """Take what is left of a turn that nothing tells, which is rounding of the others, out of sizes and products."""
+    rounding = 1e-12  # of a sum over a group's rows
     for (kind, _), own in columns.items():
         for alike in (own[:3], own[3:]) if kind in ("station", "placement") else ():
-            lost = alike[sizes[alike] <= _ROUNDING * np.max(sizes[alike])]
+            lost = alike[sizes[alike] <= rounding * np.max(sizes[alike])]
             sizes[lost], products[:, lost], products[:, :, lost] = 0.0, 0.0, 0.0
 
 

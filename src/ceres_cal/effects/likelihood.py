@@ -27,14 +27,14 @@ ASIDE = 20.0
 # The likelihood is asked from so many standard deviations of a score test on (one in five of white noise), if the
 # correlation that is likely by it would widen the variance of what is shared by so much.
 _LOUD, _MATTERS = 0.85, 0.08
-_NO_NOISE = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
 
 
 def is_loud(family: StrandFamily) -> bool:
     """Whether neighbours, nearby rows or whole strands agree more than they do in one of five sets of white noise."""
+    no_noise = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
     gap, longest, sums = family.gap, family.longest, np.diagonal(family.products)
     noise = sums[-1] / max(np.count_nonzero(family.filled) - np.sum(sums[:-1]), 1.0)
-    if gap == 0.0 or noise < _NO_NOISE:
+    if gap == 0.0 or noise < no_noise:
         return False
     residuals, private, shared = (family.squared(s) for s in (slice(-1, None), slice(6), slice(6, -1)))
     agreement, count = residuals / noise + private + shared, np.diff(family.bounds)
@@ -61,8 +61,6 @@ def _variance(family: StrandFamily, together: Array, squares: float) -> float:
 # To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %. In parts: the next one is left out
 # where the likelihood falls over the one before it to nothing.
 _SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
-_NOTHING = 6.0  # nats below the best: less than the share of a place that is left out
-_FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
 
 _Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
 
@@ -94,17 +92,18 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
         may_be_smooth: whether errors without edges are looked for, too.
         squared: sum of the squared shared columns over all rows, of which the families show some.
     """
+    nothing = 6.0  # nats below the best: less than the share of a place that is left out
     parts = [_independent(families[0], squared)]
     best = float(parts[0].log[0])
     for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
         for length in _lengths(family):
-            at, falls = _Eigenbasis.of(family, length, smooth), False
+            at, falls = _eigenbasis(family, length, smooth), False
             for shares in _SHARES:
                 place = number, smooth, length
                 part = (_impossible if falls else _of_shares)(family, at, shares, squared, place)
                 parts.append(part)
                 best = max(best, float(part.log.max()))
-                falls = bool(part.log[-1] < min(best - _NOTHING, part.log[-2]))
+                falls = bool(part.log[-1] < min(best - nothing, part.log[-2]))
     return Likelihoods(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
@@ -119,46 +118,34 @@ def _lengths(family: StrandFamily) -> list[float]:
     return list(lengths.tolist())
 
 
-@dataclass(frozen=True, eq=False)
-class _Eigenbasis:
-    """A family where its correlation is diagonal.
+_Diagonal = tuple[Array, Array]
+"""A family where its correlation is diagonal: (S, M) eigenvalues, and (S, M, Z) the columns along its eigenvectors."""
 
-    Attributes:
-        values: (S, M) its eigenvalues. columns: (S, M, Z) those of the family. white: (S, M) squared lengths of the
-            shared ones.
-    """
 
-    values: Array
-    columns: Array
-    white: Array
-
-    @classmethod
-    def of(cls, family: StrandFamily, length: float, smooth: bool) -> _Eigenbasis:
-        """At one length."""
-        values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
-        columns = family.applied(np.swapaxes(vectors, 1, 2))
-        shared = columns[..., 6:-1]
-        return cls(family.per_strand(np.maximum(values, 0.0)), columns, np.einsum("smz,smz->sm", shared, shared))
+def _eigenbasis(family: StrandFamily, length: float, smooth: bool) -> _Diagonal:
+    """At one length."""
+    values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
+    return family.per_strand(np.maximum(values, 0.0)), family.applied(np.swapaxes(vectors, 1, 2))
 
 
 def _independent(family: StrandFamily, squared: float) -> Likelihoods:
     """The likelihood of independent errors."""
-    shared = family.columns[..., 6:-1]
-    white = np.einsum("smz,smz->sm", shared, shared)
-    at = _Eigenbasis(family.filled.astype(float), family.columns, white)
+    at = family.filled.astype(float), family.columns
     return _of_shares(family, at, np.zeros(1), squared, (0, False, 0.0))
 
 
-def _of_shares(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+def _of_shares(family: StrandFamily, at: _Diagonal, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """The restricted likelihood at one place for some shares (A,)."""
-    diagonal = 1.0 - shares[:, None, None] * (1.0 - at.values)
-    logs, reduced, taken = _without_private(at.columns / np.sqrt(diagonal)[..., None], family.group)
-    size, count = at.columns.shape[2] - 7, int(np.count_nonzero(family.filled))
+    fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
+    values, columns = at
+    diagonal, white = 1.0 - shares[:, None, None] * (1.0 - values), np.einsum("smz,smz->sm", *[columns[..., 6:-1]] * 2)
+    logs, reduced, taken = _without_private(columns / np.sqrt(diagonal)[..., None], family.group)
+    size, count = columns.shape[2] - 7, int(np.count_nonzero(family.filled))
     log, variance, freedom = _restricted(family, reduced, count - taken)
-    parts = (1.0 - shares) * at.white.sum(), shares * np.sum(at.white * at.values)
-    few = max(count**2 / float(np.sum(at.values**2)) - (0 if taken else size), _FEWEST_FREEDOM)
+    parts = (1.0 - shares) * white.sum(), shares * np.sum(white * values)
+    few = max(count**2 / float(np.sum(values**2)) - (0 if taken else size), fewest_freedom)
     inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
-    scale = squared / max(float(at.white.sum()), 1e-300)  # of all rows to those looked at
+    scale = squared / max(float(white.sum()), 1e-300)  # of all rows to those looked at
     number, smooth, length_m = (np.full(len(shares), one) for one in place)
     return Likelihoods(
         number,
@@ -172,7 +159,7 @@ def _of_shares(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: fl
     )
 
 
-def _impossible(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+def _impossible(family: StrandFamily, at: _Diagonal, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """Shares that need not be looked at."""
     number, smooth, length = (np.full(len(shares), one) for one in place)
     one = np.ones(len(shares))

@@ -30,7 +30,6 @@ LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
 SINGULAR = 1e-12
 """Share of its own information that a number must keep beside the others."""
-_DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,11 +209,6 @@ class Linearised:
         rest, taken = self._projected(column[:, None])
         return np.asarray(rest[:, 0] - self.shared @ taken[:, 0])
 
-    def unabsorbed(self, shift: Array) -> Array:
-        """(E,) px of a displacement (E,) px that the free numbers could not have taken up."""
-        rest, taken = self._projected((shift * self.weight)[:, None])
-        return np.asarray((rest - self.shared @ taken)[:, 0] / self.weight)
-
     def _projected(self, columns: Array) -> tuple[Array, Array]:
         """Columns (E, Q), in standard deviations, beyond private placements, and what `shared` takes of them (P, Q)."""
         rest = self.beyond_private(columns)
@@ -319,15 +313,16 @@ def known_root(shared: Information) -> Array:
 
     How far the targets were built from their drawings has a scatter of its own (see `robust.as_built`).
     """
+    determined = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
     size, matrix = len(shared.keys), shared.matrix
     rest = np.array([key.kind != "structure" for key in shared.keys])
     if rest.all():
-        return inverse_root(matrix, np.diagonal(matrix), _DETERMINED)
+        return inverse_root(matrix, np.diagonal(matrix), determined)
     follows = np.zeros((size, int(np.count_nonzero(rest))))
     follows[rest] = np.eye(follows.shape[1])
     follows[~rest] = -np.linalg.solve(matrix[np.ix_(~rest, ~rest)], matrix[np.ix_(~rest, rest)])
     left = matrix[rest] @ follows
-    return np.asarray(follows @ inverse_root(0.5 * (left + left.T), np.diagonal(left), _DETERMINED))
+    return np.asarray(follows @ inverse_root(0.5 * (left + left.T), np.diagonal(left), determined))
 
 
 def without_shared(

@@ -21,7 +21,6 @@ from ceres_cal.effects.linearised import LEAST_LEFT, Linearised, inverse_roots
 _LN_10 = float(np.log(10.0))
 # Nats of log p: alternatives nearer than that are told apart by luck. Of what is planted the right name is first by 20.
 _ALIKE = 7.0
-_MOST = 12  # causes that are named; more than that is not a calibration with faults but none
 # Of the first cause's statistic: below it the error of its linear picture speaks. At half of it one of seven planted
 # faults has a second finding beside it, at double nothing changes.
 _LEAST_SHARE = 0.02
@@ -134,11 +133,12 @@ def select(
     Args:
         alternatives: see `score_all`. extra: how many other tests share the rate. inflation: see `score_all`.
     """
+    most = 12  # causes that are named; more than that is not a calibration with faults but none
     chosen: list[ScoreTest] = []
     extended, scores = model, score_all(model, alternatives, inflation)
     tests = len(scores) + extra
     log_level = float(np.log(rate / tests))
-    while scores and len(chosen) < _MOST:
+    while scores and len(chosen) < most:
         best = min(scores, key=lambda score: score.log_p)
         if best.log_p > log_level or (chosen and best.statistic < _LEAST_SHARE * chosen[0].statistic):
             break

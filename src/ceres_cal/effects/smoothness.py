@@ -1,4 +1,4 @@
-"""How smooth a lens without a formula is: the likeliest size of its roughness (`effects.evidence`)."""
+"""How smooth a lens without a formula is: the likeliest sizes of effects that are numbers of the model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from operator import add
 
 import numpy as np
 
-from ceres_cal.effects.evidence import likeliest_sizes
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.spread import known_inverses
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -17,7 +18,46 @@ from ceres_cal.problem.quantities import values_of
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.scene.lens.base import Roughness
 
-_AT_REST = 1e-3  # relative change of a standard deviation
+
+def likeliest_sizes(
+    normal: Array, slope: Array, forms: Sequence[Array], sigmas: Array, least: Array, at_rest: float
+) -> tuple[Array, Array, Array]:
+    """The standard deviations sigma of effects whose numbers c have the prior information sum F / sigma^2.
+
+    The fixed point of MacKay (Neural Computation 4, 1992), sigma^2 = c^T F c / gamma, with gamma = rank F - tr(C F) /
+    sigma^2 the number of directions that the data determine: the maximum of the restricted likelihood. One more
+    direction of the least size counts along (an inverse gamma distribution beforehand).
+
+    Args:
+        normal, slope: (Q, Q) and (Q,) what data say of the numbers, whose best is normal^-1 slope. forms: (Q, Q) F of
+            each. sigmas: (K,) to begin from. least: (K,) what data cannot talk a size below. at_rest: relative change
+            of a size that ends the search.
+
+    Returns:
+        (K,) sizes, (Q,) likeliest numbers, (Q, Q) inverse of their covariance.
+    """
+    one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
+    steps = 200  # of the search for sizes
+    ranks, unlimited = np.array([_rank(form) for form in forms]), np.full(len(slope), np.inf)
+    for _ in range(steps):
+        precision = normal + sum(form / sigma**2 for form, sigma in zip(forms, sigmas, strict=True))
+        covariance = known_inverses(precision, unlimited)
+        amount = covariance @ slope
+        known = ranks - np.array([np.sum(covariance * form) for form in forms]) / sigmas**2
+        squares = np.array([amount @ form @ amount for form in forms])
+        moved = np.sqrt((np.maximum(squares, 0.0) + one * least**2) / (np.maximum(known, 0.0) + one))
+        done = np.max(np.abs(np.log(moved / sigmas))) < at_rest
+        sigmas = moved
+        if done:
+            break
+    return sigmas, amount, np.asarray(precision)
+
+
+def _rank(form: Array) -> int:
+    rows = np.any(form != 0.0, axis=1)
+    own = form[np.ix_(rows, rows)]
+    diagonal = np.count_nonzero(own) == len(own)
+    return len(own) if diagonal else int(np.linalg.matrix_rank(own, hermitian=True))
 
 
 def with_smoothness(
@@ -58,12 +98,13 @@ def _sigmas(
     reduced: ReducedInformation,
 ) -> tuple[tuple[float, ...], float]:
     """The standard deviation of each form, px, and the squared step to the least cost under them, in variances."""
+    at_rest = 1e-3  # relative change of a standard deviation
     own = tuple(keys[quantity] for form in forms for quantity in form.names)
     every = [Information(tuple(keys[q] for q in form.names), form.matrix).over(own).matrix for form in forms]
     whole = reduced.shared.marginal(own).matrix
     data = whole - sum(form / sigma**2 for form, sigma in zip(every, before, strict=True))
     here = values_of(estimate, own)
     least = np.array([form.least for form in forms])
-    sizes = likeliest_sizes(data, whole @ here, every, np.array(before), least, _AT_REST)
-    away = sizes.amount - here
-    return tuple(sizes.sigmas.tolist()), float(away @ sizes.precision @ away)
+    sigmas, amount, precision = likeliest_sizes(data, whole @ here, every, np.array(before), least, at_rest)
+    away = amount - here
+    return tuple(sigmas.tolist()), float(away @ precision @ away)

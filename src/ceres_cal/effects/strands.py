@@ -23,11 +23,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Residuals
 
-_MOST_VIEWS = 16  # of a camera
 _MOST_ROWS = 1_500  # of a kind in a view
-# Beside one it is rounding; where squares underflow LAPACK's search for eigenvalues may not end.
-_NO_CORRELATION = 1e-30
-_NEAR, _FAR = 30, 30  # rows of a strand that are looked at: next to one another, and over all of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +114,11 @@ def distances_of(places: Array) -> Array:
 
 def decay(distance: Array, length: float, smooth: bool) -> Array:
     """Correlation at distances: of a rough random function, or of a smooth one."""
+    # Beside one it is rounding; where squares underflow LAPACK's search for eigenvalues may not end.
+    no_correlation = 1e-30
     relative = distance / length
     correlation = np.exp(-0.5 * relative**2 if smooth else -relative)
-    return np.where(correlation < _NO_CORRELATION, 0.0, correlation)
+    return np.where(correlation < no_correlation, 0.0, correlation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +214,9 @@ class StrandFamily:
 @lru_cache(maxsize=256)
 def _near_and_far(count: int) -> Indices:
     """Rows of a strand: some next to one another in its middle, and some over all of it."""
-    middle = max(0, (count - _NEAR) // 2)
-    return distinct(np.append(np.arange(middle, min(count, middle + _NEAR)), evenly(count, _FAR)))
+    near, far = 30, 30  # rows of a strand that are looked at: next to one another, and over all of it
+    middle = max(0, (count - near) // 2)
+    return distinct(np.append(np.arange(middle, min(count, middle + near)), evenly(count, far)))
 
 
 # ---- the views that are asked ---------------------------------------------------------------------------------------
@@ -250,6 +249,7 @@ def _shown(sights: Sights, there: Residuals) -> Sights:
 
 def _some(observations: Observations, sights: Sights) -> Sights:
     """Of each camera some views, evenly, and of each of them some rows."""
+    most_views = 16  # of a camera
     chosen, shown = np.zeros((2, len(observations.views)), dtype=bool)
     shown[observations.points.view[sights.point_rows]] = True
     shown[observations.curves.view[sights.curve_rows]] = True
@@ -257,7 +257,7 @@ def _some(observations: Observations, sights: Sights) -> Sights:
         own = (views for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera)
         views = np.array([view for views in own for view in views])
         views = views[shown[views]]
-        chosen[views[evenly(len(views), _MOST_VIEWS)]] = True
+        chosen[views[evenly(len(views), most_views)]] = True
     wanted = set(np.flatnonzero(chosen).tolist())
     sights = sights.take(np.flatnonzero([not wanted.isdisjoint(views) for views in sights.views]))
     rows = max(np.diff(sights.point_bounds).max(), np.diff(sights.curve_bounds).max())

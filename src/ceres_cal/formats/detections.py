@@ -23,7 +23,7 @@ from ceres_cal.formats.import_format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.observations import Curves, Observations, Points, View
-from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, targets_by_name
+from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, target_named, targets_by_name
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,9 @@ def _view(row: Mapping[str, Any], options: TableOptions, target: Target) -> View
 def _target(name: str, places: Sequence[tuple[float, float, float]]) -> Target:
     if places:
         return custom({_place_name(place): place for place in places})
-    if name not in targets_by_name():
+    if (known := target_named(name)) is None:
         raise InputError(f"target {name!r} is unknown: give one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
-    return targets_by_name()[name]
+    return known
 
 
 def _place(row: Mapping[str, Any], number: int) -> tuple[float, float, float]:

@@ -38,7 +38,6 @@ _COLUMNS: dict[str, Column] = {
     "homography": (float, (3, 3)),
     "third_column": (float, (3,)),
 }
-_STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +137,12 @@ def make_lookup_table(
     Raises:
         InputError: a step below 1 or beyond the image, or no step of 1 px or more keeps to the error.
     """
+    steps_px = (64, 32, 16, 8, 4, 2, 1)
     widest = min(camera.image_size)
     if step_px is not None and not 1 <= step_px <= widest:
         raise InputError(f"step_px must be from 1 to {widest}, not {step_px}")
     table = None
-    for step in _STEPS_PX if step_px is None else (step_px,):
+    for step in steps_px if step_px is None else (step_px,):
         table = _table(camera, station, step, x_m, y_m)
         if max(worst for _, worst in table.error_mm.values()) <= error_mm:
             return table

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera
     from ceres_cal.scene.targets import Target
 
-_GRID = (122, 91)  # pixels: finer than that of the fit
-_EDGE_M = 1e-6  # places at the box's own edge are in it, whatever the last bit of their way there and back says
-_ROUNDS = 8  # of bringing a place to where another camera shows it in the same pixel
 Box = tuple[Array, Array]
 
 
@@ -36,12 +33,13 @@ def field_error_mm(
         camera: that knows better. locate: pixels (N, 2) and a height -> places (N, 2) m, NaN where it knows none.
         pixels: (N, 2); those count that look into the box around the x and y of `box_m`. Infinite where none does.
     """
+    edge_m = 1e-6  # places at the box's own edge are in it, whatever the last bit of their way there and back says
     errors = {}
     low, high = (np.array([end(axis) for axis in box_m]) for end in (np.min, np.max))
     for height_m in heights_m:
         true = camera.locate(pixels, height_m)
         with np.errstate(invalid="ignore"):
-            on_field = np.all((true >= low - _EDGE_M) & (true <= high + _EDGE_M), axis=1)
+            on_field = np.all((true >= low - edge_m) & (true <= high + edge_m), axis=1)
         off = 1e3 * np.linalg.norm(locate(pixels[on_field], height_m) - true[on_field], axis=1)
         errors[height_m] = _size(off)
     return errors
@@ -75,7 +73,9 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
     Args:
         project: as the file has it, points (N, 3) m -> pixels (N, 2). box_m: of the field, None where there is none.
     """
-    pixels = image_grid(camera.image_size, _GRID)
+    rounds = 8  # of bringing a place to where another camera shows it in the same pixel
+    grid = (122, 91)  # pixels: finer than that of the fit
+    pixels = image_grid(camera.image_size, grid)
     rays = camera.rays(pixels)
     known = np.isfinite(rays[:, 0])
     depth_m = max(abs(camera.position[2]), 1.0)
@@ -87,7 +87,7 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
     def locate(seen: Array, height_m: float) -> Array:
         """Where the file's camera has these pixels: from where ours has them, by what it misses there."""
         there = place = camera.locate(seen, height_m)
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             shown = project(np.column_stack([place, np.full(len(place), height_m)]))
             place = place + there - camera.locate(shown, height_m)
         return place

@@ -22,7 +22,6 @@ from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera
 
 _MODELS = {f"LENSMODEL_OPENCV{count}": model for model, count in OPENCV_MODELS.items()}
-_BYTES_PER_COMMA = 1000  # of memory, for a part of the syntax tree
 _POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
 
 
@@ -45,8 +44,9 @@ def _export(request: ExportRequest) -> Exported:
 
 def literal_of(content: bytes) -> dict[str, Any]:
     """The literal of a .cameramodel; InputError where it is none."""
+    bytes_per_comma = 1000  # of memory, for a part of the syntax tree
     text = content.decode("utf-8", errors="replace")
-    require_room(_BYTES_PER_COMMA * text.count(",") + 4.0 * len(text), "the file")
+    require_room(bytes_per_comma * text.count(",") + 4.0 * len(text), "the file")
     try:
         with warnings.catch_warnings(action="ignore"):  # what the compiler thinks of its style
             data = ast.literal_eval(text.strip())

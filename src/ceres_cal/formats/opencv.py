@@ -23,7 +23,6 @@ from ceres_cal.scene.foreign import FISHEYE, LARGEST, ForeignCamera, image_grid
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D1", "D")
-_ROUGH_PX = 0.05  # from which on OpenCV's own inverse is worth a word
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
@@ -57,6 +56,7 @@ def _export(request: ExportRequest) -> Exported:
 
 def _reader_traps(camera: ForeignCamera) -> list[str]:
     """What OpenCV makes of a camera."""
+    rough_px = 0.05  # from which on OpenCV's own inverse is worth a word
     import cv2
 
     if camera.model == FISHEYE:
@@ -65,7 +65,7 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
     straight = cv2.undistortPoints(pixels[:, None], camera.matrix, coefficients)[:, 0]
     rays = np.column_stack([straight, np.ones(len(straight))])
     worst = float(np.max(np.linalg.norm(camera.project_rays(rays) - pixels, axis=1)))
-    if worst <= _ROUGH_PX:
+    if worst <= rough_px:
         return []
     end = "criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)"
     return [f"cv2.undistortPoints stops after five rounds, here up to {worst:.2g} px off: give it {end}"]

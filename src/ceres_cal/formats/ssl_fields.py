@@ -31,7 +31,6 @@ _RULES = {
     "ball_radius": 21.5,
     "max_robot_radius": 90.0,
 }
-_SAME_M = 6e-4  # sizes are whole millimetres, the lines are the truth
 _SHAPES = "CenterCircle TopTouchLine BottomTouchLine LeftGoalLine RightGoalLine HalfwayLine CenterLine"
 _PENALTY = "LeftPenalty RightPenalty LeftFieldLeftPenalty LeftFieldRightPenalty RightFieldLeftPenalty"
 _TYPES = {*_SHAPES.split(), *(f"{name}Stretch" for name in f"{_PENALTY} RightFieldRightPenalty".split())}
@@ -77,13 +76,14 @@ def _curves(field: Mapping[str, Any]) -> dict[str, Curve]:
 
 
 def _alike(one: Curve, other: Curve) -> bool:
+    same_m = 6e-4  # sizes are whole millimetres, the lines are the truth
     if isinstance(one, Segment) and isinstance(other, Segment):
         ends = np.array([other.start, other.end])
         off = min(np.max(np.abs(np.array(e) - ends)) for e in ((one.start, one.end), (one.end, one.start)))
-        return bool(off < _SAME_M)
+        return bool(off < same_m)
     if isinstance(one, Arc) and isinstance(other, Arc):
         off = np.max(np.abs(np.subtract((*one.centre, one.radius_m), (*other.centre, other.radius_m))))
-        return bool(off < _SAME_M and abs(one.length_m - other.length_m) < _SAME_M)
+        return bool(off < same_m and abs(one.length_m - other.length_m) < same_m)
     return False
 
 

@@ -19,11 +19,6 @@ from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.targets import Target
 
-_LARGEST = 65536
-_TTL = 1  # stays in the local network
-_LOOK_S = 60.0  # longest wait at a time: select does not take any number
-_IP_MULTICAST_ALL = 49  # of Linux; Python has no name for it
-
 
 @dataclass(frozen=True)
 class Group:
@@ -59,10 +54,11 @@ def publish(packet: bytes, group: Group, times: int | None = None, period_s: flo
     Raises:
         InputError: the network does not take it.
     """
+    ttl = 1  # stays in the local network
     sent = 0
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, _TTL)
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, ttl)
             sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
             if group.interface != "0.0.0.0":
                 sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(group.interface))
@@ -115,18 +111,21 @@ def received_geometry(group: Group, seconds: float) -> Heard:
 
 def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
     """Packets to the group alone, none of those to an address of this computer, and who sent each."""
+    ip_multicast_all = 49  # of Linux; Python has no name for it
+    look_s = 60.0  # longest wait at a time: select does not take any number
+    largest = 65536
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
             receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if sys.platform == "linux":  # or what other programs joined on other network cards comes, too
-                receiver.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+                receiver.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
             receiver.bind((group.address, group.port))
             member = struct.pack("4s4s", socket.inet_aton(group.address), socket.inet_aton(group.interface))
             receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
             ends = time.monotonic() + seconds
             while (left := ends - time.monotonic()) > 0.0:
-                if select([receiver], [], [], min(left, _LOOK_S))[0]:
-                    content, sender = receiver.recvfrom(_LARGEST)
+                if select([receiver], [], [], min(left, look_s))[0]:
+                    content, sender = receiver.recvfrom(largest)
                     yield content, f"{sender[0]}:{sender[1]}"
     except OSError as error:
         raise InputError(f"{group.address}:{group.port}: cannot be listened to: {error.strerror or error}") from None

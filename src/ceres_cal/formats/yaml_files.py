@@ -15,9 +15,6 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
 from ceres_cal.scene.foreign import LARGEST
 
-_BYTES_PER_LETTER = 200  # of memory, and 10 us, while YAML is read
-_BYTES_PER_VALUE = 100
-
 
 def read_yaml(text: str) -> dict[str, Any]:
     """A YAML file of names and values.
@@ -25,9 +22,11 @@ def read_yaml(text: str) -> dict[str, Any]:
     Raises:
         InputError: it is none.
     """
+    bytes_per_value = 100
+    bytes_per_letter = 200  # of memory, and 10 us, while YAML is read
     import yaml
 
-    require_room(float(_BYTES_PER_LETTER * len(text)), "its YAML")
+    require_room(float(bytes_per_letter * len(text)), "its YAML")
     try:
         data = yaml.load(text, _loader())
         size = _size(data, {})
@@ -37,7 +36,7 @@ def read_yaml(text: str) -> dict[str, Any]:
         raise InputError("not a YAML file of names and values")
     if math.isinf(size):
         raise InputError("something in its YAML holds itself: correct that")
-    require_room(_BYTES_PER_VALUE * size, "its YAML")
+    require_room(bytes_per_value * size, "its YAML")
     return data
 
 

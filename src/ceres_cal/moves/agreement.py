@@ -73,7 +73,7 @@ def _root_mean_square(values: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class MapChange:
     """A station from one camera to another.
 
     Attributes:
@@ -160,7 +160,7 @@ class Agreement:
     degrees: int = 0
     words: str = ""
     cause: str | None = None
-    change: Change | None = None
+    change: MapChange | None = None
     image: ImageDifference | None = None
     misfit: Misfit = field(default_factory=Misfit)
     views: tuple[Agreement, ...] = ()
@@ -274,7 +274,7 @@ def change_of(
     after: Camera,
     grids: Sequence[FieldGrid],
     known: Callable[[FieldGrid], Array] | None = None,
-) -> Change:
+) -> MapChange:
     """How a station differs from what an estimate says of it.
 
     Args:
@@ -292,7 +292,7 @@ def change_of(
         places = np.column_stack([grid.places, np.full(len(seen), grid.height_m)])
         shifts = np.linalg.norm(seen - after.project(places), axis=1)
     turned_deg, phi_px = float(np.degrees(turn)), (camera.phi, after.phi)
-    return Change(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
+    return MapChange(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
 
 
 def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Array) -> FieldDifference:

@@ -22,7 +22,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.agreement import Agreement, Agreements, Change, Misfit, change_of, field_grids
+from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.maps import FieldGrid, field_map
@@ -248,7 +248,7 @@ def resized(camera: Camera, scale: float, image_size: tuple[int, int]) -> Camera
 # ---- in words -------------------------------------------------------------------------------------------------------
 
 
-def _words(cause: str | None, what_to_do: str, change: Change, posed: bool) -> str:
+def _words(cause: str | None, what_to_do: str, change: MapChange, posed: bool) -> str:
     sizes = [
         f"{one.rms_mm:.2g} mm rms and {one.most_mm:.2g} mm at most {at_height(one.height_m)}" for one in change.maps
     ]

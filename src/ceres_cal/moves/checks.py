@@ -24,7 +24,7 @@ from ceres_cal.moves.agreement import (
     FALSE_ALARMS,
     Agreement,
     Agreements,
-    Change,
+    MapChange,
     Misfit,
     change_of,
     field_grids,
@@ -244,7 +244,7 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
     return answer if misfit is None else replace(answer, misfit=misfit)
 
 
-def _words(holds: bool, probability: float, misfit: Misfit, change: Change) -> str:
+def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -> str:
     worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
     if holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""

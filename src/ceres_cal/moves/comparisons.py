@@ -25,9 +25,6 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import difference
 from ceres_cal.problem.structure import EXACT
 
-_COLUMNS = 41  # of the grid over an image
-_ROUNDS = 20  # of reweighting
-
 
 @checked
 @numerical("the comparison")
@@ -125,12 +122,13 @@ def compare_cameras(
 
 
 def _camera_compared(a: Calibration, b: Calibration, name: str, other: str, without_turn: bool) -> Agreement:
+    columns = 41  # of the grid over an image
     first, second = a.cameras[name], b.cameras[other]
     if first.image_size != second.image_size:
         sizes = " and ".join(f"{w} x {h} px" for w, h in (first.image_size, second.image_size))
         raise InputError(f"camera {name!r}: its images are of {sizes}: calibrations of one size can be compared")
     width, height = first.image_size
-    x, y = (np.linspace(0.0, n - 1.0, max(2, round(_COLUMNS * n / width))) for n in (width, height))
+    x, y = (np.linspace(0.0, n - 1.0, max(2, round(columns * n / width))) for n in (width, height))
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     seen, also = first.rays(pixels), second.rays(pixels)
     both = np.isfinite(seen[:, 0]) & np.isfinite(also[:, 0])
@@ -154,8 +152,9 @@ def _common_turn(seen: Array, also: Array) -> Array:
     """(3, 3) the rotation that most of the directions (N, 3) agree on: Cauchy's weights at the median, since lenses
     differ most in corners that nobody observed.
     """
+    rounds = 20  # of reweighting
     turn = np.eye(3)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         away = np.linalg.norm(seen @ turn.T - also, axis=1)
         weights = 1.0 / (1.0 + (away / max(median(away), 1e-15)) ** 2)
         turn = nearest_rotation((also * weights[:, None]).T @ seen)

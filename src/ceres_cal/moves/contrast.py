@@ -17,9 +17,6 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
 from ceres_cal.problem.information import Information, Key
 
-_DETERMINED = 1e-11  # singular value, at unit columns, from which on a direction counts as determined
-_TESTABLE = 1e-6  # length, at unit columns, that both statements together must leave of a direction
-
 
 @dataclass(frozen=True, eq=False)
 class NormalDistribution:
@@ -71,16 +68,18 @@ def _chi2_95(freedom: float) -> float:
 
 def contrast(first: NormalDistribution, second: NormalDistribution, tested: Sequence[Key]) -> Contrast:
     """The contrast in the tested numbers, all others being the same in both; both speak of the same numbers."""
+    testable = 1e-6  # length, at unit columns, that both statements together must leave of a direction
+    determined = 1e-11  # singular value, at unit columns, from which on a direction counts as determined
     roots = first.information.root, second.information.root
     known, at = len(roots[0]), first.information.columns(tested)
     rows = np.vstack(roots)
     sizes = np.linalg.norm(rows, axis=0)
     rows /= np.where(sizes > 0.0, sizes, 1.0)
-    alike = _basis(rows, _DETERMINED)
+    alike = _basis(rows, determined)
     apart = rows[:, at] * (np.arange(len(rows)) >= known)[:, None]
     for _ in range(2):  # the second time for what rounding left
         apart = apart - alike @ (alike.T @ apart)
-    apart = _basis(apart, _TESTABLE)
+    apart = _basis(apart, testable)
     off = np.concatenate([root @ one.offsets for root, one in zip(roots, (first, second), strict=True)])
     shares = np.clip(np.linalg.eigvalsh(apart[:known].T @ apart[:known]), 0.0, 1.0)
     share = float(np.mean(shares)) if len(shares) else 0.0

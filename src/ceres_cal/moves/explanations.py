@@ -24,7 +24,6 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import make_structure
 
-_ZOOMS = 15
 # Share of the observations that another zoom must explain to be looked at. Nothing changes from 0.33 to 0.67.
 _HALF = 0.5
 # Share of observations that may be taken out where another lens is said to explain the rest. Nothing changes from
@@ -162,10 +161,11 @@ def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
 
 def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, PoseCandidate] | None:
     """The search with the phi that explains it best, and the pose there; None where none explains half of it."""
+    zooms = 15
     best: tuple[PoseSearch, PoseCandidate] | None = None
     for width in (2.0, 1.05, 1.008):  # each grid is finer, around the best of the one before
         middle = search.camera.phi if best is None else best[0].camera.phi
-        for phi in middle * np.geomspace(1.0 / width, width, _ZOOMS):
+        for phi in middle * np.geomspace(1.0 / width, width, zooms):
             zoomed = search.with_camera(replace(search.camera, phi=float(phi)))
             for candidate in pose_candidates(zoomed, old, patience=0)[:1]:
                 if best is None or candidate.misfit < best[1].misfit:

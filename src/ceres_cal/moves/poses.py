@@ -27,7 +27,6 @@ from ceres_cal.start.planes import plane_sight
 # Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise. Nothing
 # changes from half to double.
 _WIDE = (60.0, 12.0)
-_FARTHEST_M = 1e3
 _TURNS = [(0.0, 0.0, angle) for angle in (np.pi, np.pi / 2, -np.pi / 2)]
 # Turns about each axis of the camera; neighbours' basins overlap.
 _GRID = list(product(np.deg2rad((-24.0, 0.0, 24.0)), repeat=3))
@@ -37,7 +36,6 @@ _ALIKE = (0.02, 0.01)
 # many times that of the calibration: up to 40 % may be wrong. Nothing changes but at a noise of twice: another iris
 # then fits no pose, and is not named.
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
-_ROUNDS = 4  # of the closed form's reweighting
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +79,9 @@ class PoseSearch:
 
     def allows(self, pose: Pose) -> bool:
         """Whether a camera may stand there: over the floor, not in the clouds; a placement may be anywhere near."""
+        farthest_m = 1e3
         x, y, height = pose.position
-        near = float(np.hypot(x, y)) < _FARTHEST_M and abs(float(height)) < _FARTHEST_M
+        near = float(np.hypot(x, y)) < farthest_m and abs(float(height)) < farthest_m
         return near and (self.sight.key.placement is not None or height > 0.0)
 
     @property
@@ -136,12 +135,13 @@ def closed_form(search: PoseSearch) -> Pose | None:
     """The pose by a homography between the lens's rays and the plane of the drawing, from points and straight lines;
     None where they are too few (a point gives two equations, a line two) or cannot fix it.
     """
+    rounds = 4  # of the closed form's reweighting
     plane = plane_sight(search.drawn, height_m=0.0)
     rays = search.camera.rays(plane.pixels)
     known = np.isfinite(rays[:, 0])
     if plane.equations < 8 or np.count_nonzero(known) < 8:
         return None
-    homography, _ = fit_lines(plane.lines[known], rays[known], _ROUNDS)
+    homography, _ = fit_lines(plane.lines[known], rays[known], rounds)
     return None if homography is None else pose_from_homography(homography)
 
 

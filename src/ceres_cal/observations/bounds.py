@@ -16,7 +16,6 @@ _MARGIN_PX = 1.5
 # Of a camera's observations: more of them outside, and its image has another size.
 _FEW = 0.01
 _CORNER = 0.25  # of either side: a board that is always held so far from the middle of the image is rare
-_LONG = 1e6  # px: printed with an exponent
 _FAR = 10.0  # image diagonals: a pixel farther off was not measured, and its square swamps what was
 # The largest playing fields end at 60 m; the smallest board in millimetres reaches as far.
 _LARGE_M = 100.0
@@ -119,11 +118,12 @@ def _cause(pixels: Array, size: Sequence[int]) -> str:
 
 
 def _first(content: Content, points: Mask, curves: Mask) -> str:
+    long = 1e6  # px: printed with an exponent
     column: Columns = content.points if points.any() else content.curves
     row = int(np.argmax(points if points.any() else curves))
     kind = "curve" if isinstance(column, Curves) else "point"
     feature, (x, y) = content.feature_name(kind, row), column.pixels[row]
-    at = ", ".join(f"{value:.1f}" if abs(value) < _LONG else f"{value:g}" for value in (x, y))
+    at = ", ".join(f"{value:.1f}" if abs(value) < long else f"{value:g}" for value in (x, y))
     return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({at})"
 
 

@@ -150,7 +150,6 @@ _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
 _ROW_NS = 10.0  # of what is looked at in a block
-_MOST_RUNS = 10_000  # of rows side by side that are read one by one
 C = TypeVar("C")
 T = TypeVar("T")
 
@@ -162,11 +161,12 @@ def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
 
 def _taken(column: AnyArray, rows: Indices | Indices32 | Mask) -> AnyArray:
     """Rows of a column; of one in a file, where they lie side by side, without mapping what is around them."""
+    most_runs = 10_000  # of rows side by side that are read one by one
     if not isinstance(column, np.memmap):
         return column[rows]
     numbers = np.flatnonzero(rows) if rows.dtype == bool else rows
     starts = np.flatnonzero(np.diff(numbers, prepend=-2) != 1)
-    if not len(numbers) or len(starts) > _MOST_RUNS:
+    if not len(numbers) or len(starts) > most_runs:
         return np.array(column[rows])
     runs = zip(numbers[starts].tolist(), np.diff(starts, append=len(numbers)).tolist(), strict=True)
     return np.concatenate([read_rows(rows_of(column, start, start + count)) for start, count in runs])

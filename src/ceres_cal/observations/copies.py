@@ -24,7 +24,6 @@ Hashes = NDArray[np.uint64]
 
 COUNTED_ONCE = ": counted once"
 """How a line about copies ends."""
-_LEAST_ROWS = 4  # of a view that copies another: fewer whole pixels agree by chance
 # Large odd numbers without pattern, those of splitmix64: what the parts of a row are multiplied with.
 _X, _FEATURE, _FRAME = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
@@ -163,13 +162,14 @@ def _mark_views(
     columns: tuple[Columns, Columns], hashes: Sequence[Hashes], place: Indices, sources: tuple[Indices, ...]
 ) -> None:
     """Rows of views all of whose rows repeat those of an earlier one; `place` (V,): of the same station and target."""
+    least_rows = 4  # of a view that copies another: fewer whole pixels agree by chance
     contents: list[list[Hashable]] = [[int(number)] for number in place]
     sizes, differs = np.zeros(len(place), dtype=np.int64), np.zeros(len(place), dtype=bool)
     own = [source < 0 for source in sources]
     for column, values, counts in zip(columns, hashes, own, strict=True):
         sizes += np.bincount(column.view[counts], minlength=len(place))
         differs[column.view[counts][~_repeated(values[counts])]] = True
-    whole = np.flatnonzero((sizes >= _LEAST_ROWS) & ~differs)
+    whole = np.flatnonzero((sizes >= least_rows) & ~differs)
     for column, counts in zip(columns, own, strict=True):
         rows = np.flatnonzero(counts & np.isin(column.view, whole))
         said = _parts(column, rows)

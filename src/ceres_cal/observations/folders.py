@@ -20,7 +20,6 @@ from ceres_cal.base.files import opened
 from ceres_cal.observations.columns import Columns, read_rows, rows_of
 
 ENDING, HEADER = ".columns", "header.json"
-_BLOCK = 1 << 22  # rows written at once
 
 
 def write_folder(path: Path, header: Any, columns: Mapping[str, Columns]) -> None:
@@ -45,11 +44,12 @@ def write_folder(path: Path, header: Any, columns: Mapping[str, Columns]) -> Non
 
 
 def _write(path: Path, array: AnyArray) -> None:
+    block = 1 << 22  # rows written at once
     with path.open("wb") as file:
         described = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape}
         np.lib.format.write_array_header_1_0(file, described)
-        for first in range(0, len(array), _BLOCK):
-            rows = read_rows(rows_of(array, first, min(first + _BLOCK, len(array))))
+        for first in range(0, len(array), block):
+            rows = read_rows(rows_of(array, first, min(first + block, len(array))))
             file.write(np.ascontiguousarray(rows).data)
 
 

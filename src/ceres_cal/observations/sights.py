@@ -30,7 +30,6 @@ from ceres_cal.observations.files import Content
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import nearest_to_rays
 
-_BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
 _RUN = 256  # rows between two that go, from which on those between are moved together
 _Rows: TypeAlias = "Indices | slice | list[slice]"
 
@@ -335,8 +334,9 @@ def nearest_feet(sight: Sights, camera: Camera) -> Array:
     `camera` stands in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
     taken.
     """
-    blocks = range(0, len(sight.curve_pixels), _BLOCK)
-    return np.concatenate([np.empty(0), *(_nearest(sight, camera, slice(at, at + _BLOCK)) for at in blocks)])
+    block = 1 << 16  # rows worked on at once: memory stays small beside the observations
+    blocks = range(0, len(sight.curve_pixels), block)
+    return np.concatenate([np.empty(0), *(_nearest(sight, camera, slice(at, at + block)) for at in blocks)])
 
 
 def _nearest(sight: Sights, camera: Camera, rows: slice) -> Array:

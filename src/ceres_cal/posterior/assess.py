@@ -15,10 +15,9 @@ import numpy as np
 from ceres_cal.base.numerical import numerical
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.observations import Observations
-from ceres_cal.posterior.bent import ends_of
+from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
-from ceres_cal.posterior.profile import Node, profile, valley
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Information, over
 from ceres_cal.problem.parameters import Estimate, unit_px
@@ -49,6 +48,8 @@ def assess(
     reduced: ReducedInformation,
     degrees_of_freedom: float,
     scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
+    *,
+    bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
@@ -61,6 +62,7 @@ def assess(
         reduced: what the problem says at the estimate.
         degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
         scatter_at: how the data scatter at an estimate, of which the problem says so much.
+        bends: whether weak directions are followed, which takes a solve for each end.
 
     Raises:
         SolutionError: no possible lens fits.
@@ -82,7 +84,8 @@ def assess(
         reduced = information(problem, estimate)
         posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
-    return estimate, _with_bends(replace(posterior, mixtures=mixtures), problem, estimate)
+    posterior = replace(posterior, mixtures=mixtures)
+    return estimate, _with_bends(posterior, problem, estimate) if bends else posterior
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
@@ -108,7 +111,7 @@ def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> P
     }
     own = ends.beside(posterior.stated.over(posterior.keys).marginal(held)).mixture(posterior.information)
     bent = replace(posterior, mixtures={**mixtures, "": own})
-    return bent.with_alternatives(held, list(ends.minima), (ends.odds / (1.0 + ends.odds.sum())).tolist())
+    return bent.with_alternatives(held, *minima_of(ends.others, estimate, by_model.given(held), posterior.half_width))
 
 
 def _inflation(posterior: Posterior, camera: str) -> float:
@@ -165,6 +168,9 @@ def with_doubts(
     estimate = end.solution.estimate
     disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as any of what contradicts it
     posterior = posterior.with_alternatives(conflicts.keys, conflicts.shifts, [disputed] * len(conflicts.shifts))
+    for doubt in conflicts.doubts:  # of which nothing is known for certain any more
+        posterior = replace(posterior, stated=posterior.stated.without(doubt.keys))
+        posterior = posterior.with_alternatives(conflicts.keys, [doubt.shift], [doubt.probability])
     doubtful = [one for one in explanations if one.is_doubtful]
     shifts = [difference(one.other, estimate, posterior.keys) for one in doubtful]
     likely = np.array([one.doubt for one in doubtful])
@@ -180,7 +186,7 @@ def with_roughness(posterior: Posterior, end: RobustSolution, observations: Obse
     """Wider by what a lens without a formula leaves in the same places of all views."""
     if not end.problem.options.blank_lens.roughness:
         return posterior
-    from ceres_cal.posterior.roughness import shifts_by_roughness
+    from ceres_cal.posterior.other_lenses import shifts_by_roughness
 
     return posterior.widened(*shifts_by_roughness(end, observations))
 

@@ -1,4 +1,9 @@
-"""Where the quadratic picture bends: the least cost at the ends of weak directions, and by how much that widens.
+"""Where the cost is no parabola: along phi, and at the ends of weak directions.
+
+The views of a flat field from nearly above tell phi by the small differences of large numbers, so the least cost has a
+long, bent valley that no ellipse describes (the profile likelihood). It is followed step by step; at each of its nodes
+the other numbers have a covariance of their own. Together they bound any number or mapped point that depends on both:
+along the valley exactly, across it by the quadratic picture.
 
 A direction that is known to a few hundredths of its natural size reaches so far that the least cost there is a curve,
 not a line: one board before a lens with tangential terms fits nearly as well with its principal point a quarter of the
@@ -9,35 +14,188 @@ where all directions are well known.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.tails import normal_cdf
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Information, Key, over
-from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.parameters import Estimate, unit_px
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference, moved, natural_sizes
+from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.reduced import information
+from ceres_cal.robust.other_minima import FEW, solved_soon
+
+# Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
+# changes from half to double.
+_FAR = 9.0
+_STEPS = (0.02, 0.35)  # of log phi
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One point of the valley: phi held, everything else at its best.
+
+    Attributes:
+        cost: twice the least cost there, that of the observations over the factor on their variance; with that of the
+            priors, also of those on phi.
+        information: about everything shared, phi too, though it was held.
+    """
+
+    estimate: Estimate
+    cost: float
+    information: Information
+
+
+def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float = 1.0) -> tuple[Node, ...]:
+    """Follow the valley from the estimate both ways, until it is three sigma up or phi is no lens any more.
+
+    Args:
+        inflation: factor on the variance of the observations along it: what they cost is divided by it.
+
+    Raises:
+        SolutionError: the solve does not find back to where it ended, or from there to a lens that fits.
+    """
+    unit, phi = unit_px(estimate.cameras[camera]), estimate.cameras[camera].phi
+    first = least = _node(camera, problem, estimate, inflation)
+    within = float(np.clip(phi, unit * PHI_RANGE[0], unit * PHI_RANGE[1]))
+    while first is not None and phi != within:
+        factor = within / phi
+        phi = within if 0.5 <= factor <= 2.0 else phi * float(np.clip(factor, 0.5, 2.0))
+        first = _node(camera, problem, _ahead(camera, first, phi), inflation)
+    if first is None or least is None or first.cost - least.cost > _FAR:
+        raise SolutionError(
+            f"camera {camera!r}: the least cost lies at phi {estimate.cameras[camera].phi:.1f} px, which is no lens: "
+            "check labels and dimensions, add a prior on height_m or phi, or boards tilted by 20 degrees"
+        )
+    down = list(_walk(camera, problem, first, -1, inflation))
+    up = list(_walk(camera, problem, first, +1, inflation))
+    if not (down or up):
+        raise SolutionError(
+            f"camera {camera!r}: no other phi beside {phi:.1f} px can be solved for, so nothing says how far it is "
+            "known: check labels and dimensions, add observations, or a prior on height_m or phi"
+        )
+    return (*down[::-1], first, *up)
+
+
+def profile(
+    camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float, stated_sd: Mapping[Key, float]
+) -> Mixture:
+    """The valley as seen from the estimate.
+
+    Args:
+        half_width: standard deviations from the middle to the end of a 95 % interval.
+        stated_sd: of numbers that were stated: a node is no nearer, in standard deviations, than any of them has it.
+    """
+    costs = np.array([node.cost for node in nodes])
+    phi = estimate.cameras[camera].phi
+    here = float(np.interp(phi, [node.estimate.cameras[camera].phi for node in nodes], costs))
+    # Where the valley has a second, lower place, both count: the bound reaches as high over either.
+    base = costs.min() if here - costs.min() <= half_width**2 else here
+    keys = _keys_of(camera, estimate, nodes[0].information.keys)
+    steps = np.array([difference(node.estimate, estimate, keys) for node in nodes])
+    stated = (steps / [stated_sd.get(key, np.inf) for key in keys]) ** 2
+    rises = np.maximum(costs - base, np.max(stated, axis=1))
+    across = [_across(node.information, keys) for node in nodes]
+    is_open = bool(rises[0] < half_width**2), bool(rises[-1] < half_width**2)
+    return Mixture.along_phi(keys, phi, steps, rises, across, is_open)
+
+
+def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> Node | None:
+    """The least cost with phi held where the start has it; None where the solver does not get there."""
+    try:
+        held = problem.holding(camera, 0)
+        solution = solve(held, start)
+        known = None if solution.failed else information(problem, solution.estimate).shared
+    except CalibrationError:  # quiet: a smaller step is tried; a valley without an end stays open
+        return None
+    if known is None:
+        return None
+    there = solution.estimate
+    stated = sum(prior.cost(there) for prior in held.stated_at(there))
+    cost = (2.0 * solution.cost - stated) / inflation + stated + _cost_of_phi(camera, problem, there)
+    return Node(there, cost, known)
+
+
+def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
+    """What priors on phi alone add to twice the cost: a solve that holds phi leaves them out."""
+    own = [prior for prior in problem.priors if [key[:3] for key in prior.keys] == [("camera", camera, "phi")]]
+    return sum(prior.cost(estimate) for prior in own)
+
+
+def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float) -> Iterator[Node]:
+    """Nodes on one side, each found from the one before by a step along the valley's slope."""
+    most_nodes = 60
+    most_rise = 1.5  # from one node to the next
+    unit = unit_px(first.estimate.cameras[camera])
+    low, high = (unit * limit for limit in PHI_RANGE)
+    node, step = first, _first_step(camera, first)
+    lowest = first.cost
+    for _ in range(most_nodes):
+        phi = node.estimate.cameras[camera].phi
+        wanted = float(np.clip(phi * np.exp(direction * step), low, high))
+        if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
+            return
+        following = _node(camera, problem, _ahead(camera, node, wanted), inflation)
+        change = np.inf if following is None else abs(following.cost - node.cost)
+        if following is None or (change > most_rise and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
+            step *= 0.5  # too far to find, or to interpolate where the bounds will lie
+            if step < 0.5 * _STEPS[0]:
+                return
+            continue
+        step = float(np.clip(step * (1.5 if change < 0.5 * most_rise else 1.0), *_STEPS))
+        node, lowest = following, min(lowest, following.cost)
+        yield node
+
+
+def _first_step(camera: str, node: Node) -> float:
+    """Half a standard deviation of log phi by the quadratic picture, within reason."""
+    column = _phi_column(camera, node.information.keys)
+    sd = float(np.sqrt(max(node.information.inverse[column, column], 0.0))) or np.inf
+    return float(np.clip(0.5 * sd / node.estimate.cameras[camera].phi, *_STEPS))
+
+
+def _ahead(camera: str, node: Node, phi: float) -> Estimate:
+    """The estimate with another phi, and everything shared moved along with it as the normal equations say."""
+    keys = node.information.keys
+    column = _phi_column(camera, keys)
+    others = np.delete(np.arange(len(keys)), column)
+    step = np.zeros(len(keys))
+    step[column] = phi - node.estimate.cameras[camera].phi
+    held = node.information.given([keys[i] for i in others])
+    step[others] = -held.inverse @ node.information.matrix[others, column] * step[column]
+    return moved(node.estimate, keys, step)
+
+
+def _phi_column(camera: str, keys: tuple[Key, ...]) -> int:
+    return next(i for i, key in enumerate(keys) if key[:3] == ("camera", camera, "phi"))
+
+
+def _keys_of(camera: str, estimate: Estimate, keys: tuple[Key, ...]) -> tuple[Key, ...]:
+    """phi, the camera's other numbers, those of its stations."""
+    mine = {name for name, station in estimate.stations.items() if station.camera == camera}
+    own = [key for key in keys if key.kind == "camera" and key.owner == camera]
+    return (*own, *(key for key in keys if key.kind == "station" and key.owner in mine))
+
+
+def _across(information: Information, keys: tuple[Key, ...]) -> Information:
+    """About all of the keys but the first, which is held; what is not among them integrated out."""
+    held = information.given([key for key in information.keys if key != keys[0]])
+    return held.marginal(keys[1:])
+
 
 # Sigma in natural sizes from which on a direction is looked at.
 BENDING = 0.01
 _HELD = 0.005  # of a step: how closely its end is held
 _FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
-_FEW = 300  # equations beside which other minima are sought: not measured; the cases mended had under 200
-_MOST_ITERATIONS = 30  # of each end: along a flat valley the solver creeps for hundreds that change nothing here
-_FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
-# Another minimum lies so far off, of the rise at an end, by what the normal equations say, and costs less than so much
-# of that: the same one, not quite reached, costs all of it.
-_OTHER, _SAME = 0.25, 0.25
-_WITHIN = 0.25  # share of a weak direction's variance that each component along its curve has by itself
-_LEAST_PAIRS = 12  # of components
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +206,7 @@ class Ends:
         keys: (K). steps: (2 B, K) as far as the quadratic picture has the ends of the 95 % interval along each
             direction, upper ones first. ends: (2 B, K) where the least cost has risen there as much.
         half_width: standard deviations that a step is long. information: of the quadratic picture.
-        minima: (M, K) others that fit as well. odds: (M,) theirs.
+        others: where solves ended that began far out, with what they cost beyond the least.
     """
 
     keys: tuple[Key, ...]
@@ -56,8 +214,7 @@ class Ends:
     ends: Array
     half_width: float
     information: Information
-    minima: Array
-    odds: Array
+    others: tuple[Solution, ...] = ()
 
     @property
     def excesses(self) -> Array:
@@ -69,17 +226,10 @@ class Ends:
         return information.widened(over(self.excesses, self.keys, information.keys))
 
     def beside(self, stated: Information) -> Ends:
-        """With ends no farther than what was stated lets them be.
-
-        With L what the observations say, P what was stated, C = (L + P)^-1 and E the excesses, the covariance of L + P
-        with L widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
-        """
+        """With ends no farther than what was stated lets them be."""
         if not np.any(stated.matrix):
             return self
-        moved = self.excesses @ self.information.less(stated).matrix @ self.information.inverse
-        left = moved @ stated.matrix @ self.excesses.T
-        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
-        excesses = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved
+        excesses = self.information.beside(stated, self.excesses)
         return replace(self, ends=self.steps + self.half_width * np.sqrt(2.0) * excesses)
 
     def mixture(self, information: Information) -> Mixture:
@@ -89,20 +239,23 @@ class Ends:
         Args:
             information: of everything that is shared.
         """
+        within = 0.25  # share of a weak direction's variance that each component along its curve has by itself
         up, down = np.split(self.ends / self.half_width, 2)
         linear, square = 0.5 * (up - down), 0.5 * (up + down) / self.half_width
-        along = np.sqrt(1.0 - _WITHIN) * _drawn(len(up))
+        along = np.sqrt(1.0 - within) * _drawn(len(up))
         along = along[np.argsort(np.linalg.norm(along, axis=1), kind="stable")]
         keys, steps = information.keys, over(along @ linear + along**2 @ square, self.keys, information.keys)
         rows = np.split(self.steps / self.half_width, 2)[0] @ self.information.matrix
         rows = over(rows, self.keys, keys)
-        known = Information(keys, information.matrix + (1.0 / _WITHIN - 1.0) * rows.T @ rows)
-        return Mixture(keys, np.full(len(steps), 1.0 / len(steps)), steps, (known,) * len(steps))
+        known = Information(keys, information.matrix + (1.0 / within - 1.0) * rows.T @ rows)
+        every = np.zeros(len(steps), dtype=np.int64)
+        return Mixture(keys, np.full(len(steps), 1.0 / len(steps)), steps, (known,), every)
 
 
 def _drawn(count: int) -> Array:
     """(2 H, count) normal variables, uncorrelated and of variance one: H and their mirror images."""
-    half = max(_LEAST_PAIRS, 2 * count)
+    least_pairs = 12  # of components
+    half = max(least_pairs, 2 * count)
     grid = np.linspace(0.0, 4.0, 401)
     each = np.interp((np.arange(half) + 0.5) / half, 2.0 * normal_cdf(grid) - 1.0, grid)
     rng = np.random.default_rng(0)
@@ -137,12 +290,13 @@ def ends_of(
     Args:
         problem: whose cost is least at the estimate. information: as the data scatter. by_model: as that cost says.
     """
+    far_out = 3.0  # times 95 %: where a search for another minimum starts
     keys, sizes = information.keys, natural_sizes(estimate, information.keys)
     axes = weak_axes(information, estimate, keys)
     if not axes.shape[1]:
         return None
     least = 2.0 * solve(problem, estimate).cost
-    few, minima = problem.sights.equations < _FEW, _Minima(by_model, sizes, least)
+    few, others = problem.sights.equations < FEW, list[Solution]()
     steps, excesses = [], []
     for sign in (half_width, -half_width):
         for axis in axes.T:
@@ -152,43 +306,18 @@ def ends_of(
             along, step = sign * axis, sign * (information.spread.covariance @ slopes) / sizes
             end = _end(problem, estimate, keys, along)
             found = [_excess(end, step, least, rise)]
-            far = _end(problem, estimate, keys, _FAR_OUT * along) if few else None
+            far = _end(problem, estimate, keys, far_out * along) if few else None
             if far is not None:
-                minima.look(_solved(problem, far.estimate), estimate, rise, half_width)
+                if (other := solved_soon(problem, far.estimate)) is not None:
+                    others.append(replace(other, cost=other.cost - 0.5 * least))
                 # Where the cost rises ever less, the interval ends between; far ends by themselves tell nothing.
-                nearer = _FAR_OUT * _reach(far, least, rise)
+                nearer = far_out * _reach(far, least, rise)
                 if nearer > 1.0:
                     found.append(_excess(_end(problem, estimate, keys, nearer * along), step, least, rise, nearer))
             steps.append(step)
             excesses.append(max(found, key=lambda one: float(np.linalg.norm(np.clip(one, -1.0, 1.0)))))
     reached = np.array(steps)
-    return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, *minima.found)
-
-
-class _Minima:
-    """Other minima that fit as well, each once, with their odds."""
-
-    def __init__(self, information: Information, sizes: Array, least: float) -> None:
-        self._information, self._sizes, self._least = information, sizes, least
-        self._steps: list[Array] = []
-        self._odds: list[float] = []
-
-    def look(self, other: Solution | None, estimate: Estimate, rise: float, half_width: float) -> None:
-        """Keep it where it costs no more than an end of an interval, and is no part of the same one."""
-        if other is None:
-            return
-        step = difference(other.estimate, estimate, self._information.keys)
-        above = max(2.0 * other.cost - self._least, 0.0)
-        apart = float(step @ self._information.matrix @ step)
-        known = any(np.max(np.abs(step - one) / self._sizes) < BENDING for one in self._steps)
-        if above <= rise and apart > max(_OTHER * rise, above / _SAME) and not known:
-            self._steps.append(step)
-            self._odds.append(float(np.exp(-0.5 * above * half_width**2 / rise)))
-
-    @property
-    def found(self) -> tuple[Array, Array]:
-        """(M, K) from the estimate, and (M,) odds against it."""
-        return np.array(self._steps).reshape(-1, len(self._sizes)), np.array(self._odds)
+    return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, tuple(others))
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,21 +335,12 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
     with suppress(InputError):  # quiet: no camera there; the end counts as far away as any
         held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
-        solution = _solved(replace(problem, priors=(*problem.priors, held)), estimate)
+        solution = solved_soon(replace(problem, priors=(*problem.priors, held)), estimate)
         if solution is not None:
             pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
             off = difference(solution.estimate, estimate, keys) / sizes
             return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
     return None
-
-
-def _solved(problem: Problem, start: Estimate) -> Solution | None:
-    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
-    try:
-        solution = solve(replace(problem, options=short), start)
-    except CalibrationError:  # quiet: the end counts as far away as any
-        return None
-    return None if solution.failed else solution
 
 
 def _reach(end: _End, least: float, rise: float) -> float:

@@ -13,10 +13,9 @@ import numpy as np
 from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.effects.dependence import Dependence
-from ceres_cal.posterior.bent import Ends
 from ceres_cal.posterior.mixture import Chain, Mixture
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import Information, Key, over, pose_keys
+from ceres_cal.problem.information import Information, Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Station
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.files import CameraFile, PoseFile
@@ -46,15 +45,13 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
     @classmethod
     def of(cls, mixture: Mixture) -> MixtureFile:
         """As a file has it."""
-        different = {id(one): one for one in mixture.information}
-        number = {name: count for count, name in enumerate(different)}
-        known = next(iter(different.values())).keys
+        known = mixture.information[0].keys
         return cls(
             list(mixture.keys),
             mixture.weights.tolist(),
             mixture.steps.tolist(),
-            [number[id(one)] for one in mixture.information],
-            [lower_triangle(one.over(known)) for one in different.values()],
+            mixture.at.tolist(),
+            [lower_triangle(one.over(known)) for one in mixture.information],
             [key for key in mixture.keys if key not in known],
             [ChainFile(int(chain.at[0]), chain.roots.tolist()) for chain in mixture.chains],
             mixture.phi_px,
@@ -79,10 +76,9 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
             raise InputError(f"{where}.chains do not fit its components: calibrate again")
         if chains and self.keys[0][:3] != ("camera", name, "phi"):
             raise InputError(f"{where} does not begin with phi of camera {name!r}: calibrate again")
-        information = tuple(every[number] for number in self.at)
-        numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), information
+        numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), tuple(every)
         valley = self.phi_px, self.open_below, self.open_above
-        return Mixture(tuple(self.keys), *numbers, chains, *valley, dict(self.lenses))
+        return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, dict(self.lenses))
 
 
 class SeenFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -113,71 +109,21 @@ class ChainFile(msgspec.Struct, forbid_unknown_fields=True):
     roots: list[float]
 
 
-class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A valley as files of before have it: at each node the steps and the lower triangle of the information."""
-
-    keys: list[Key]
-    phi_px: float
-    steps: list[list[float]]
-    rises: list[float]
-    information: list[list[float]]
-    open_below: bool
-    open_above: bool
-
-    def mixture(self, camera: str, known: Collection[Key]) -> Mixture:
-        """The valley along phi of a camera; InputError where its numbers do not fit each other, or those known."""
-        where = f"posterior.profiles.{camera}"
-        require_keys(self.keys, known, where)
-        if not self.keys or self.keys[0][:3] != ("camera", camera, "phi"):
-            raise InputError(f"{where} does not begin with phi of camera {camera!r}: calibrate again")
-        require_alike(where, self.keys, self.steps, (self.rises, self.information))
-        if len(self.steps) < 2:
-            raise InputError(f"{where} has no valley: calibrate again")
-        across = tuple(information_from(row, self.keys[1:], f"{where}.information") for row in self.information)
-        is_open = self.open_below, self.open_above
-        steps, rises = np.array(self.steps), np.array(self.rises)
-        return Mixture.along_phi(tuple(self.keys), self.phi_px, steps, rises, across, is_open)
-
-
-class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
-    """What leaves the quadratic picture, as files of before have it: one end of each weak direction."""
-
-    keys: list[Key]
-    steps: list[list[float]]
-    ends: list[list[float]]
-    half_width: float
-
-    def mixture(self, information: Information) -> Mixture | None:
-        """Its components; InputError where its numbers do not fit each other, or those that are known."""
-        require_alike("posterior.bends", self.keys, self.steps, (self.ends,))
-        require_alike("posterior.bends", self.keys, self.ends, ())
-        require_keys(self.keys, information.keys, "posterior.bends")
-        steps, ends = np.array(self.steps), np.array(self.ends)
-        bent = np.any(steps != 0.0, axis=1)
-        mixture, own = None, information.marginal(self.keys)
-        if bent.any():
-            near, far = (np.concatenate([part[bent], -part[bent]]) for part in (steps, ends))
-            none = np.zeros((0, len(self.keys)))
-            curves = Ends(tuple(self.keys), near, far, self.half_width, own, none, none[:, 0])
-            mixture = curves.mixture(information)
-        minima = over(ends[~bent], self.keys, information.keys)
-        if len(minima):
-            likely = np.full(len(minima), 1.0 / (len(minima) + 1.0))
-            mixture = (mixture or Mixture.of_one(information)).with_alternatives(likely, minima, information)
-        return mixture
-
-
 class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
-    """The posterior in a calibration's file; freedom is null where the sigmas were taken as stated."""
+    """The posterior in a calibration's file; freedom is null where the sigmas were taken as stated.
+
+    Attributes:
+        profiles, bends: what files of before have in place of mixtures (`files_before`).
+    """
 
     keys: list[Key]
     information: list[float]
     placements: dict[str, list[float]]
     freedom: float | None
-    profiles: dict[str, ProfileFile] = {}
+    profiles: dict[str, Any] = {}
     by_model: list[float] | None = None
     dependence: Dependence | None = None
-    bends: BendsFile | None = None
+    bends: Any = None
     stated_keys: list[Key] = []
     stated: list[float] = []
     mixtures: dict[str, MixtureFile] = {}
@@ -212,10 +158,7 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             for name, row in self.placements.items()
         }
         information = information_from(self.information, self.keys, "posterior.information")
-        mixtures = {name: entry.mixture(name, self.keys) for name, entry in self.profiles.items()}
-        if self.bends is not None and (bent := self.bends.mixture(information)) is not None:
-            mixtures[""] = bent
-        mixtures |= {name: entry.mixture(name, self.keys) for name, entry in self.mixtures.items()}
+        mixtures = {name: entry.mixture(name, self.keys) for name, entry in self.mixtures.items()}
         by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
         freedom = np.inf if self.freedom is None else self.freedom
         require_keys(self.stated_keys, self.keys, "posterior.stated_keys")

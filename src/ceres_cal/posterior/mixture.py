@@ -22,11 +22,9 @@ from ceres_cal.problem.information import Information, Key, over
 FARTHER = 3.0
 """Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
 and radii, not only what lies within 95 %."""
-_FINE = 0.125  # standard deviations from one interpolated place to the next
 # Share of a flat prior on log phi in how the weight lies along a valley; the rest is the signed root of the rise, which
 # is normal whatever the valley is measured in. Where the valley is flat the root says nothing.
 _FLAT = 0.1
-_OVERLAP = 0.5  # standard deviation of each interpolated place, of the way to the next: so there are no steps
 _TWICE = (np.log(2.0), np.log(4.0))
 # Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
 # from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
@@ -56,7 +54,7 @@ class Mixture:
     Attributes:
         keys: (K) the numbers, phi first where it was followed. weights: (C,) probabilities.
         steps: (C, K) from the estimate to the middle of each component.
-        information: (C) about the numbers there; one that it has no key of is held.
+        information: (I) about the numbers, one that it has no key of is held. at: (C,) which of these each has.
         chains: of components along phi. phi_px: by the estimate; 0 where there is no chain.
         open_below, open_above: the valley does not rise to the 95 % bound as far as lenses go.
         lenses: of components that are another lens, which one: their steps are how the numbers follow it.
@@ -66,6 +64,7 @@ class Mixture:
     weights: Array
     steps: Array
     information: tuple[Information, ...]
+    at: Indices
     chains: tuple[Chain, ...] = ()
     phi_px: float = 0.0
     open_below: bool = False
@@ -75,7 +74,8 @@ class Mixture:
     @classmethod
     def of_one(cls, information: Information) -> Mixture:
         """The normal distribution about the estimate."""
-        return cls(information.keys, np.ones(1), np.zeros((1, len(information.keys))), (information,))
+        alone = np.zeros(1, dtype=np.int64)
+        return cls(information.keys, np.ones(1), np.zeros((1, len(information.keys))), (information,), alone)
 
     @classmethod
     def along_phi(
@@ -85,7 +85,8 @@ class Mixture:
         """A valley: at each node twice the rise of the cost, and the information about all keys but phi."""
         side = np.where(np.arange(len(steps)) < np.argmin(rises), -1.0, 1.0)
         chain = Chain(np.arange(len(steps)), side * np.sqrt(np.asarray(rises)))
-        mixture = cls(keys, np.zeros(len(steps)), np.asarray(steps), tuple(across), (chain,), phi_px, *is_open)
+        numbers = np.zeros(len(steps)), np.asarray(steps), tuple(across), chain.at
+        mixture = cls(keys, *numbers, (chain,), phi_px, *is_open)
         weights, between, _ = mixture._between(chain)
         each = weights @ between
         return replace(mixture, weights=each / each.sum())
@@ -96,11 +97,6 @@ class Mixture:
         return np.asarray(self.phi_px + self.steps[:, 0])
 
     @property
-    def is_normal(self) -> bool:
-        """Whether it is one normal distribution about the estimate."""
-        return len(self.weights) == 1
-
-    @property
     def is_followed(self) -> bool:
         """Whether phi was followed along its profile."""
         return bool(self.chains)
@@ -108,11 +104,7 @@ class Mixture:
     @cached_property
     def variances(self) -> Array:
         """(C, K) within each component; 0 of what is held there, infinite where unknown."""
-        known: dict[int, Array] = {}
-        for one in self.information:
-            if id(one) not in known:
-                known[id(one)] = over(one.spread.sd**2, one.keys, self.keys)
-        return np.array([known[id(one)] for one in self.information])
+        return np.array([over(one.spread.sd**2, one.keys, self.keys) for one in self.information])[self.at]
 
     @cached_property
     def sd(self) -> Array:
@@ -131,22 +123,20 @@ class Mixture:
 
     def with_information(self, how: Callable[[Information], Information]) -> Mixture:
         """With other information in each component."""
-        known: dict[int, Information] = {}
-        for one in self.information:
-            if id(one) not in known:
-                known[id(one)] = how(one)
-        return replace(self, information=tuple(known[id(one)] for one in self.information))
+        return replace(self, information=tuple(map(how, self.information)))
 
     def with_alternatives(
         self, weights: Array, steps: Array, information: Information, lenses: Sequence[int] = ()
     ) -> Mixture:
         """With further components of these weights (S,) at steps (S, K); other lenses by their numbers."""
+        number = next((n for n, one in enumerate(self.information) if one is information), len(self.information))
         return replace(
             self,
             lenses={**self.lenses, **{len(self.weights) + count: lens for count, lens in enumerate(lenses)}},
             weights=np.concatenate([(1.0 - weights.sum()) * self.weights, weights]),
             steps=np.concatenate([self.steps, steps]),
-            information=(*self.information, *[information] * len(weights)),
+            information=(*self.information[:number], information, *self.information[number + 1 :]),
+            at=np.concatenate([self.at, np.full(len(weights), number)]),
         )
 
     def shifted_also(self, weights: Array, shifts: Array) -> Mixture:
@@ -157,7 +147,7 @@ class Mixture:
             Chain(chain.at + copy * count, chain.roots) for copy in range(len(every)) for chain in self.chains
         )
         of_all = np.concatenate([weight * self.weights for weight in every])
-        return replace(self, weights=of_all, steps=steps, information=self.information * len(every), chains=chains)
+        return replace(self, weights=of_all, steps=steps, at=np.tile(self.at, len(every)), chains=chains)
 
     def off_valley(self, shifts: Array) -> Array:
         """(S, K) of shifts (S, K) what is beside the first chain, phi held: along it they change nothing."""
@@ -185,13 +175,14 @@ class Mixture:
 
     def _along(self, chain: Chain, values: Array, variances: Array) -> Iterator[tuple[Array, Array, Array]]:
         """Parts of what `refined` gives."""
+        overlap = 0.5  # standard deviation of each interpolated place, of the way to the next: so there are no steps
         whole = float(self.weights[chain.at].sum())
         weights, between, across = self._between(chain)
         share = whole / weights.sum()
         own, widths = values[chain.at], variances[chain.at]
         ends = ((self.open_below, 0), (self.open_above, -1))
         kept = np.array([not ends[0][0], *[True] * (len(weights) - 2), not ends[1][0]])
-        jump = _OVERLAP * _mixed(across[kept], own)
+        jump = overlap * _mixed(across[kept], own)
         jumps = jump[..., :, None] * jump[..., None, :] if widths.ndim > own.ndim else jump**2
         yield share * weights[kept], _mixed(between[kept], own), _mixed(between[kept], widths) + jumps
         for is_open, end in ends:
@@ -203,8 +194,9 @@ class Mixture:
         """Weights (F,) of places along the valley, its ends first and last; of which nodes (F, N) each is, and by how
         much of them (F, N) the next one differs.
         """
+        fine = 0.125  # standard deviations from one interpolated place to the next
         roots, log_phi = chain.roots, np.log(self.phi[chain.at])
-        counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / _FINE), 2).astype(int)
+        counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / fine), 2).astype(int)
         node = np.repeat(np.arange(len(counts)), counts)
         part = np.concatenate([(np.arange(n) + 0.5) / n for n in counts])
         places = np.zeros((len(node), len(roots)))

@@ -1,9 +1,20 @@
-"""Other lenses that predict as well as the chosen one, and how its numbers follow them.
+"""What a lens does not say of itself: other lenses that predict as well as it, and by how much it is too smooth.
 
-Where they agree, the data tell them apart; at the rim and between lines they do not, and what the chosen one says there
-is its own. So they are components of the posterior, and maps show what they show, also where nothing was observed. The
-numbers of the chosen one follow each as closely as they can, by least squares over places on the floor and above it, or
-over rays of a camera that sees no floor.
+Where other lenses agree, the data tell them apart; at the rim and between lines they do not, and what the chosen one
+says there is its own. So they are components of the posterior, and maps show what they show, also where nothing was
+observed. The numbers of the chosen one follow each as closely as they can, by least squares over places on the floor
+and above it, or over rays of a camera that sees no floor.
+
+What a lens that is too smooth leaves displaces an image in the same way in all views: no number of views makes that
+less. What goes together within a sight alone, as a bent board or a blurred frame has it, is no lens, and does not
+count: whether sums of residuals over cells of the image agree between sights is asked first, by products of different
+sights. Bumps along the radius and over the image are columns X beside the free numbers; their coefficients scatter by
+tau (px). With P what all free numbers leave, the residuals r say u = X^T P r of them, and
+
+    Cov u = kappa V + tau^2 V V,    V = X^T P X,
+
+kappa for what goes together within a view. The restricted likelihood of tau, of each kind of bumps, says how rough the
+lens is. By what the free numbers take up of them they are off.
 """
 
 from __future__ import annotations
@@ -13,14 +24,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.transforms import Pose
-from ceres_cal.posterior.image import Picture, picture_slopes
-from ceres_cal.posterior.maps import locate_slopes
+from ceres_cal.effects.evidence import agreement as agreement_of
+from ceres_cal.effects.evidence import shifts_by
+from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
+from ceres_cal.effects.smoothness import likeliest_sizes
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights
+from ceres_cal.posterior.maps import Picture, locate_slopes, picture_slopes
+from ceres_cal.problem.equations import Equations, equations_of
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes
+from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
 
 _PLACES = 12  # along each side of the picture
@@ -28,11 +48,9 @@ _PLACES = 12  # along each side of the picture
 # followed as closely, what lenses with another phi show there ruins the floor; not at all, one map in ten was 2.5
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
-_FOLLOWED = 1e-4  # of the largest singular value: directions that show less are not moved along
 # Of the weights. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
 # a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
 _COUNTED = 0.5
-_MOST = 0.8  # of all of them together
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +101,9 @@ class OtherLenses:
 
 def counted(weights: Sequence[float]) -> Array:
     """(L,) probabilities of other lenses as far as they count, together less than all."""
+    most = 0.8  # of all of them together
     each = _COUNTED * np.asarray(weights, dtype=float)
-    return np.asarray(each / max(1.0, float(each.sum()) / _MOST))
+    return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> list[Array]:
@@ -93,6 +112,7 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     Args:
         there: with the chosen lens, at its best or elsewhere in a valley along phi.
     """
+    followed = 1e-4  # of the largest singular value: directions that show less are not moved along
     every = list(_compared(lenses, keys, there))
     if not every:
         return []
@@ -102,7 +122,7 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     for number in range(len(lenses.others)):
         offset = np.concatenate([one[number].ravel() for one in offsets])
         known = np.isfinite(slope).all(axis=1) & np.isfinite(offset)
-        step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=_FOLLOWED)[0]
+        step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=followed)[0]
         shifts.append(step * sizes)
     return shifts
 
@@ -127,3 +147,156 @@ def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iter
         if not stations:
             picture = Picture(camera.at(Pose.identity()), pixels)
             yield picture_slopes(picture, keys, name), lenses.shifts(name)
+
+
+AGREES = 3.0
+"""From how many standard deviations on a lens leaves something: of one that leaves nothing one in a thousand does."""
+# Observations on average; cells along the image: some show what is long, many what a surface's nodes do not follow.
+_IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
+
+
+def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> float:
+    """By how many standard deviations sums of residuals over a cell have one sign in all sights; 0 of one sight.
+
+    Args:
+        end: of all rounds; what took part is asked. sizes: of the images of each camera, px.
+    """
+    sights = _some(end)
+    points, curves = _in_sigmas(end, sights)
+    of_points, of_curves = _sight_of(sights.point_bounds), _sight_of(sights.curve_bounds)
+    sight = np.concatenate([of_points, of_points, of_curves])
+    left = np.concatenate([points[:, 0], points[:, 1], curves])
+    return max(_agreement(cells_of(sights, sizes, most), sight, left) for most in (_MOST_CELLS, _FINE_CELLS))
+
+
+def agreement_in_rings(end: RobustSolution) -> float:
+    """The same of sums over rings about the principal point, of what points lie farther out; of cameras the most."""
+    rings = 24  # from the middle to the farthest observation
+    agree, some = 0.0, _some(end)
+    for name, camera in end.solution.estimate.cameras.items():
+        sights = some.of_camera(name)
+        offsets = camera.offsets(sights.pixels)
+        radius = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
+        ring = (rings / np.max(radius, initial=1e-12) * radius).astype(int)
+        outward = np.einsum("ij,ij->i", offsets, _in_sigmas(end, sights)[0]) / radius
+        agree = max(agree, _agreement(ring, _sight_of(sights.point_bounds), outward))
+    return agree
+
+
+def _some(end: RobustSolution) -> Sights:
+    most_compared = 50_000  # of more, those of some sights
+    sights = end.problem.sights
+    every = -(-sights.equations // most_compared)
+    return sights if every <= 1 else sights[::every]
+
+
+def _sight_of(bounds: Indices) -> Indices:
+    """Of each observation its sight's number; of very many sights, that of some beside each other."""
+    most_groups = 200  # of sights: products within one do not count, a half of a percent
+    sights = len(bounds) - 1
+    return np.repeat(np.arange(sights) * min(sights, most_groups) // max(sights, 1), np.diff(bounds))
+
+
+def _in_sigmas(end: RobustSolution, sights: Sights) -> tuple[Array, Array]:
+    """(N, 2), (M,) residuals of points and curve observations, in standard deviations."""
+    of_points, of_curves = end.problem.weighting.scales
+    points = end.residuals.points[sights.point_rows] / (of_points * sights.sigma_px[:, None])
+    return points, end.residuals.curves[sights.curve_rows] / (of_curves * sights.curve_sigma_px)
+
+
+def _agreement(place: Indices, sight: Indices, left: Array) -> float:
+    """By how many standard deviations the sums of residuals (N,) by place (N,) agree between sights (N,)."""
+    count = int(np.max(sight, initial=0)) + 1
+    size = count * (int(np.max(place, initial=0)) + 1)
+    sums = np.bincount(place * count + sight, left, size).reshape(-1, count)
+    return agreement_of(np.asarray(sums.T, dtype=float))
+
+
+def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _MOST_CELLS) -> Indices:
+    """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, each curve apart;
+    no more than so many along the image.
+    """
+    names = sorted(sizes)
+    count = (len(sights.point_rows) + len(sights.curve_rows)) / (_IN_A_CELL * len(names))
+    side = min(most, max(2, int(np.sqrt(count))))
+    owners = np.array([names.index(key.camera) for key in sights.keys])
+    per_px = side / np.array([sizes[name] for name in names], dtype=float)
+
+    def cells(bounds: Indices, pixels: Array) -> Indices:
+        owner = np.repeat(owners, np.diff(bounds))
+        x, y = (np.clip((pixels[:, k] * per_px[owner, k]).astype(int), 0, side - 1) for k in (0, 1))
+        return np.asarray((owner * side + y) * side + x)
+
+    points, curves = cells(sights.point_bounds, sights.pixels), cells(sights.curve_bounds, sights.curve_pixels)
+    first = 2 * side * side * len(names)
+    return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
+
+
+_ALONG, _OVER = (
+    36,
+    (6, 12, 24),
+)  # bumps from the middle to the farthest observation, or along the longer side of the image
+
+
+def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
+    """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
+    lenses do to them; none where views do not agree on anything that is left.
+    """
+    if max(agreement(end, observations.cameras), agreement_in_rings(end)) <= AGREES:
+        return (), ()
+    reduced = end.reduced or information(end.problem, end.solution.estimate)
+    model = _linearised(end, observations, reduced)
+    every = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]
+    return reduced.shared.keys, [shift for shifts in every for shift in shifts]
+
+
+def _linearised(end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> Linearised:
+    """Some sights' equations, beside their share of what was known before."""
+    most_equations = 12_000  # that tell how rough a lens is: of more, those of some views
+    problem, estimate = end.problem, end.solution.estimate
+    every = max(1, -(-problem.sights.equations // most_equations))
+    sights = problem.sights[::every]
+    equations = equations_of(observations, sights, estimate, end.residuals)
+    weights = equation_weights(observations, problem.weighting, equations, end.residuals).within_sigma
+    model = linearise_within(problem, estimate, equations, weights, reduced.shared)
+    share = sights.equations / problem.sights.equations
+    return model.beside_prior(share * model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root)
+
+
+def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
+    """(R, K) by the bumps of a camera's image."""
+    at_rest = 0.02  # relative change of a size
+    loose_px, least_px = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
+    equations, rows = model.equations, model.equations.bounds[:-1]
+    own = equations.of_sights(np.array([key.camera == name for key in equations.sights.keys]))
+    every = list(_bumps(equations, camera, own))
+    kind = np.repeat(np.arange(len(every)), [columns.shape[1] for columns in every])
+    inside = model.beyond_private(np.hstack(every) * (own * model.weight)[:, None])
+    taken = model.shared.T @ inside
+    normal, slope = inside.T @ inside - taken.T @ taken, inside.T @ model.left_over
+    best = np.linalg.solve(normal + np.eye(len(kind)) / loose_px**2, slope)
+    rest = model.left_over - inside @ best + model.shared @ (taken @ best)
+    scatter = np.add.reduceat(inside * rest[:, None], rows), np.add.reduceat(inside**2, rows)
+    within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
+    forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
+    loose, least = np.full((2, len(every)), [[loose_px], [least_px]])
+    _, amount, precision = likeliest_sizes(normal / within, slope / within, forms, loose, least, at_rest)
+    return shifts_by(model.root @ taken, np.linalg.inv(precision) + np.outer(amount, amount))
+
+
+def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:
+    """(E, Q) px per px of bumps along the radius and over the image, as far as a camera's own equations (E,) reach."""
+    offsets = camera.offsets(equations.pixel)
+    radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    outward = np.sum(equations.direction * offsets * (1.0, camera.aspect), axis=1) / radius
+    yield _hats(radius / np.max(radius[own], initial=1e-12) * _ALONG, _ALONG) * outward[:, None]
+    for count in _OVER:
+        step_px = max(camera.image_size) / count
+        x, y = (_hats(equations.pixel[:, k] / step_px, -int(-camera.image_size[k] // step_px)) for k in (0, 1))
+        over = (x[:, :, None] * y[:, None, :]).reshape(len(x), -1)
+        yield np.hstack([over * equations.direction[:, axis, None] for axis in (0, 1)])
+
+
+def _hats(place: Array, count: int) -> Array:
+    """(E, count + 1) straight up to 1 at each whole number from 0 to the count, and down."""
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(count + 1))))

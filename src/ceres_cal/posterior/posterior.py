@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.shown import brief
 from ceres_cal.base.spread import Spread, without
 from ceres_cal.base.tails import NORMAL_95, student_95
-from ceres_cal.effects.dependence import Dependence, Scatter
+from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.information import Information, Key, over, pose_keys, sigma_limits
 from ceres_cal.problem.parameters import Estimate, Layout
@@ -30,7 +30,8 @@ class Posterior:
     painted amiss, is not in it.
 
     Attributes:
-        information: about the P numbers that are shared: the normal distribution that a refit, a check and advice take.
+        information: about the P numbers that are shared: the normal distribution that a refit, a check and advice take,
+            as the normal equations have it, with the second moments of what else may be true.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         mixtures: camera -> what it and its stations may be, where its phi was followed along its profile; "" -> what
@@ -75,7 +76,7 @@ class Posterior:
         """The posterior where something else may be true: shifts (S, K) of some numbers, with the probability of each.
 
         Where these follow other lenses, the estimate with the chosen one is given, and with each of them. They are
-        components of the mixtures, and in the information by the second moments that they add.
+        components of the mixtures, each as wide as all of it, and in the information by their second moments.
         """
         if not len(shifts):
             return self
@@ -87,8 +88,8 @@ class Posterior:
             mine = self.mixtures[name]
             off = mine.off_valley(over(limited, self.keys, mine.keys))
             mixtures[name] = mine.shifted_also(likely, off[:, None])
-        there = replace(self, lenses=self.lenses or lenses)
-        return there._with_information(np.sqrt(likely)[:, None] * whole, mixtures)
+        information = self.wider(self.information, lambda seen: seen.widened(np.sqrt(likely)[:, None] * whole))
+        return replace(self._known_by(information, mixtures), lenses=self.lenses or lenses)
 
     def widened(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
         """The posterior whose numbers scatter by shifts (S, K) of some of them as well: each goes into the covariance
@@ -102,27 +103,21 @@ class Posterior:
             return self.wider(one, lambda seen: seen.widened(over(whole, self.keys, seen.keys)))
 
         mixtures = {name: mixture.with_information(wider) for name, mixture in self.mixtures.items()}
-        return self._with_information(whole, mixtures)
+        return self._known_by(wider(self.information), mixtures)
 
-    def _with_information(self, shifts: Array, mixtures: Mapping[str, Mixture]) -> Posterior:
-        information = self.wider(self.information, lambda seen: seen.widened(shifts))
+    def _known_by(self, information: Information, mixtures: Mapping[str, Mixture]) -> Posterior:
+        """The same with other mixtures, and the information that has their second moments."""
         placements = self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
         return replace(self, information=information, placements=placements, mixtures=mixtures)
 
     def _beside_stated(self, shifts: Array) -> Array:
-        """(S, P) shifts as far as what was stated lets them be.
-
-        With L what the observations say, P what was stated and C = (L + P)^-1, the covariance of L + P with L widened
-        by d is C + g g^T, where g = C L d / (1 + d^T L C P d)^1/2: never more than P^-1.
-        """
+        """(S, P) shifts as far as what was stated lets each of them be: never more than its standard deviation."""
         if not np.any(self.stated.matrix):
             return shifts
         stated = self.stated.over(self.keys)
-        moved = shifts @ self.information.less(stated).matrix @ self.information.inverse
-        left = np.einsum("sp,pq,sq->s", moved, stated.matrix, shifts)
-        moved = moved / np.sqrt(1.0 + np.maximum(left, 0.0))[:, None]
+        moved = np.concatenate([self.information.beside(stated, shift[None]) for shift in shifts])
         with np.errstate(invalid="ignore"):  # of what is stated nearly alone, all of it is rounding
             room = np.sqrt(np.maximum(np.nan_to_num(self.stated_sd**2 - self.spread.sd**2, nan=np.inf), 0.0))
         return np.asarray(np.clip(moved, -room, room))
@@ -261,7 +256,7 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
     model, stated = reduced.shared, reduced.stated
     if scatter is None:
         return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom, stated=stated)
-    shared, dependence = scatter.widened(reduced.points + reduced.curves) + reduced.priors, scatter.dependence
+    shared, dependence = scattered(reduced, scatter), scatter.dependence
     placements = _Placements(reduced.eliminated, shared, dependence.private)
     return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence, stated=stated)
 

@@ -87,16 +87,16 @@ def _of_components(mixture: Mixture, estimate: Estimate, shown: Functional, widt
     """(C, N, 2) values from those of the estimate, and (C, N, 2, 2) covariances."""
     here, known = shown.values(estimate), dict[int, Array]()
     values, covariances = [], []
-    for step, information in zip(mixture.steps, mixture.information, strict=True):
+    for step, number in zip(mixture.steps, mixture.at.tolist(), strict=True):
         there, off = estimate, np.full(here.shape, np.nan)
         with suppress(InputError):  # reads: "unknown" at these places of the map
             there = moved(estimate, mixture.keys, step) if np.any(step) else estimate
             off = shown.values(there) - here
-        if id(information) not in known:
-            followed = mixture.is_followed
-            known[id(information)] = _covariance(information, there, shown, width if followed else 0.0)
+        if number not in known:
+            far = width if mixture.is_followed else 0.0
+            known[number] = _covariance(mixture.information[number], there, shown, far)
         values.append(off)
-        covariances.append(known[id(information)])
+        covariances.append(known[number])
     return np.array(values), np.array(covariances)
 
 

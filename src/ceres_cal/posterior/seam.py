@@ -84,11 +84,6 @@ def _numbers(estimate: Estimate, first: str, second: str) -> Array:
     return np.array([np.linalg.norm(b.position - a.position), np.linalg.norm(turn)])
 
 
-_BIN_M = 0.5  # along a curve; observations of one stretch are taken together
-_FEWEST = 2  # observations of a stretch by each of the two stations
-_PIXEL = 0.5  # for the slope of a map by differences
-
-
 def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], grid: FieldGrid) -> FieldMap:
     """Predicted disagreement of two stations about places that both see, over a grid; `station` names both.
 
@@ -213,6 +208,8 @@ def _sightings(
     observations: Observations, estimate: Estimate, station: str, scales: tuple[float, float]
 ) -> Iterator[tuple[_Thing, _Sighting]]:
     """What a station saw of the points and of the stretches of curve that lie in the world."""
+    fewest = 2  # observations of a stretch by each of the two stations
+    bin_m = 0.5  # along a curve; observations of one stretch are taken together
     camera = estimate.camera_at(station)
     points, curves = observations.points, observations.curves
     for target, feature, rows in _rows(observations, points, station):
@@ -225,10 +222,10 @@ def _sightings(
         s = nearest_on_track(tracks, is_arc, np.column_stack([located, np.full(len(rows), height_m)]))
         feet, start = along_track(tracks, is_arc, s), curve.parameter_range[0]
         length = (turned_on(curve, s) - start) * np.linalg.norm(tracks[:, 1], axis=1)
-        stretch = np.floor(length / _BIN_M).astype(int)
+        stretch = np.floor(length / bin_m).astype(int)
         for number in distinct(stretch):
             part = stretch == number
-            if np.count_nonzero(part) >= _FEWEST:
+            if np.count_nonzero(part) >= fewest:
                 sighting = _sighting(camera, curves, rows[part], feet[part], scales[1])
                 normal = _normal(tracks[0], is_arc, sighting.place)
                 yield (name, int(number)), replace(sighting, normal=normal)
@@ -257,9 +254,10 @@ def _rows(observations: Observations, columns: Columns, station: str) -> Iterato
 
 def _metres_per_px(camera: Camera, pixels: Array, height_m: float) -> float:
     """Of the map about the mean of some pixels, in the mean over directions."""
-    middle = np.mean(pixels, axis=0) + _PIXEL * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    pixel = 0.5  # for the slope of a map by differences
+    middle = np.mean(pixels, axis=0) + pixel * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     x1, x0, y1, y0 = camera.locate(middle, height_m)
-    return float(np.sqrt(0.5 * (np.sum((x1 - x0) ** 2) + np.sum((y1 - y0) ** 2)))) / (2.0 * _PIXEL)
+    return float(np.sqrt(0.5 * (np.sum((x1 - x0) ** 2) + np.sum((y1 - y0) ** 2)))) / (2.0 * pixel)
 
 
 def _normal(track: Array, is_arc: bool, place: Array) -> Array:

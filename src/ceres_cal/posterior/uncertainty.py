@@ -1,8 +1,12 @@
-"""Everything a calibration can say of its own trustworthiness, under one name: `calibration.uncertainty`."""
+"""How well a calibration is known, for people: numbers with verdicts, weak directions in words, maps, rigs.
+
+A number is known, weak or unknown by its standard deviation in natural sizes; a direction by what goes unnoticed along
+it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,19 +17,179 @@ from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.shown import Shown, html_of, text_of
+from ceres_cal.base.spread import are_known
 from ceres_cal.base.typed import rows
 from ceres_cal.base.words import at_precision, two_digits
-from ceres_cal.posterior.image import ImageMap, image_map
-from ceres_cal.posterior.maps import FieldGrid, FieldMap, PointSpread, field_map, spread_of_points
+from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
+from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import RigPair, rig_pairs, seam_map
-from ceres_cal.posterior.weak import Verdict, WeakDirection, ratio_sd, unknown_placements, verdicts, weak_directions
+from ceres_cal.problem.information import PLACEMENT_QUANTITIES, Key, sigma_limits
 from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.quantities import natural_sizes, values_of
 from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.targets import Target
 
-_GRID = 36  # steps along the longer side
-_WIDENED = 1.1  # factor on standard deviations that is worth a word
+KNOWN, WEAK = 0.01, 0.3
+"""Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
+degrees), up to the second it is weak, beyond it, or with a bound that is open, unknown."""
+CONFLICT = "in conflict"
+_GIVES_WAY = ("usual", "tolerance")  # kinds of conflict in which what was stated is not kept
+_LEARNT = 0.5  # of a tolerance's sigma: what the data must add to call the offset of a line known
+# Of the largest share: smaller ones are not named. Nothing changes from half to double.
+_IN_WORDS = 0.3
+# A ratio that is so much better known than its parts is worth a sentence. Nothing changes from half to double.
+_TOGETHER = 0.1
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is known of one number.
+
+    Attributes:
+        key: the number. value: in the key's unit; of a turn 0, which is where the pose is.
+        sd: root mean square of what may be, infinite where unknown; where phi is followed along its profile, half the
+            distance of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural
+            size, infinite also for phi and height where the valley is open.
+        verdict: "known", "weak" or "unknown" (see KNOWN and WEAK), or "in conflict": everything else contradicts what
+            was stated of it, and both are within its bounds. by_profile: whether the bounds are the profile's.
+        factor: standard deviation as the data scatter over that by the model alone.
+    """
+
+    key: Key
+    value: float
+    sd: float
+    low: float
+    high: float
+    relative: float
+    verdict: str
+    by_profile: bool
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A combination of numbers that the observations hardly tell.
+
+    Attributes:
+        words: one line. relative: sigma along it in natural sizes, infinite where unknown.
+        shares: key -> share, the largest one 1, of those that are not small.
+    """
+
+    words: str
+    relative: float
+    shares: tuple[tuple[Key, float], ...]
+
+
+def verdicts(estimate: Estimate, posterior: Posterior, conflicts: Sequence[Conflict] = ()) -> tuple[Verdict, ...]:
+    """One for each shared number, in the order of the posterior's keys.
+
+    Args:
+        conflicts: what was stated and everything else contradicts.
+    """
+    disputed = {(one.owner, one.quantity, one.unit) for one in conflicts if one.kind not in _GIVES_WAY}
+    bounds, values = posterior.bounds, values_of(estimate, posterior.keys)
+    half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
+    if posterior.followed:  # a valley that widens farther out is no better known than there
+        half = np.maximum(half, np.ptp(posterior.bounds_at(FARTHER), axis=1) / (2.0 * FARTHER))
+    sizes, open_half = natural_sizes(estimate, posterior.keys), half.copy()
+    low, high = values + bounds[:, 0], values + bounds[:, 1]
+    followed = np.zeros(len(values), dtype=bool)
+    for name in posterior.followed:
+        mixture = posterior.mixtures[name]
+        at = posterior.information.columns(mixture.keys)
+        followed[at] = True
+        if mixture.open_below or mixture.open_above:  # an open valley has no width, whatever it is compared with
+            along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
+            open_half[along], low[along] = np.inf, np.maximum(low[along], 0.0)
+    sd = np.where(followed, half, posterior.sd)
+    relative = np.where(followed, open_half, posterior.sd) / sizes
+    columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
+    return tuple(
+        Verdict(key, value, sigma, bottom, top, share, _word(key, share, key[1:] in disputed), by_profile, factor)
+        for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
+    )
+
+
+def _word(key: Key, relative: float, is_disputed: bool) -> str:
+    known, weak = (_LEARNT, 0.95) if key.kind == "structure" else (KNOWN, WEAK)
+    return "unknown" if relative > weak else CONFLICT if is_disputed else "known" if relative <= known else "weak"
+
+
+def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
+    """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
+    unknown: dict[str, tuple[str, ...]] = {}
+    every = list(posterior.placements.values())
+    if every and are_known(np.array([one.matrix for one in every]), sigma_limits(every[0].keys)):
+        return unknown
+    for name in posterior.placements:
+        lost = np.isinf(posterior.placement(name).sd)
+        if lost.any():
+            unknown[name] = tuple(q for q, is_lost in zip(PLACEMENT_QUANTITIES, lost, strict=True) if is_lost)
+    return unknown
+
+
+def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirection, ...]:
+    """Directions, weakest first, along which sigma exceeds KNOWN in natural sizes; neither structure nor the nodes of
+    a lens's surface are looked at.
+
+    Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes some
+    number by more than a hundredth of itself.
+    """
+    nodes = {(name, quantity) for name, camera in estimate.cameras.items() for quantity in camera.lens.nodes}
+    keys = [key for key in posterior.keys if key.kind != "structure" and key[1:3] not in nodes]
+    at = posterior.information.columns(keys)
+    sizes = natural_sizes(estimate, keys)
+    lost = posterior.spread.unknown[at] / sizes[:, None]
+    finite = posterior.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
+    values, vectors = np.linalg.eigh(finite)
+    weak = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
+    weak += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
+    return tuple(_direction(estimate, posterior, keys, relative, vector) for relative, vector in weak)
+
+
+def _direction(
+    estimate: Estimate, posterior: Posterior, keys: Sequence[Key], relative: float, vector: Array
+) -> WeakDirection:
+    scaled = vector / vector[np.argmax(np.abs(vector))]
+    named = [int(i) for i in np.argsort(-np.abs(scaled)) if abs(scaled[i]) >= _IN_WORDS]
+    shares = tuple((keys[i], float(scaled[i])) for i in named)
+    return WeakDirection(_words(estimate, posterior, [keys[i] for i in named], relative), relative, shares)
+
+
+def _words(estimate: Estimate, posterior: Posterior, keys: Sequence[Key], relative: float) -> str:
+    phi = next((key for key in keys if key.quantity == "phi"), None)
+    heights = [key for key in keys if key.quantity == "height" and phi and _camera(estimate, key) == phi.owner]
+    if phi is not None and heights:
+        ratio = max(ratio_sd(estimate, posterior, phi.owner, key.owner) for key in heights)
+        if ratio < _TOGETHER * relative:
+            stations = ", ".join(repr(key.owner) for key in heights)
+            whose = "its height" if stations == repr(phi.owner) else f"the height of {stations}"
+            known = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
+            return f"phi of {phi.owner!r} and {whose} trade off: {known}"
+    owners = dict.fromkeys(key.owner for key in keys)
+    parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
+    many, names = len(keys) > 1, " and ".join(parts)
+    if np.isinf(relative):
+        return f"nothing tells {names}{' apart' if many else ''}"
+    return f"{names}{' trade off: each' if many else ':'} known to {two_digits(100.0 * relative)} % only"
+
+
+def _camera(estimate: Estimate, key: Key) -> str:
+    return estimate.stations[key.owner].camera if key.kind == "station" else key.owner
+
+
+def ratio_sd(estimate: Estimate, posterior: Posterior, camera: str, station: str) -> float:
+    """Relative standard deviation of phi over height: what a view from straight above does tell.
+
+    Raises:
+        InputError: one of them was held.
+    """
+    slopes = np.zeros(len(posterior.keys))
+    slopes[posterior.column("camera", camera, "phi")] = 1.0 / estimate.cameras[camera].phi
+    height = float(estimate.stations[station].cam_from_world.position[2])
+    slopes[posterior.column("station", station, "height")] = -1.0 / height
+    return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +268,9 @@ class Uncertainty:
     @property
     def widening(self) -> str:
         """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
+        widened = 1.1  # factor on standard deviations that is worth a word
         dependence, factor = self.posterior.dependence, median(self.posterior.factors)
-        if dependence is None or not dependence.causes or factor < _WIDENED:
+        if dependence is None or not dependence.causes or factor < widened:
             return ""
         return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
@@ -181,11 +346,12 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
     Raises:
         InputError: there is nothing that does not move.
     """
+    grid = 36  # steps along the longer side
     box = [target.box for target in targets.values() if not target.movable]
     if not box:
         raise InputError("no field to draw a map of: give x_m and y_m")
     low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)
-    spacing = float(np.max(high - low)) / _GRID
+    spacing = float(np.max(high - low)) / grid
     counts = np.maximum(np.round((high - low) / spacing).astype(int) + 1, 2)
     x, y = (np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True))
     return x, y

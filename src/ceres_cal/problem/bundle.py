@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -15,19 +16,15 @@ from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.charts import Chart, ChartedCost, chart_of
-from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
+from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, Chart, ChartedCost, EliminatedCost, Run, SightCost, chart_of
 from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.prior_cost import PriorCost
 from ceres_cal.problem.problem import Problem, Weighting
 
-_AT_REST = 10  # iterations
 _NOTHING_LEFT = "Nothing left to gain."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
 # Relative change of a placement's cost that a start may leave. Nothing changes from half to double.
 _POSED = 1e-2
-_MOST_INVALID = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
-_DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
 
 @dataclass(frozen=True)
@@ -130,10 +127,11 @@ class _Assembly:
 def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     private, sights, layout = problem.private, problem.sights, problem.layout
     blocks = _ParameterBlocks.pack(estimate, layout, private)
-    assembly = _Assembly(blocks, [], [])
+    assembly, posed = _Assembly(blocks, [], []), set[str]()
     for camera in estimate.cameras:
         own = sights.numbers(camera, placements=private)
         if len(own):
+            posed.add(camera)
             cost = EliminatedCost(run, sights.take(own), problem, estimate)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
@@ -147,7 +145,8 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     if problem.elsewhere is not None:
         more = problem.elsewhere.cost(run, problem, estimate)
         assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
-    for prior in problem.priors_of(estimate):
+    smooth = (problem.smooth_at(estimate, name) for name in estimate.cameras if name not in posed)
+    for prior in (*problem.stated_at(estimate), *chain.from_iterable(smooth)):
         prior_cost = PriorCost(run, prior, estimate, layout)
         assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
     return assembly
@@ -288,12 +287,15 @@ def with_placements_at_best(problem: Problem, estimate: Estimate) -> Estimate:
 
 def _rests(history: Sequence[float]) -> bool:
     """Whether the last iterations changed the cost by rounding alone: a redescending loss can go on like that."""
-    last = history[-_AT_REST:]
-    return len(last) == _AT_REST and max(last) - min(last) <= 1e-11 * max(last)
+    at_rest = 10  # iterations
+    last = history[-at_rest:]
+    return len(last) == at_rest and max(last) - min(last) <= 1e-11 * max(last)
 
 
 def _require_enough(problem: Problem, estimate: Estimate) -> None:
     unknowns = problem.layout.size + len(estimate.structure.values)
+    if problem.equations >= unknowns:
+        return
     known = unknowns - problem.unknowns(estimate)
     if problem.equations + known < unknowns:
         raise DegenerateError(
@@ -303,14 +305,16 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
 
 
 def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> Any:
+    dense_limit = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
+    most_invalid = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in problem.layout.free.values()) + len(assembly.blocks.structure)
-    few = kept + 6 * len(problem.layout.stations) < _DENSE_LIMIT
+    few = kept + 6 * len(problem.layout.stations) < dense_limit
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
     if few and not assembly.blocks.placements:  # nothing is left to be eliminated
         solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
     solver.max_num_iterations = problem.options.max_iterations
-    solver.max_num_consecutive_invalid_steps = _MOST_INVALID
+    solver.max_num_consecutive_invalid_steps = most_invalid
     solver.function_tolerance = precision
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14

@@ -1,6 +1,10 @@
-"""Cost functions of the observations: compressed sights, eliminated placements.
+"""Cost functions of the observations, and the numbers of a camera as Ceres moves them.
 
 What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++.
+
+A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
+height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps. In
+coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
 """
 
 from __future__ import annotations
@@ -13,13 +17,14 @@ import numpy as np
 import pyceres
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales, unit_px
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.problem.structure import Structure
+from ceres_cal.scene.camera import Camera
 
 
 @dataclass(eq=False)
@@ -87,7 +92,6 @@ class CachedCost(_CostFunction):
         """Jacobians are asked for where a step was accepted, and nowhere else."""
 
 
-_STRUCTURE = 3  # slot
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
@@ -131,10 +135,11 @@ class SightCost(CachedCost):
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+        structure = 3  # slot
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
         for place, slot in enumerate(self.slots):
-            size = self._unknowns.structure if slot == _STRUCTURE else len(parameters[place])
+            size = self._unknowns.structure if slot == structure else len(parameters[place])
             numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * size)
         residuals = np.empty(rows)
         points, curves = as_built(self._points, self._curves, self._sight, self._structure.with_values(numbers[3]))
@@ -143,7 +148,7 @@ class SightCost(CachedCost):
             kernels.Blocks(*jacobians),
         )  # fmt: skip
         if mixing is not None:
-            jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
+            jacobians[structure] = (jacobians[structure].reshape(rows, -1) @ mixing).reshape(-1)
         return CostValue(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
 
 
@@ -203,6 +208,7 @@ class EliminatedCost(CachedCost):
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._last = self._accepted
+        self._smooth = _smoothness(problem, estimate, self.camera, self._size)
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self.slots: list[int] = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
@@ -224,7 +230,7 @@ class EliminatedCost(CachedCost):
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
             swept = self._swept(at, tolerance, newton)
-            cost = float(np.sum(swept.costs))
+            cost = float(np.sum(swept.costs)) + self._add_smoothness(at, swept.reduced)
             if not np.isfinite(cost):
                 return None
             kernels.cholesky(swept.reduced, upper)
@@ -235,6 +241,17 @@ class EliminatedCost(CachedCost):
         residuals[-1] = np.sqrt(max(missing, 0.0))
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
+
+    def _add_smoothness(self, at: Array, reduced: Array) -> float:
+        """What the lens's roughness costs, once its normal equations are added: as residuals of its own Ceres would
+        take as long over it as over all sights.
+        """
+        if self._smooth is None:
+            return 0.0
+        slope = self._smooth @ at
+        reduced[:-1, :-1] += self._smooth
+        reduced[-1, :-1] += slope
+        return float(at @ slope)
 
     def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
         """Every placement brought to its best in a place, from the last accepted one."""
@@ -273,3 +290,74 @@ class EliminatedCost(CachedCost):
         if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
             self._accepted = self._eliminated(at, 1e-14) or self._accepted
         return self._sights.keys, self._accepted.poses
+
+
+_PHI = 0  # of the intrinsics
+
+
+class Chart:
+    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
+    have made in Python.
+    """
+
+    def __init__(self, camera: Camera, free: Indices) -> None:
+        powers = np.array([0.0] * 4 + [order - 1.0 for order in camera.lens.orders] + [0.0])
+        self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
+
+    def moved(self, numbers: Array) -> Array:
+        """(K,) what Ceres moves, of the free numbers (K,)."""
+        return np.asarray(numbers / self._scales(numbers))
+
+    def numbers(self, moved: Array) -> Array:
+        """(K,) the free numbers again."""
+        return np.asarray(moved * self._scales(moved))
+
+    def chained(self, jacobian: Array, numbers: Array) -> Array:
+        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
+        chained = jacobian * self._scales(numbers)
+        chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
+        return np.asarray(chained)
+
+    @np.errstate(all="ignore")  # phi may be 0 on the way: no camera, which shows nothing
+    def _scales(self, numbers: Array) -> Array:
+        return np.asarray((numbers[self._phi] / self._unit) ** self._powers)
+
+
+def chart_of(camera: Camera, free: Indices) -> Chart | None:
+    """None where the numbers are moved as they are."""
+    return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
+
+
+class ChartedCost(_CostFunction):
+    """A cost function over what Ceres moves, of one over the numbers themselves."""
+
+    def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:
+        super().__init__()
+        self._run, self._cost, self._charts = run, cost, charts
+        self.set_num_residuals(cost.num_residuals())
+        self.set_parameter_block_sizes(cost.parameter_block_sizes())
+
+    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
+        with self._run:
+            numbers = [
+                chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
+            ]
+            if not self._cost.Evaluate(numbers, residuals, jacobians):
+                return False
+            for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
+                if chart:
+                    jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
+            return True
+        return False
+
+
+def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> Array | None:
+    """(size, size) what is known of a lens's roughness, by the numbers of its camera's block; None of nothing."""
+    camera, whole = estimate.cameras[name], None
+    place = {number: at for at, number in enumerate(problem.layout.free[name].tolist())}
+    for prior in problem.smooth_at(estimate, name):
+        numbers = [intrinsic_names(camera.lens).index(key.quantity) for key in prior.keys]
+        at, scales = [place[number] for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
+        whole = np.zeros((size, size)) if whole is None else whole
+        whole[np.ix_(at, at)] += scales[:, None] * prior.information.matrix * scales
+    return whole

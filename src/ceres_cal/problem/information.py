@@ -96,7 +96,6 @@ def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
 
 
 _VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
-_DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +174,17 @@ class Information:
         left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
         return Information(self.keys, left.T @ left)
 
+    def beside(self, stated: Information, shifts: Array) -> Array:
+        """(S, K) shifts that widen all of it as shifts (S, K) widen what is known beyond what was stated.
+
+        With L what is known beyond, P what was stated, C = (L + P)^-1 and E the shifts, the covariance of L + P with L
+        widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
+        """
+        moved = shifts @ self.less(stated).matrix @ self.inverse
+        left = moved @ stated.matrix @ shifts.T
+        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
+        return np.asarray((vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved)
+
     def less(self, other: Information) -> Information:
         """What is left without a part of it; nothing of numbers of which that part says all but rounding."""
         left = self.matrix - other.over(self.keys).matrix
@@ -206,10 +216,11 @@ class Information:
     @cached_property
     def root(self) -> Array:
         """(R, K) with root^T root = matrix: a row for each direction that is determined, in standard deviations."""
+        determined = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
         diagonal = np.diagonal(self.matrix)
         if np.count_nonzero(self.matrix) == np.count_nonzero(diagonal):
             return np.asarray(np.diag(np.sqrt(diagonal))[diagonal > 0.0])
         scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
         values, vectors = np.linalg.eigh(self.matrix * scale[:, None] * scale)
-        kept = values > _DETERMINED
+        kept = values > determined
         return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T / scale)

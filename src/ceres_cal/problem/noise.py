@@ -14,12 +14,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.observations import Observations
 from ceres_cal.observations.files import Content
-from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.problem.residuals import Residuals
 
-_BEYOND = 100.0  # an exponent: no observation is so rare
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
 _LEAST_SPARE = 8.0
@@ -32,40 +30,28 @@ USUAL_EQUATIONS = 10.0
 # Share by which rows kept may outnumber those that their scale was taken from, and still be the tail of the same noise:
 # of Student's t with two degrees of freedom it is 1 %, of outliers more.
 _TAIL = 0.02
-_MOST_WIDER = 5
 # Of the root of how many there are: so many outliers more or fewer, at the bound, move what is shared by no 0.05 sd.
 # None of fewer than 60 000.
 SAME = 4e-3
-_ENOUGH = 5_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _BLOCK = 1 << 16  # lengths at once: what is made of them stays where the processor is quick
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
 _NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
 
 
-@dataclass(frozen=True)
-class Redundancy:
-    """The share of the equations of points and of curves that is left over for the noise: 1 less the mean leverage."""
+Redundancy = tuple[float, float]
+"""The share of the equations of points and of curves that is left over for the noise: 1 less the mean leverage."""
 
-    points: float
-    curves: float
 
-    @classmethod
-    def by_count(cls, equations: int, unknowns: int) -> Redundancy:
-        """As if every equation determined as much as any other."""
-        share = 1.0 - unknowns / max(equations, 1)
-        return cls(share, share)
+def by_count(equations: int, unknowns: int) -> Redundancy:
+    """As if every equation determined as much as any other."""
+    return (1.0 - unknowns / max(equations, 1),) * 2
 
-    @classmethod
-    def by_leverage(cls, sights: Sights, leverages: tuple[float, float]) -> Redundancy:
-        """As the observations in the sights determine the free numbers.
 
-        Args:
-            leverages: equations of points and of curves that the free numbers take up.
-        """
-        counts = 2 * len(sights.point_rows), len(sights.curve_rows)
-        points, curves = (1.0 - taken / max(count, 1) for taken, count in zip(leverages, counts, strict=True))
-        return cls(points, curves)
+def by_leverage(counts: tuple[int, int], leverages: tuple[float, float]) -> Redundancy:
+    """Of so many equations of points and of curves, of which the free numbers take up so many."""
+    points, curves = (1.0 - taken / max(count, 1) for taken, count in zip(leverages, counts, strict=True))
+    return points, curves
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,19 +92,6 @@ class Inliers:
     def with_rows_of(self, other: Inliers) -> Inliers:
         """The same with the rows that others have."""
         return replace(self, points=other.points, curves=other.curves)
-
-    @classmethod
-    def at(
-        cls,
-        points: Array,
-        curves: Array,
-        redundancy: Redundancy,
-        options: Options,
-        usual: tuple[float, float] | None = None,
-    ) -> Inliers:
-        """See `judge`; of lengths of points (N,) and of curves (M,) in their stated sigmas."""
-        noise = noise_of(EachLength(points), EachLength(curves), redundancy, options, usual)
-        return cls.by_noise(points, curves, noise)
 
     @classmethod
     def by_noise(cls, points: Array, curves: Array, noise: NoiseScales) -> Inliers:
@@ -170,7 +143,8 @@ def _median_scale(lengths: Lengths, median_of_one: float) -> float:
 
 def _middle(lengths: Array) -> float:
     """The median, of some of very many."""
-    some = lengths[:: max(1, len(lengths) // _ENOUGH)]  # its median is that of all within two hundredths
+    enough = 5_000
+    some = lengths[:: max(1, len(lengths) // enough)]  # its median is that of all within two hundredths
     middle = len(some) // 2
     return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
@@ -191,7 +165,9 @@ def judge(
         options: how far off an outlier is, and whether the stated sigmas hold (scale 1).
         usual: scales of points and curves seen before; they count as much as a few spare equations do.
     """
-    return Inliers.at(*relative_lengths(observations, residuals), redundancy, options, usual)
+    points, curves = relative_lengths(observations, residuals)
+    noise = noise_of(EachLength(points), EachLength(curves), redundancy, options, usual)
+    return Inliers.by_noise(points, curves, noise)
 
 
 class NoiseScales(NamedTuple):
@@ -235,11 +211,11 @@ def noise_of(
     if options.noise_scale == "stated":
         return NoiseScales(1.0, 1.0, options.reject_sigma, np.inf)
     floor = usual or (0.0, 0.0)
-    spare_of_all = 2.0 * redundancy.points * points.count + redundancy.curves * curves.count
+    spare_of_all = 2.0 * redundancy[0] * points.count + redundancy[1] * curves.count
     reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
-    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy.points)
-    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy.curves)
-    spare = 2.0 * redundancy.points * point_spread.count, redundancy.curves * curve_spread.count
+    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy[0])
+    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy[1])
+    spare = 2.0 * redundancy[0] * point_spread.count, redundancy[1] * curve_spread.count
     degrees = spare[0] + spare[1]
     if usual is not None:
         p, c = point_spread.scale_from(usual[0], spare[0]), curve_spread.scale_from(usual[1], spare[1])
@@ -259,9 +235,10 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     `sigmas` is over a known one: (1 + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), that of Student's t in
     two dimensions. Where the stated sigmas are taken it is `sigmas`.
     """
+    beyond = 100.0  # an exponent: no observation is so rare
     if degrees < _LEAST_SPARE:
         return sigmas
-    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, _BEYOND))))
+    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
 @dataclass(frozen=True)
@@ -314,9 +291,10 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
     Args:
         least: a scale that theirs is no smaller than. degrees: spare equations of each.
     """
+    most_wider = 5
     first = _median_scale(lengths, median_of_one)
     spread = lengths.within(reject_sigma * max(first, least))
-    for _ in range(_MOST_WIDER):
+    for _ in range(most_wider):
         if degrees <= 0.0 or not spread.count:
             break
         wider = lengths.within(reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))

@@ -31,10 +31,6 @@ PAPERS_POWERS = (2, 3)
 _OF_POWERS = "radial"  # the lens that powers stand for where none is named
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
 """The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
-_ENOUGH_VIEWS = 8  # that tell a skew beside a lens without a formula: no test decides there
-_LARGEST = 2**31 - 1  # whole number that Ceres counts with
-# Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
-_SIGMAS = (1e-3, 1e9)
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -99,6 +95,10 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out
+        # none.
+        sigmas = (1e-3, 1e9)
+        largest = 2**31 - 1  # whole number that Ceres counts with
         take_types(self)
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
@@ -125,18 +125,18 @@ class Options:
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
         if self.reject_sigma == np.inf:  # as far as anything counts, which files can hold
-            object.__setattr__(self, "reject_sigma", _SIGMAS[1])
+            object.__setattr__(self, "reject_sigma", sigmas[1])
         for name in ("loss_scale", "reject_sigma"):
-            if not _SIGMAS[0] <= getattr(self, name) <= _SIGMAS[1]:
-                least, most = _SIGMAS
+            if not sigmas[0] <= getattr(self, name) <= sigmas[1]:
+                least, most = sigmas
                 raise InputError(f"{name} must be {least:g} to {most:g} sigmas, not {getattr(self, name)}")
         if not self.max_iterations > 0:
             raise InputError(f"max_iterations must be above 0, not {self.max_iterations}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
         for name in ("max_iterations", "threads"):
-            if getattr(self, name) > _LARGEST:
-                raise InputError(f"{name} must be {_LARGEST} at most, not {getattr(self, name):.3g}")
+            if getattr(self, name) > largest:
+                raise InputError(f"{name} must be {largest} at most, not {getattr(self, name):.3g}")
 
     @property
     def _which(self) -> str:
@@ -165,7 +165,8 @@ class Options:
         """These options with a skew, which displaces by the first power, of a lens whose powers are left open, where so
         many views tell it.
         """
-        if self.powers or views < _ENOUGH_VIEWS or not self.usual_camera:
+        enough_views = 8  # that tell a skew beside a lens without a formula: no test decides there
+        if self.powers or views < enough_views or not self.usual_camera:
             return self
         return replace(self, free_skew="skew" not in self.fixed)
 

@@ -14,8 +14,6 @@ from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, logarithmic
 
-_NEAR = 1e-6  # residuals that Cauchy's loss leaves as they are
-
 
 class _Linear(NamedTuple):
     """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
@@ -29,10 +27,10 @@ class _Linear(NamedTuple):
         """(n,) in the units of the keys."""
         return np.asarray(block[self.slots] * self.scales)
 
-    def slopes(self, block: Array) -> Array:
-        """(n, size) derivatives by the block."""
-        slopes = np.zeros((len(self.slots), self.size))
-        slopes[np.arange(len(self.slots)), self.slots] = self.scales
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, size) derivatives by the block of root (R, n) times the values."""
+        slopes = np.zeros((len(root), self.size))
+        slopes[:, self.slots] = root * self.scales
         return slopes
 
 
@@ -50,14 +48,14 @@ class _StationCoordinates(NamedTuple):
         turn = rotation_log(pose.rotation @ self.rotation.T)
         return np.concatenate([pose.position, turn])[self.rows]
 
-    def slopes(self, block: Array) -> Array:
-        """(n, 6) derivatives by the rotation vector and the translation."""
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, 6) derivatives of root (R, n) times the values by the rotation vector and the translation."""
         inverse, left = rotation_exp(block[:3]).T, left_jacobian(block[:3])
         slopes = np.zeros((6, 6))
         slopes[:3] = np.hstack([-inverse @ skew(block[3:]) @ left, -inverse])
         turn = rotation_log(inverse.T @ self.rotation.T)
         slopes[3:, :3] = np.linalg.solve(left_jacobian(turn), left)
-        return slopes[self.rows]
+        return np.asarray(root @ slopes[self.rows])
 
 
 class PriorCost(CachedCost):
@@ -89,15 +87,16 @@ class PriorCost(CachedCost):
         if self._is_usual:
             residuals, slope = _bent(residuals)
             root = slope[:, None] * root
-        slopes = [(root[:, part.columns] @ part.slopes(block)).reshape(-1) for part, block in blocks]
+        slopes = [part.slopes(block, root[:, part.columns]).reshape(-1) for part, block in blocks]
         return CostValue(at, residuals, slopes)
 
 
 def _bent(residuals: Array) -> tuple[Array, Array]:
     """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
+    near = 1e-6  # residuals that Cauchy's loss leaves as they are
     weight = 1.0 / (1.0 + (residuals / USUAL_BENDS) ** 2)
     bent = USUAL_BENDS * np.sign(residuals) * np.sqrt(np.log1p((residuals / USUAL_BENDS) ** 2))
-    far = np.abs(residuals) > _NEAR
+    far = np.abs(residuals) > near
     return bent, np.where(far, weight * residuals / np.where(far, bent, 1.0), 1.0)
 
 

@@ -32,7 +32,6 @@ _USUAL_ASPECT, _USUAL_DECENTRING = 5e-4, 5e-4
 # Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
 # that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
 USUAL_BENDS = 2.0
-_LEAST_RATIO = 1e-6  # of a number to its mean: a step of the solver may pass 0
 ANY_PHI = 1.1, 0.8
 """phi in half image diagonals, and the standard deviation of its logarithm: fisheyes of 0.3 and lenses of cranes and
 stands, five half diagonals, are within two of it. Without it a view from straight above, which tells phi over height
@@ -132,7 +131,8 @@ class GaussianPrior:
 
 def logarithmic(off: Array, mean: Array) -> tuple[Array, Array]:
     """(K,) mean log(x / mean) of numbers x that are `off` the mean, and its derivative by x; far below 0 of x <= 0."""
-    ratio = np.maximum(1.0 + off / mean, _LEAST_RATIO)
+    least_ratio = 1e-6  # of a number to its mean: a step of the solver may pass 0
+    ratio = np.maximum(1.0 + off / mean, least_ratio)
     return mean * np.log(ratio), 1.0 / ratio
 
 

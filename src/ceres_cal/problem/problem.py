@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
@@ -90,7 +91,8 @@ class Problem:
 
     def priors_of(self, estimate: Estimate) -> list[GaussianPrior]:
         """The priors and the smoothness of lenses, of numbers that are free."""
-        return [*self.stated_at(estimate), *self._smooth_at(estimate)]
+        smooth = (self.smooth_at(estimate, name) for name in estimate.cameras)
+        return [*self.stated_at(estimate), *chain.from_iterable(smooth)]
 
     def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
         """What these say at an estimate: what is usual counts less, the farther off it is."""
@@ -104,19 +106,19 @@ class Problem:
         restricted = [prior.given(free) for prior in self.priors]
         return [prior for prior in restricted if prior.keys]
 
-    def _smooth_at(self, estimate: Estimate) -> Iterator[GaussianPrior]:
-        """What its smoothness says of each lens, where no posterior says so already."""
-        for name, camera in estimate.cameras.items():
-            if not (forms := camera.lens.roughness):
-                continue
-            keys = {key.quantity: key for key in intrinsic_keys(name, camera.lens)}
-            free = {key for number, key in enumerate(keys.values()) if number in self.layout.free[name]}
-            sigmas = self.smoothness.get(name, tuple(form.loose for form in forms))
-            for form, sigma in zip(forms, sigmas, strict=True):
-                own = tuple(keys[quantity] for quantity in form.names)
-                if free & set(own) and not self.knows_lens(name, camera.lens):
-                    whole = GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own)))
-                    yield whole.given(free)
+    def smooth_at(self, estimate: Estimate, camera: str) -> Iterator[GaussianPrior]:
+        """What its smoothness says of a camera's lens, of mean nought, where no posterior says so already."""
+        lens = estimate.cameras[camera].lens
+        if not (forms := lens.roughness) or self.knows_lens(camera, lens):
+            return
+        keys = {key.quantity: key for key in intrinsic_keys(camera, lens)}
+        every = list(keys.values())
+        free = {every[number] for number in self.layout.free[camera]}
+        sigmas = self.smoothness.get(camera, tuple(form.loose for form in forms))
+        for form, sigma in zip(forms, sigmas, strict=True):
+            own = tuple(keys[quantity] for quantity in form.names)
+            if free & set(own):
+                yield GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own))).given(free)
 
     def knows_lens(self, camera: str, lens: Lens) -> bool:
         """Whether a posterior states a camera's lens in every direction: how smooth it is, is in there."""

@@ -231,27 +231,17 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
 
 def difference(estimate: Estimate, reference: Estimate, keys: Sequence[Key]) -> Array:
     """The step (P,) along the keys that leads from the reference to the estimate."""
-    step = np.empty(len(keys))
+    step = values_of(estimate, keys) - values_of(reference, keys)
     for (kind, owner), columns in columns_by_owner(keys).items():
-        changes = _differences(kind, owner, estimate, reference)
-        step[columns] = [changes[keys[column].quantity] for column in columns]
+        if kind == "station":
+            here, there = (one.stations[owner].cam_from_world.rotation for one in (estimate, reference))
+            turn = rotation_log(here @ there.T)
+        elif kind == "placement":
+            here, there = (one.placements[owner].rotation for one in (estimate, reference))
+            turn = rotation_log(there.T @ here)
+        else:
+            continue
+        for column in columns:
+            if keys[column].unit == "rad":
+                step[column] = turn[STATION_QUANTITIES.index(keys[column].quantity) - 3]
     return step
-
-
-def _differences(kind: str, owner: str, estimate: Estimate, reference: Estimate) -> dict[str, float]:
-    if kind == "camera":
-        here, there = estimate.cameras[owner], reference.cameras[owner]
-        change = (intrinsics_vector(here) - intrinsics_vector(there)) / intrinsics_scales(there)
-        return dict(zip(intrinsic_names(there.lens), change.tolist(), strict=True))
-    if kind in ("structure", "dimension"):
-        change = estimate.structure.values - reference.structure.values
-        names = [name.partition("/")[2] for name in reference.structure.names if name.partition("/")[0] == owner]
-        mine = [name.partition("/")[0] == owner for name in reference.structure.names]
-        return dict(zip(names, change[mine].tolist(), strict=True))
-    if kind == "station":
-        a, b = estimate.stations[owner].cam_from_world, reference.stations[owner].cam_from_world
-        step = np.concatenate([a.position - b.position, rotation_log(a.rotation @ b.rotation.T)])
-        return dict(zip(STATION_QUANTITIES, step.tolist(), strict=True))
-    c, d = estimate.placements[owner], reference.placements[owner]
-    step = np.concatenate([c.translation - d.translation, rotation_log(d.rotation.T @ c.rotation)])
-    return dict(zip(PLACEMENT_QUANTITIES, step.tolist(), strict=True))

@@ -19,21 +19,12 @@ from ceres_cal.scene.lens import Lens
 
 PHI_RANGE = (0.15, 15.0)
 """In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
-# In half image diagonals: from a fisheye whose image circle takes a tenth of the picture to a telescope that shows one
-# degree. Millimetres of a lens lie below it.
-_PHI = (0.05, 100.0)
-_OFF_CENTRE = 10.0  # image diagonals: a picture that was cropped from one ten times as large
-_ASPECT = (0.1, 10.0)  # anamorphic lenses and skipped rows have 0.5 to 2
-_SKEW = (-1.0, 1.0)  # columns that lean by 45 degrees
-# In the solver's unit, in which it is of order one; the rational model's reach a few hundred.
-_COEFFICIENT = 1e6
 _REDRAWN = 20.0  # times a dimension as drawn, or the inverse: beyond it another target was drawn
 # Of the longest side of the target's bounding box. Paper that is held by hand bends by a fiftieth.
 _BUILT = 0.05
 _FINEST = 1e-6
 """m and px: a standard deviation below a micrometre, or a millionth of a pixel, was measured by nobody. A hundredth of
 it is solved for without loss; at a ten-thousandth the solve no longer converges."""
-_FINEST_RATIO = 1e-9  # of numbers without a unit, which are of order one
 
 
 @dataclass(frozen=True)
@@ -118,20 +109,29 @@ def _ranges(prior: Prior, observations: Observations, options: Options) -> Itera
 
 def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Range:
     """Of a camera's number, by its name."""
+    finest_ratio = 1e-9  # of numbers without a unit, which are of order one
+    # In the solver's unit, in which it is of order one; the rational model's reach a few hundred.
+    coefficient = 1e6
+    skew = (-1.0, 1.0)  # columns that lean by 45 degrees
+    aspect = (0.1, 10.0)  # anamorphic lenses and skipped rows have 0.5 to 2
+    off_centre = 10.0  # image diagonals: a picture that was cropped from one ten times as large
+    # In half image diagonals: from a fisheye whose image circle takes a tenth of the picture to a telescope that shows
+    # one degree. Millimetres of a lens lie below it.
+    phi = (0.05, 100.0)
     size = np.array(image_size, dtype=float)
     half = 0.5 * float(np.hypot(*size))
     image = f"the image is {image_size[0]} x {image_size[1]} px"
     if name == "phi":
-        return Range(_PHI[0] * half, _PHI[1] * half, "px", _FINEST, f"the focal length in pixels, where {image}")
+        return Range(phi[0] * half, phi[1] * half, "px", _FINEST, f"the focal length in pixels, where {image}")
     if name in ("cx", "cy"):
-        middle, reach = 0.5 * (size[int(name == "cy")] - 1.0), _OFF_CENTRE * 2.0 * half
+        middle, reach = 0.5 * (size[int(name == "cy")] - 1.0), off_centre * 2.0 * half
         return Range(middle - reach, middle + reach, "px", _FINEST, image)
     if name == "aspect":
-        return Range(*_ASPECT, "", _FINEST_RATIO, "it is fy / fx, near 1")
+        return Range(*aspect, "", finest_ratio, "it is fy / fx, near 1")
     if name == "skew":
-        return Range(*_SKEW, "", _FINEST_RATIO, "it is 0 unless columns of pixels lean")
+        return Range(*skew, "", finest_ratio, "it is 0 unless columns of pixels lean")
     scale = 1.0 if lens is None or name not in lens.names else lens.scales(half)[lens.names.index(name)]
-    return Range(-_COEFFICIENT / scale, _COEFFICIENT / scale, "", _FINEST_RATIO / scale, "more bends no image")
+    return Range(-coefficient / scale, coefficient / scale, "", finest_ratio / scale, "more bends no image")
 
 
 def _of_place(station: str, observations: Observations) -> Range:

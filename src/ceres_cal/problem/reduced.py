@@ -6,7 +6,7 @@ added up over what is shared, in the coordinates of `problem.information`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
@@ -27,7 +27,6 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 
-_ROUNDING = 1e-13  # of a sum over a sight's rows
 _BATCH = 250_000  # numbers of normal equations worked on at once: they stay where the processor is quick
 
 
@@ -59,7 +58,8 @@ class ReducedInformation:
 
     Attributes:
         points, curves: what the observations of either kind say. priors: what was known before.
-        stated: that part of the priors which somebody stated, or an earlier calibration found.
+        stated: that part of the priors which somebody stated, or an earlier calibration found. built: that part of them
+            which says how far targets may be from their drawings: a scatter that equations have in common.
         eliminated: the private placements, by station.
         point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
     """
@@ -68,6 +68,7 @@ class ReducedInformation:
     curves: Information
     priors: Information
     stated: Information
+    built: Information
     eliminated: tuple[Eliminated, ...]
     point_leverage: float
     curve_leverage: float
@@ -117,7 +118,7 @@ def normals_with_residuals(sights: Sights, problem: Problem, estimate: Estimate)
     Raises:
         SolutionError: an observation cannot be projected.
     """
-    return _KernelNormals(sights, problem, estimate).of(0, len(sights))
+    return _kernel_normals(sights, problem, estimate)(0, len(sights))
 
 
 def owned_columns(keys: Sequence[Key]) -> dict[tuple[str, str], Indices]:
@@ -176,9 +177,13 @@ class _InformationSums:
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
         known = reduce(add, priors, Information.nothing(self._keys))
-        every = self._problem.stated_at(self._estimate)
-        stated = reduce(add, (prior.information for prior in every if not prior.is_usual), Information.nothing())
-        return ReducedInformation(points, curves, known, stated, tuple(eliminated), *self._leverages.tolist())
+        every = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
+        of_targets = [all(key.kind == "structure" for key in prior.keys) for prior in every]
+        stated, built = (
+            reduce(add, (one.information for one, own in zip(every, of_targets, strict=True) if own == of), nothing)
+            for of, nothing in ((False, Information.nothing()), (True, Information.nothing()))
+        )
+        return ReducedInformation(points, curves, known, stated, built, tuple(eliminated), *self._leverages.tolist())
 
     def _owned(self, kind: str, name: str) -> Indices:
         return self._columns.get((kind, name), np.empty(0, dtype=np.int64))
@@ -189,7 +194,7 @@ class _InformationSums:
         perturbation of the pose: turn, shift].
         """
         kernel_of = {
-            kind: _KernelNormals(own, self._problem, self._estimate)
+            kind: _kernel_normals(own, self._problem, self._estimate)
             for kind, own in enumerate(sights.by_kind)
             if own.equations
         }
@@ -198,7 +203,7 @@ class _InformationSums:
         batch = max(1, _BATCH // size**2)
         for first in range(0, len(sights), batch):
             last = min(first + batch, len(sights))
-            yield poses[first:last], {kind: one.of(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}
+            yield poses[first:last], {kind: one(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}
 
     def _eliminate(self, sights: Sights) -> Eliminated:
         """The private placements of one station; what is left of their sights is added to the sums."""
@@ -252,47 +257,45 @@ def _limits(own: Array) -> Array:
     """(S, 6) sigmas beyond which a placement's number is unknown: what remains of a turn about the middle of rings, in
     sums over all of their rows, is rounding of its other turns.
     """
+    rounding = 1e-13  # of a sum over a sight's rows
     turns, shifts = np.max(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3), axis=2).T
     largest = np.repeat(np.column_stack([turns, shifts]), 3, axis=1)
-    return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (_ROUNDING * largest + 1e-300) ** -0.5))
+    return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (rounding * largest + 1e-300) ** -0.5))
 
 
-class _KernelNormals:
-    """The normal equations of one camera's sights, as the kernels give them."""
+def _kernel_normals(sights: Sights, problem: Problem, estimate: Estimate) -> Callable[[int, int], Array]:
+    """The normal equations of one camera's sights, as the kernels give them: (n, K + 1, K + 1) of those from one number
+    to another, the residuals' row last. What it returns raises SolutionError where an observation cannot be projected.
+    """
+    camera = estimate.cameras[sights.keys[0].camera]
+    free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
+    offsets = len(structure.offsets)
+    units = np.ones(len(free) + offsets + 7)
+    units[: len(free)] = intrinsics_scales(camera)[free]
+    size, chain = len(units), structure.chain(len(free), 7)
+    rows = (len(sights.points) + len(sights.curve_pixels)) / len(sights)
+    arguments = (
+        camera_optics(camera),
+        kernels.Unknowns(free, offsets),
+        point_columns(sights, structure, weighting.point_scale),
+        curve_columns(sights, structure, starting_feet(sights, estimate, problem.feet), weighting.curve_scale),
+        kernel_loss(weighting),
+        estimate.pose_stack(sights.keys),
+        units,
+    )
 
-    def __init__(self, sights: Sights, problem: Problem, estimate: Estimate) -> None:
-        camera = estimate.cameras[sights.keys[0].camera]
-        free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
-        offsets = len(structure.offsets)
-        units = np.ones(len(free) + offsets + 7)
-        units[: len(free)] = intrinsics_scales(camera)[free]
-        self._size, self._chain = len(units), structure.chain(len(free), 7)
-        self._rows = (len(sights.points) + len(sights.curve_pixels)) / len(sights)
-        self._arguments = (
-            camera_optics(camera),
-            kernels.Unknowns(free, offsets),
-            point_columns(sights, structure, weighting.point_scale),
-            curve_columns(sights, structure, starting_feet(sights, estimate, problem.feet), weighting.curve_scale),
-            kernel_loss(weighting),
-            estimate.pose_stack(sights.keys),
-            units,
-        )
-
-    def of(self, first: int, last: int) -> Array:
-        """(n, K + 1, K + 1) of the sights from one number to another, the residuals' row last.
-
-        Raises:
-            SolutionError: an observation cannot be projected.
-        """
-        normals = np.empty((last - first, self._size, self._size))
+    def between(first: int, last: int) -> Array:
+        normals = np.empty((last - first, size, size))
 
         def part(begin: int, end: int) -> bool:
-            return kernels.sight_normals(first + begin, first + end, *self._arguments, normals[begin:end])
+            return kernels.sight_normals(first + begin, first + end, *arguments, normals[begin:end])
 
-        if not all(run_parts(part, parts_of(last - first, int(self._rows * (last - first)), NORMAL_NS))):
+        if not all(run_parts(part, parts_of(last - first, int(rows * (last - first)), NORMAL_NS))):
             raise SolutionError(
                 "an observation cannot be projected where the solve ended: no uncertainty can be given: choose another "
                 "lens (for wide ones kannala-brandt or spline), free what is held of this one, or leave out what lies "
                 "nearest to the image's corners"
             )
-        return normals if self._chain is None else self._chain.T @ normals @ self._chain
+        return normals if chain is None else chain.T @ normals @ chain
+
+    return between

@@ -17,7 +17,6 @@ from ceres_cal.problem.structure import Structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
 
-_POINT_NS = 10.0
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
 # scripts/accuracy/moves.py. Nothing changes from half to double.
 _STRAY = 0.05
@@ -149,12 +148,13 @@ def _residuals(n: int, m: int, sights: Sights, estimate: Estimate, feet: Array |
 def _point_residuals(
     optics: kernels.Optics, poses: Array, sights: Sights, structure: Structure, offsets: Array
 ) -> None:
+    point_ns = 10.0
     columns = point_columns(sights, structure)
 
     def part(first: int, last: int) -> None:
         kernels.point_residuals(first, last, optics, poses, columns, sights.point_rows, offsets)
 
-    run_parts(part, parts_of(len(sights), len(sights.points), _POINT_NS))
+    run_parts(part, parts_of(len(sights), len(sights.points), point_ns))
 
 
 def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Array:

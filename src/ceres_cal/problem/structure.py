@@ -28,7 +28,6 @@ from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
 
 Kind = Literal["lines", "points", "warp"]
 """What a tolerance speaks of."""
-_NONE = -1
 WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
 """What the warp of a board is made of: see `bends_of`."""
 
@@ -267,16 +266,17 @@ def _parts_of(curve: Curve) -> tuple[str, ...]:
 
 def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Indices32, Array, Indices32]:
     """Point slots, bends and track slots, by the place of each offset."""
+    none = -1
     point_slots, bends, track_slots = [], [], []
     for name, target in targets.items():
         curves = []
         for curve_name, curve in target.curves.items():
-            slots = [place.get(f"{name}/{curve_name}{part}", _NONE) for part in _parts_of(curve)]
-            curves.append(slots + [_NONE] * (3 - len(slots)))
+            slots = [place.get(f"{name}/{curve_name}{part}", none) for part in _parts_of(curve)]
+            curves.append(slots + [none] * (3 - len(slots)))
         track_slots += curves * 3  # the paint's centre and both edges move together
-        warp = [place.get(f"{name}/{part}", _NONE) for part in WARP]
+        warp = [place.get(f"{name}/{part}", none) for part in WARP]
         for point_name in target.points:
-            point_slots.append([place.get(f"{name}/{point_name}.{axis}", _NONE) for axis in "xy"] + warp)
+            point_slots.append([place.get(f"{name}/{point_name}.{axis}", none) for axis in "xy"] + warp)
         bends.append(bends_of(target))
     return (
         np.array(point_slots, dtype=np.int32).reshape(-1, 2 + len(WARP)),

@@ -15,7 +15,7 @@ from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.faults import FaultyMap
 from ceres_cal.report.quality import Quality
 from ceres_cal.robust.as_built import words_of

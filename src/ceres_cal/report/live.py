@@ -13,7 +13,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import ResidualTable
 from ceres_cal.diagnostics.advice import advise
 from ceres_cal.posterior.maps import FieldMap
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.material import paint_of
 from ceres_cal.report.pictures.advised import places_in_picture

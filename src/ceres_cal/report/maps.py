@@ -11,8 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.posterior.image import image_grid
-from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.maps import FieldMap, image_grid
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table

@@ -24,7 +24,7 @@ from ceres_cal.base.words import (
 )
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.observations import Observations
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.problem.parameters import anchored_stations
 from ceres_cal.report.document import Piece, Section, Table, Text, wrapped
 from ceres_cal.report.quality import Quality

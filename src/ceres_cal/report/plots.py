@@ -9,8 +9,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.diagnostics import Diagnosis
-from ceres_cal.posterior.image import ImageMap
-from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.maps import FieldMap, ImageMap
 from ceres_cal.report.canvas import WIDE_IN
 from ceres_cal.report.maps import LABEL, fill
 from ceres_cal.report.residual_pictures import draw_vectors, significant_means

@@ -15,11 +15,9 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, Finding, diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.thinning import thinned
-from ceres_cal.posterior.image import ImageMap
-from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.maps import FieldMap, ImageMap
 from ceres_cal.posterior.seam import Disagreement
-from ceres_cal.posterior.uncertainty import Uncertainty
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.report.faults import FaultyMap, faulty_map, sigmas_of_cameras
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Target

@@ -10,8 +10,7 @@ import numpy as np
 from ceres_cal.base.words import DASH, at_precision, counted, fixed, metres, mm, plural, sentence, short, two_digits
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.seam import RigPair
-from ceres_cal.posterior.uncertainty import Uncertainty
-from ceres_cal.posterior.weak import Verdict
+from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
 from ceres_cal.report.grounds import (
     CARE_MM,

@@ -25,7 +25,7 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, LIKELY, RepeatedAmounts, agreement
-from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
+from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.equations import Equations, equations_of, whole_structure
@@ -197,10 +197,8 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
         )
 
 
-_MOST_SCREENED, _MOST_SIGHTS = 12, 200  # of a camera: that are asked first, and that tell the sigma
 # Standard deviations of products of different views from which on the likelihood is asked, which costs as much again.
 _REPEATS = 2.0
-_DEGREE, _POWERS = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
 
 
 def estimate_as_built(
@@ -212,6 +210,7 @@ def estimate_as_built(
     Args:
         problem: of all the observations. end: of its rounds.
     """
+    most_screened, most_sights = 12, 200  # of a camera: that are asked first, and that tell the sigma
     structure, tolerances = whole_structure(observations.targets), problem.options.tolerances
     dimensions = problem.options.dimensions
     stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.solution.estimate.structure)
@@ -219,14 +218,14 @@ def estimate_as_built(
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
         return (), as_stated
-    sights = _some(end.problem.sights, _MOST_SCREENED)
+    sights = _some(end.problem.sights, most_screened)
     equations, weights = _equations(stated, observations, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
     # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved.
     if not any(agreement(scores[:, numbers]) > _REPEATS for numbers in kinds.values()):
         return (), as_stated
-    equations, weights = _equations(stated, observations, end, _some(end.problem.sights, _MOST_SIGHTS))
+    equations, weights = _equations(stated, observations, end, _some(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
     every = tuple(_likely(repeats, kinds, observations))
@@ -260,7 +259,7 @@ def _equations(
     stated_alone = stated.carrying(estimate.structure)
     before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
     solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
-    weights = _weights(observations, end, equations)
+    weights = end.weights_of(observations, equations)
     return replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1)), weights
 
 
@@ -269,12 +268,6 @@ def _columns(structure: Structure, equations: Equations, weights: Weights) -> Sp
     slots, scale = equations.slots(structure), weights.inverse_sigma * weights.used
     values = np.where(slots >= 0, equations.built * scale[:, None], 0.0)
     return SparseColumns(np.where(slots >= 0, slots, len(structure.names)), values, len(structure.names))
-
-
-def _weights(observations: Observations, end: RobustSolution, equations: Equations) -> Weights:
-    """How the equations counted at the end."""
-    taking_part = end.inliers.points, end.inliers.curves
-    return equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
 
 
 def _drawn(equations: Equations, weights: Weights, stated: Structure, end: RobustSolution) -> Linearised:
@@ -289,14 +282,15 @@ def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
     """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
     radius.
     """
+    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
     for name in equations.sights.cameras:
         camera = estimate.cameras[name]
         place = (equations.pixel - camera.principal_point) / unit_px(camera)
         x, y = place.T
-        smooth = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+        smooth = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
         along = np.sum(place * equations.direction, axis=1)
-        radial = [np.sum(place**2, axis=1) ** power * along for power in _POWERS]
+        radial = [np.sum(place**2, axis=1) ** power * along for power in powers]
         every = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
         yield np.column_stack(every) * (owner == name)[:, None]
 

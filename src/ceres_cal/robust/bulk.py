@@ -18,25 +18,29 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.bundle import Progress, Solution, solve
-from ceres_cal.problem.engines import Engine, InProcess, OnWorkers
-from ceres_cal.problem.noise import SAME, Inliers, NoiseScales, Redundancy, noise_of, relative_lengths
+from ceres_cal.problem.engines import Engine, InProcess, OnWorkers, SharedObservations, of_world
+from ceres_cal.problem.noise import (
+    SAME,
+    Inliers,
+    NoiseScales,
+    Redundancy,
+    by_count,
+    by_leverage,
+    noise_of,
+    relative_lengths,
+)
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.shared_cost import SharedObservations, of_world
 from ceres_cal.problem.shares import Share, ShareRequest, cut
 from ceres_cal.problem.sums import Histogram, Looked, Used
 from ceres_cal.robust.competing import Explanation
-from ceres_cal.robust.robust import RobustSolution
-from ceres_cal.robust.rounds import Rounds
+from ceres_cal.robust.robust import RobustSolution, Rounds
 
 # Observations of the part, and views of it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200
-# Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
-_TO_THE_LAST = 1e-17
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
-_MOST_ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,10 +278,12 @@ class _SumRounds(Rounds[_SumRound]):
 
     def next(self, state: _SumRound) -> _SumRound:
         """One more solve of what was judged to take part, judged."""
+        # Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
+        to_the_last = 1e-17
         problem = self._judged(state.seen, state.noise)
-        solution = solve(problem, state.seen.estimate, self._progress, precision=_TO_THE_LAST)
+        solution = solve(problem, state.seen.estimate, self._progress, precision=to_the_last)
         seen = self._look(solution.estimate, state.noise.bounds, problem.weighting)
-        noise = seen.noise(Redundancy.by_count(problem.equations, self._unknowns), self._problem)
+        noise = seen.noise(by_count(problem.equations, self._unknowns), self._problem)
         return _SumRound(problem, solution, seen, noise, state.rounds + 1)
 
     def with_leverages(self, state: _SumRound) -> _SumRound:
@@ -287,15 +293,16 @@ class _SumRounds(Rounds[_SumRound]):
         here = replace(elsewhere, feet_along=self._along)  # else shares would seek those of before again
         reduced = information(replace(state.problem, elsewhere=here), state.solution.estimate)
         points, curves = state.seen.inside(state.noise)
-        shares = (1.0 - own / max(n, 1) for own, n in zip(reduced.leverages, (2 * points, curves), strict=True))
-        return replace(state, noise=state.seen.noise(Redundancy(*shares), self._problem), reduced=reduced)
+        redundancy = by_leverage((2 * points, curves), reduced.leverages)
+        return replace(state, noise=state.seen.noise(redundancy, self._problem), reduced=reduced)
 
     def end(self) -> RobustSolution:
         """The end of the rounds, with what all observations say there."""
+        most_rounds = 8
         before = self._before
         seen = self._look(before.solution.estimate, _bounds(before), before.problem.weighting)
-        noise = seen.noise(Redundancy.by_count(sum(seen.looked.equations), self._unknowns), self._problem)
-        state = self.to_rest(_SumRound(self._problem, before.solution, seen, noise, 0), _MOST_ROUNDS)
+        noise = seen.noise(by_count(sum(seen.looked.equations), self._unknowns), self._problem)
+        state = self.to_rest(_SumRound(self._problem, before.solution, seen, noise, 0), most_rounds)
         state = state if state.reduced is not None else self.with_leverages(state)
         self._seen, self._noise = state.seen, state.noise
         inliers = Inliers.by_noise(*state.seen.lengths, state.noise)

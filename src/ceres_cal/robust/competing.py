@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Indices, Mask, medians_known
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.words import two_digits
-from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.offsets import Offsets, measure_offsets
+from ceres_cal.effects.columns import least_absolute
+from ceres_cal.effects.evidence import Offsets, measure_offsets
+from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.equations import write_equations
@@ -42,7 +43,8 @@ from ceres_cal.robust.groups import (
     mostly_rejected,
     rows_compared,
 )
-from ceres_cal.robust.robust import RobustSolution, require_fits
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust.usable import require_fits
 
 # Log odds between which both explanations are named: 19 to 1.
 DOUBTFUL = 3.0
@@ -105,7 +107,6 @@ _SUSPECT = -4.4
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
-_MOST_WRONG = 4  # groups
 
 
 Solver = Callable[[Problem, Subproblem], RobustSolution]
@@ -128,8 +129,8 @@ def compete(
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
     taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
     for trial in trials:
-        groups = every.kinds[some.kinds.index(trial.suspects.groups)]
-        own = [groups.among(np.array([number])) & taking_part for number in trial.suspects.numbers]
+        groups = every.kinds[some.kinds.index(trial.suspects[0])]
+        own = [groups.among(np.array([number])) & taking_part for number in trial.suspects[1]]
         found = trial.explanations if some is part else [_as_stated(one, part, solver) for one in trial.explanations]
         explanations += [replace(one, rows=rows) for one, rows in zip(found, own, strict=True)]
         if trial.log_odds >= 0.0:
@@ -164,12 +165,8 @@ def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanatio
     return one if other.solution.failed else replace(one, other=other.solution.estimate)
 
 
-@dataclass(frozen=True, eq=False)
-class _Suspects:
-    """Groups of one kind, by their numbers."""
-
-    groups: ObservationGroups
-    numbers: tuple[int, ...]
+_Suspects = tuple[ObservationGroups, tuple[int, ...]]
+"""Groups of one kind, by their numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +205,9 @@ class _Competition:
 
     def decided(self) -> list[_Trial]:
         """The trials of groups that do not belong, one after the other; the last one may be in doubt."""
+        most_wrong = 4  # groups
         end, decided = self._some.end, list[_Trial]()
-        while sum(len(one.explanations) for one in decided) < _MOST_WRONG:
+        while sum(len(one.explanations) for one in decided) < most_wrong:
             best = _best(list(self.trials(end)))
             if best is None or best.log_odds < -DOUBTFUL:
                 break
@@ -221,10 +219,10 @@ class _Competition:
 
     def trials(self, end: RobustSolution) -> Iterator[_Trial]:
         """What solves without the suspects say; also without one more, where a second one may hide the first."""
-        for suspects in self.suspects(end):
-            trial = self.tried(end, suspects)
+        for groups, numbers in self.suspects(end):
+            trial = self.tried(end, (groups, numbers))
             if trial is not None and trial.log_odds < DOUBTFUL and trial.next is not None:
-                pair = self.tried(end, _Suspects(suspects.groups, (*suspects.numbers, trial.next)))
+                pair = self.tried(end, (groups, (*numbers, trial.next)))
                 trial = trial if pair is None or pair.log_odds < trial.log_odds else pair
             if trial is not None:
                 yield trial
@@ -238,7 +236,7 @@ class _Competition:
                 rows = tuple(np.flatnonzero(groups.among(np.array(numbers))).tolist())
                 if rows not in self._tried:
                     self._tried.add(rows)
-                    yield _Suspects(groups, numbers)
+                    yield groups, numbers
 
     def _mostly_rejected(self, end: RobustSolution, groups: ObservationGroups) -> Iterator[tuple[int, ...]]:
         """The one with most outliers, where most of its observations are."""
@@ -269,7 +267,7 @@ class _Competition:
 
     def tried(self, end: RobustSolution, suspects: _Suspects) -> _Trial | None:
         """What a solve without the suspects says of them; None where there is none, or they lie here and there."""
-        groups, numbers = suspects.groups, suspects.numbers
+        groups, numbers = suspects
         without = self._without(groups, numbers)
         if without is None:
             return None
@@ -287,7 +285,7 @@ class _Competition:
                 instead = f"the whole of {groups.name(rival)} does not belong"
                 rivals = self._without(groups, tuple(rival if one == number else one for one in numbers))
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
-            aside_px = float(np.nanmedian(lengths[own]))
+            aside_px = float(medians_known(lengths[own]))
             explanations.append(Explanation(groups.name(number), own, aside_px, odds, instead, other))
         rows = groups.among(np.array(numbers)) & self._taking_part
         least = min(one.log_odds for one in explanations)
@@ -323,9 +321,7 @@ class _Competition:
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
         equations = write_equations(observations, sights, end.solution.estimate, end.residuals)
-        inliers, weighting = end.inliers, end.inliers.weighting(problem.options)
-        taking_part = inliers.points, inliers.curves
-        weights = equation_weights(observations, weighting, equations, end.residuals, taking_part)
+        weights = end.weights_of(observations, equations)
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(problem, end.solution.estimate, equations, weights)
@@ -334,7 +330,9 @@ class _Competition:
         agreeing = model.used.copy()
         for number in back:
             own = np.flatnonzero(effect.group == np.searchsorted(chosen, number))
-            agree = _agreeing(model, effect.columns, own, problem.options.reject_sigma)
+            left = (equations.residual * model.weight)[own]
+            left = left + effect.columns[own] @ least_absolute(effect.columns[own], left)
+            agree = np.abs(left) <= problem.options.reject_sigma
             if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
                 return chosen, None
             agreeing[own] = agree
@@ -365,14 +363,3 @@ def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | No
     each = offsets.log_evidence_with_each(at)
     best = int(np.argmax(each))
     return int(chosen[best]) if each[best] > offsets.log_evidence(at) else None
-
-
-def _agreeing(model: Linearised, columns: Array, rows: Indices, reject_sigma: float) -> Mask:
-    """(N,) which of the rows one offset brings within the bound, by least absolute deviations."""
-    own = columns[rows][:, np.any(columns[rows] != 0.0, axis=0)]
-    residual = (model.equations.residual * model.weight)[rows]
-    left = residual
-    for _ in range(20):
-        sizes = 1.0 / np.sqrt(np.maximum(np.abs(left), 1.0))
-        left = residual - own @ np.linalg.lstsq(own * sizes[:, None], residual * sizes, rcond=1e-9)[0]
-    return np.asarray(np.abs(left) <= reject_sigma)

@@ -25,24 +25,26 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import log_f_tail
+from ceres_cal.effects.dependence import measure_scatter, scattered
+from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.costs import robust_weights
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import moved, natural_sizes, values_of
-from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
+from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.stated import (
     LEVEL,
     Conflict,
     Statement,
     WaldTest,
+    agreed,
     contradicted,
     contradicting,
+    doubted,
     grouped,
     statements,
 )
@@ -51,9 +53,6 @@ LARGEST_FREEDOM = 1e6
 """Degrees of freedom that count as infinitely many."""
 _LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
 _STATED = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
-# Of a standard deviation, and at most of a number's natural size, to either side, for the slope of the cost along what
-# is held.
-_STEP, _MOST_STEP = 0.1, 1e-3
 
 
 class Rest(NamedTuple):
@@ -65,7 +64,7 @@ class Rest(NamedTuple):
     freedom: float
 
 
-def linear_rest(statement: Statement, end: RobustSolution, observations: Observations) -> Rest:
+def linear_rest(statement: Statement, end: RobustSolution) -> Rest:
     """By the linear picture where the problem with the statement was solved."""
     estimate, freedom = end.solution.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
@@ -80,7 +79,7 @@ def linear_rest(statement: Statement, end: RobustSolution, observations: Observa
     else:
         freed = statement.left_out(end.problem, estimate)
         rest = information(freed, estimate).shared.marginal(statement.keys)
-        slope = -_slopes(end.problem, observations, estimate, rest)
+        slope = -_slopes(freed, estimate, statement.keys)
         step = rest.inverse @ slope
     # It swells the noise that the rest is measured by, as far as the linear picture goes.
     noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
@@ -106,40 +105,27 @@ def _roots(stated: Array, least: float) -> tuple[Array, Array]:
     return size * vectors * root, vectors / root / size
 
 
-def _slopes(problem: Problem, observations: Observations, estimate: Estimate, rest: Information) -> Array:
-    """Derivative of the cost by what is held, everything else where it is."""
-    weighting = problem.weighting
-    sigmas = (
-        weighting.point_scale * observations.points.sigma_px[:, None],
-        weighting.curve_scale * observations.curves.sigma_px,
-    )
-
-    def standardised(there: Estimate) -> tuple[Array, Array]:
-        seen = residuals(observations, problem.sights, there, problem.feet)
-        return np.nan_to_num(seen.points / sigmas[0]), np.nan_to_num(seen.curves / sigmas[1])
-
-    points, curves = standardised(estimate)
-    weights = robust_weights(weighting, np.concatenate([np.sum(points**2, axis=1), curves**2]))
-    points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
-    slopes, sizes = [], natural_sizes(estimate, rest.keys)
-    for number, stated in enumerate(np.diagonal(rest.matrix)):
-        if not stated > 0.0:  # the rest says nothing of it
-            slopes.append(0.0)
-            continue
-        step = np.zeros(len(rest.keys))
-        step[number] = min(_STEP / np.sqrt(stated), _MOST_STEP * sizes[number])
-        above, below = (standardised(moved(estimate, rest.keys, sign * step)) for sign in (1.0, -1.0))
-        change = np.sum(points * (above[0] - below[0])) + curves @ (above[1] - below[1])
-        slopes.append(float(change) / (2.0 * step[number]))
-    return np.array(slopes)
+def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """Derivative of the cost by what was held of a camera, everything else where it is."""
+    name = keys[0].owner
+    own = freed.sights.of_camera(name)
+    if not len(own):
+        return np.zeros(len(keys))
+    gradient = normals_with_residuals(own, freed, estimate)[:, -1, :-1].sum(axis=0)
+    every = [intrinsic_keys(name, estimate.cameras[name].lens)[number] for number in freed.layout.free[name]]
+    return np.asarray(gradient[[every.index(key) for key in keys]])
 
 
-def rest_at(statement: Statement, end: RobustSolution) -> Rest:
-    """Where a problem without the statement was solved."""
+def rest_at(statement: Statement, end: RobustSolution, observations: Observations | None = None) -> Rest:
+    """Where a problem without the statement was solved; with the observations, as these scatter."""
     estimate = end.solution.estimate
     reduced = end.reduced or information(end.problem, estimate)
     freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
-    return Rest(estimate, np.zeros(len(statement.keys)), reduced.shared.marginal(statement.keys), freedom)
+    scatter = None
+    if observations is not None:
+        scatter = measure_scatter(observations, end.problem, end.residuals, estimate, reduced)
+    known = scattered(reduced, scatter).marginal(statement.keys)
+    return Rest(estimate, np.zeros(len(statement.keys)), known, freedom)
 
 
 def worst_test(statement: Statement, rest: Rest) -> WaldTest:
@@ -191,9 +177,9 @@ def log_probability(squared: float, rest: Rest) -> float:
     return float(log_f_tail(squared / rank, rank, max(rest.freedom, 1.0)))
 
 
-# Probability of a linear picture from which on it is worth another solve: 2.5 sigma.
-_SUSPICIOUS = 0.0124
-_MOST = 4  # solves
+# Probability of a linear picture from which on it is worth another solve: 2.2 sigma, where one in twenty is wrong.
+_SUSPICIOUS = 0.028
+_DOUBTFUL = 0.05  # probability that a statement is wrong, from which on both explanations are named
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
@@ -202,34 +188,67 @@ class Conflicts:
     """What contradicts what, and how the numbers move with each of it.
 
     Attributes:
-        every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when a
-            statement in conflict is left out.
+        every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when
+            statements in conflict are left out, or are not.
+        answer: without what was stated and is contradicted; None where the answer stays.
+        doubts: priors that look wrong, and are too likely right to be set aside.
     """
 
     every: tuple[Conflict, ...] = ()
     keys: tuple[Key, ...] = ()
     shifts: tuple[Array, ...] = ()
+    answer: RobustSolution | None = None
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """One line of each."""
+        return (*(one.words for one in self.every), *(one.words for one in self.doubts))
+
+
+class Doubt(NamedTuple):
+    """That a prior may be wrong: its numbers, how probable that is, (K,) by how much everything moves without it."""
+
+    keys: tuple[Key, ...]
+    probability: float
+    shift: Array
+    words: str
 
 
 @numerical("the test of what was stated")
 def find_conflicts(
-    problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None = None
+    problem: Problem,
+    observations: Observations,
+    end: RobustSolution,
+    usual: tuple[float, float] | None = None,
+    part: Problem | None = None,
 ) -> Conflicts:
     """Everything stated that the rest contradicts, the worst first, each with those before it left out.
 
     Args:
         problem: of all the observations. end: its solution. usual: noise scales that were seen before.
+        part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
+            without an outlier; None where the answer stays.
     """
+    most = 4  # solves
     every = tuple(statements(problem, observations, end.solution.estimate))
     if not every:
         return Conflicts()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     search = _ForwardSelection(problem, end, observations, usual, every)
-    while search.solves < _MOST and search.leave_out_the_worst():
+    while search.solves < most and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
-    shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.shifts]
-    return Conflicts((*(one for _, one in pairs), *search.conflicts()), reduced.shared.keys, tuple(shifts))
+    named = (*(one for _, one in pairs), *search.conflicts())
+    priors, answer = agreed(problem.priors, named), None
+    if part is not None and priors != problem.priors:
+        answer = _solved(replace(part, priors=priors), observations, search.end, usual)
+    if answer is None:
+        shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.places[1:]]
+    else:
+        moved = difference(answer.solution.estimate, end.solution.estimate, reduced.shared.keys)
+        shifts = [place - moved for place in search.places[:-1]]
+    return Conflicts(named, reduced.shared.keys, tuple(shifts), answer, tuple(search.doubts))
 
 
 def without_suspicious(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
@@ -240,7 +259,7 @@ def without_suspicious(problem: Problem, observations: Observations, end: Robust
     for one in statements(problem, observations, estimate):
         if one.kind in ("earlier", "tolerance"):
             continue
-        if worst_test(one, linear_rest(one, end, observations)).log_p < np.log(_SUSPICIOUS):
+        if worst_test(one, linear_rest(one, end)).log_p < np.log(_SUSPICIOUS):
             problem = one.left_out(problem, estimate)
     return problem
 
@@ -269,6 +288,24 @@ def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
     return np.asarray(covariance[:, column] / covariance[column, column] * offset)
 
 
+def _wrong(squared: float) -> float:
+    """Probability that a statement so far off is wrong, which one in twenty is: as of a line that lies aside."""
+    scatter = 1.0 + FEATURE_ASIDE.scatter**2
+    right, *others = FEATURE_ASIDE.probabilities * np.exp(0.5 * squared * (1.0 - 1.0 / scatter)) / np.sqrt(scatter)
+    return float(np.sum(others) / (right + np.sum(others)))
+
+
+def _solved(
+    problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
+) -> RobustSolution | None:
+    """The problem solved from where another one ended; None where it cannot be."""
+    try:
+        after = solve_robustly(problem, observations, end.solution.estimate, usual)
+    except CalibrationError:  # quiet: the linear test decides, and the answer stays
+        return None
+    return None if after.solution.failed else after
+
+
 @dataclass(eq=False)
 class _ForwardSelection:
     """Forward selection: the worst statement is left out, then the worst of the others.
@@ -276,7 +313,8 @@ class _ForwardSelection:
     Attributes:
         problem, end: without what was left out. left: statements that are not judged yet.
         out: those in conflict, their tests, and names of others that may be wrong in their place.
-        shifts: see `Conflicts`.
+        doubts: see `Conflicts`. places: (K,) from the first end: it, ends without statements, and where rivals that are
+            left out would lead.
     """
 
     problem: Problem
@@ -288,13 +326,14 @@ class _ForwardSelection:
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
         self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
-        self.shifts: list[Array] = []
+        self.doubts: list[Doubt] = []
         self._level = float(np.log(LEVEL / len(self.every)))
         self._first = self.end.reduced or information(self.end.problem, self.end.solution.estimate)
+        self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.solution.estimate
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
-        tests = [worst_test(one, linear_rest(one, self.end, self.observations)) for one in self.left]
+        tests = [worst_test(one, linear_rest(one, self.end)) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
         if number < 0 or tests[number].log_p > np.log(_SUSPICIOUS):
             return False
@@ -303,16 +342,21 @@ class _ForwardSelection:
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.solution.estimate)
-        after = None if suspect.kind == "earlier" else self._solved(freed)
+        after = None if suspect.kind == "earlier" else _solved(freed, self.observations, self.end, self.usual)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
+            likely = _wrong(test.squared)
+            if after is not None and suspect.kind == "prior" and likely > _DOUBTFUL:
+                shift = difference(after.solution.estimate, self.end.solution.estimate, self._first.shared.keys)
+                words = doubted(suspect, test, len(self.every) == 1, likely)
+                self.doubts.append(Doubt(suspect.keys, likely, shift, words))
             return True
         self.out.append((suspect, test, [one.name for one, _ in rivals]))
-        self.shifts += [_along(self._first, t.key, t.seen[0] - t.stated[0]) for _, t in rivals]
+        here = self.places[-1]
+        self.places += [here + _along(self._first, t.key, t.seen[0] - t.stated[0]) for _, t in rivals]
         if after is not None:
-            start = GaussianPrior.about(Information.nothing(self._first.shared.keys), self.end.solution.estimate)
-            self.shifts.append(start.offsets(after.solution.estimate))
+            self.places.append(difference(after.solution.estimate, self._start, self._first.shared.keys))
             self.problem, self.end = freed, after
         return True
 
@@ -322,25 +366,18 @@ class _ForwardSelection:
         found = []
         for number, (statement, test, rivals) in enumerate(self.out):
             if number < len(self.out) - 1 and statement.kind != "earlier":
-                test = worst_test(statement, rest_at(statement, self.end))
+                test = worst_test(statement, rest_at(statement, self.end, self.observations))
             if test.log_p <= self._level:
                 found.append(contradicted(statement, test, alone, rivals))
         return found
-
-    def _solved(self, problem: Problem) -> RobustSolution | None:
-        """The problem solved from where the last one ended; None where it cannot be."""
-        try:
-            after = solve_robustly(problem, self.observations, self.end.solution.estimate, self.usual)
-        except CalibrationError:  # quiet: the linear test decides
-            return None
-        return None if after.solution.failed else after
 
     def _confirmed(self, statement: Statement, after: RobustSolution) -> WaldTest:
         """The test where the problem without the statement was solved. In a bent valley the least squares themselves
         say how far apart the two are: by how much they rise, over the same observations, when the statement is added.
         """
         rest = rest_at(statement, after)
-        test = worst_test(statement, rest)
+        alone = worst_test(statement, rest)
+        test = worst_test(statement, rest_at(statement, after, self.observations))
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
         try:
@@ -348,7 +385,8 @@ class _ForwardSelection:
         except CalibrationError:  # quiet: the linear test decides
             return test
         rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
-        if rise >= test.squared or len(statement.priors) > 1:
+        if rise >= alone.squared or len(statement.priors) > 1:
             return test
-        share = float(np.sqrt(rise / test.squared))
-        return test._replace(squared=rise, log_p=log_probability(rise, rest), sigmas=test.sigmas * share)
+        share = rise / alone.squared
+        squared, sigmas = share * test.squared, test.sigmas * share**0.5
+        return test._replace(squared=squared, log_p=log_probability(squared, rest), sigmas=sigmas)

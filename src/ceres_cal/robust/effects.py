@@ -19,7 +19,7 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
-from ceres_cal.effects.linearised import equation_weights, make_linear_model
+from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
@@ -29,8 +29,6 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
-# Probability below which an effect is nothing: by as much of its amounts' variance nothing is visibly wider.
-_NEGLIGIBLE = 0.01
 _MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
 
 
@@ -110,9 +108,7 @@ class _Amounts:
         equations = write_equations(observations, problem.sights, estimate, end.residuals)
         along = np.sum(off[equations.observation] * equations.direction, axis=1)
         equations = replace(equations, residual=equations.residual - along)
-        taking_part = end.inliers.points, end.inliers.curves
-        weights = equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
-        model = make_linear_model(problem, estimate, equations, weights)
+        model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))
         case = Case(observations, problem, estimate, model)
         groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
         for effect in estimated():
@@ -179,12 +175,14 @@ class _Amounts:
 
     def shifts(self) -> Iterator[Array]:
         """(K,) each, see `EffectsEnd`."""
+        # Probability below which an effect is nothing: by as much of its amounts' variance nothing is visibly wider.
+        negligible = 0.01
         amounts, covariance = self._best
         yield from shifts_by(self.taken, covariance)
         for number, group in enumerate(self.groups):
             (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
             if probability > LIKELY:
                 yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
-            elif probability > _NEGLIGIBLE:
+            elif probability > negligible:
                 alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))
                 yield from np.sqrt(probability) * shifts_by(taken, open_ + np.outer(alone, alone))

@@ -215,12 +215,8 @@ def _features(observations: Observations, owner: Indices, frames: Indices) -> Fe
     )
 
 
-_MOST_OTHERS = 16  # views besides, which tell the lens
-_MOST_TOGETHER = 256  # groups, at the cube of the number: 8 views of a field of 32 lines; 1350 took 25 s
-_MOST_ROWS = 40  # of a group in one view
 # Share of a group's observations in use below which it is compared in any case: its other rows are good by chance.
 _LEFT = 0.5
-_MOST_REJECTED = 4  # such groups of a kind, whose views are asked
 # Observations that are asked, and views of them: what the free numbers take up is projected out of the few rows that
 # are compared, so a solve has but to end in the right valley.
 _MOST_ASKED, _FEWEST_ASKED = 200_000, 200
@@ -252,6 +248,7 @@ class Subproblem:
 
 def compared_part(every: Subproblem) -> Subproblem:
     """All observations, or of very many some: of views that stand out, and of others evenly."""
+    most_rejected = 4  # such groups of a kind, whose views are asked
     observations, sights = every.observations, every.problem.sights
     if len(sights.point_rows) + len(sights.curve_rows) <= _MOST_ASKED:
         return every
@@ -262,7 +259,7 @@ def compared_part(every: Subproblem) -> Subproblem:
     chosen = _some_views(np.bincount(view[there], minlength=len(observations.views)))
     for groups in every.kinds:
         gone = mostly_rejected(groups, every.end, there)
-        worst = np.argsort(-gone, kind="stable")[: min(_MOST_REJECTED, np.count_nonzero(gone))]
+        worst = np.argsort(-gone, kind="stable")[: min(most_rejected, np.count_nonzero(gone))]
         chosen |= views_compared(observations, groups, every.end, there, groups.among(worst) & there)
     there &= chosen[view]
     rows = np.flatnonzero(there)[:: max(1, int(np.count_nonzero(there)) // (2 * _MOST_ASKED))]
@@ -313,6 +310,7 @@ def views_compared(
     observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
 ) -> Mask:
     """(V,) those with what is recalled, those that stand out, some of the others, and some without any group."""
+    most_others = 16  # views besides, which tell the lens
     view = column_of(observations, "view")
     shows_some = np.bincount(view[taking_part & (groups.of >= 0)], minlength=len(observations.views))
     largest, most = groups.standing_out(end, taking_part), groups.most_views
@@ -321,7 +319,7 @@ def views_compared(
     chosen[distinct(view[recalled])[:most]] = True
     chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: most // 2]] = True
     chosen[with_some[:: max(1, 2 * len(with_some) // most)]] = True
-    chosen[others[:: max(1, len(others) // _MOST_OTHERS)]] = True
+    chosen[others[:: max(1, len(others) // most_others)]] = True
     return chosen
 
 
@@ -332,13 +330,14 @@ def groups_compared(
 
     Of very many those that are recalled, those that stand out, and others evenly.
     """
+    most_together = 256  # groups, at the cube of the number: 8 views of a field of 32 lines; 1350 took 25 s
     every = np.flatnonzero(groups.count(rows) >= FEWEST)
-    if len(every) <= _MOST_TOGETHER:
+    if len(every) <= most_together:
         return every, 1.0
     standing_out = every[np.argsort(-excess(observations, groups, end, rows)[every], kind="stable")]
-    some = every[:: -(-2 * len(every) // _MOST_TOGETHER)]
+    some = every[:: -(-2 * len(every) // most_together)]
     back = np.intersect1d(every, np.array(recalled, dtype=np.int64))
-    chosen = distinct(np.concatenate([back, standing_out[: _MOST_TOGETHER // 2], some]))
+    chosen = distinct(np.concatenate([back, standing_out[: most_together // 2], some]))
     return chosen, len(chosen) / len(every)
 
 
@@ -389,8 +388,9 @@ def _largest(observations: Observations, end: RobustSolution) -> Array:
 
 def _thinned(rows: Indices, key: Indices, of_group: Mask) -> Indices:
     """Of rows with the same key some, evenly, where they are of a group."""
+    most_rows = 40  # of a group in one view
     order = np.argsort(key, kind="stable")
     _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
     place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)
-    most = np.where(of_group[order], np.minimum(size, _MOST_ROWS), size)
+    most = np.where(of_group[order], np.minimum(size, most_rows), size)
     return np.asarray(rows[order[(place * most) // size != ((place - 1) * most) // size]])

@@ -1,4 +1,11 @@
-"""Other minima of few observations: where a solve ends that begins at another phi, or where a start may be as well.
+"""Other minima than the one that a solve ends in.
+
+A small or distant board looks almost the same tilted either way, and each of the two mirrored poses of its plane has a
+minimum of its own. Which is the lower one can only be told by trying both; they are tried where they compete, that is,
+where perspective is too weak to have decided at the start.
+
+A start that is far off leaves most of a board's corners outside the rejection bound, and what is rejected pulls no
+more. With the lens solved from the other boards, four good corners pose a lost one by consensus.
 
 A floor seen by few points and lines may be explained from two places, by two lenses; a start cannot tell which of the
 minima is the least, nor that there are two.
@@ -6,52 +13,188 @@ minima is the least, nor that there are two.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.observations import Observations
-from ceres_cal.problem.bundle import Solution, solve
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.problem.bundle import Solution, placement_costs, solve
 from ceres_cal.problem.information import Information
+from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import difference, natural_sizes
-from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.start.closed_forms import pose_from_homography
+from ceres_cal.start.planes import consensus_homography
 
-_FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
-_FACTORS = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
-_MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hundreds that change nothing here
+# Perspective that bends a view by so many standard deviations leaves no doubt. Of 200 small boards none stays
+# mirrored from 12 to 200, four do at 0; of 20 000, six did at 50.
+_DECIDED_SIGMA = 100.0
+# Of rotations and metres: the two minima of a plane are degrees apart, rounding is not. Nothing changes from half to
+# double.
+_SAME = 1e-3
+# Squared standard deviations: ten of them decide, whatever the lens still does. Nothing changes from half to double.
+_MUCH_WORSE = 100.0
+
+
+def without_mirrored_poses(
+    problem: Problem, estimate: Estimate, among: frozenset[SightKey]
+) -> tuple[Estimate, int, frozenset[SightKey]]:
+    """The estimate with private placements in the better one of their two poses.
+
+    Args:
+        among: keys of the sights that are tried.
+
+    Returns:
+        The estimate, how many placements were changed, and the keys of those whose other pose is not much worse.
+    """
+    sights, weighting = problem.sights, problem.weighting
+    changed, undecided = 0, frozenset[SightKey]()
+    for camera in estimate.cameras:
+        own = [number for number in sights.numbers(camera, placements=problem.private) if sights.keys[number] in among]
+        if own:
+            estimate, count, open_ones = _with_better_poses(sights.take(np.array(own)), estimate, weighting)
+            changed, undecided = changed + count, undecided | open_ones
+    return estimate, changed, undecided
+
+
+def _with_better_poses(
+    sights: Sights, estimate: Estimate, weighting: Weighting
+) -> tuple[Estimate, int, frozenset[SightKey]]:
+    poses = estimate.pose_stack(sights.keys)
+    ambiguous = _ambiguous(sights, poses, estimate, weighting)
+    if not len(ambiguous):
+        return estimate, 0, frozenset()
+    few = sights.take(ambiguous)
+    twice = np.concatenate([poses[ambiguous], mirrored(few, poses[ambiguous])])
+    costs, poses = placement_costs(sights.take(np.tile(ambiguous, 2)), estimate, weighting, twice)
+    (as_is, other), (posed, turned) = np.split(costs, 2), np.split(poses, 2)
+    better = np.flatnonzero(other < as_is * (1.0 - 1e-6))
+    two = np.max(np.abs(turned - posed), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
+    close = np.flatnonzero(two & (np.abs(other - as_is) < _MUCH_WORSE))
+    undecided = frozenset(few.keys[i] for i in close)
+    if not len(better):
+        return estimate, 0, undecided
+    return estimate.with_placements([few.keys[i] for i in better], turned[better]), len(better), undecided
+
+
+def _boxes(sights: Sights) -> tuple[Array, Array]:
+    """Middle (S, 3) and half diagonal (S,) of the box around each sight's points; every sight has some."""
+    starts = sights.point_bounds[:-1]
+    low, high = np.minimum.reduceat(sights.points, starts), np.maximum.reduceat(sights.points, starts)
+    return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+
+
+def _ambiguous(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Indices:
+    """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
+    cos(tilt), against the noise.
+    """
+    seen = np.flatnonzero(np.diff(sights.point_bounds) >= 4)
+    if not len(seen):
+        return seen
+    few, pose = sights.take(seen), poses[seen]
+    centres, reach = _boxes(few)
+    middle = np.einsum("sij,sj->si", pose[:, :, :3], centres) + pose[:, :, 3]
+    distance = np.linalg.norm(middle, axis=1)
+    cosine = np.abs(np.sum(pose[:, :, 2] * middle, axis=1)) / distance
+    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+    phi = estimate.cameras[sights.keys[0].camera].phi
+    bend_px = phi * (reach / distance) ** 2 * sine * cosine
+    sigma_px = weighting.point_scale * np.minimum.reduceat(few.sigma_px, few.point_bounds[:-1])
+    return np.asarray(seen[bend_px < _DECIDED_SIGMA * sigma_px])
+
+
+def mirrored(sights: Sights, poses: Array) -> Array:
+    """cam_from_target (S, 3, 4) with the depth of each target's points reversed about its middle, along the line of
+    sight: R' = (1 - 2 d d^T) R diag(1, 1, -1), a rotation again.
+    """
+    centres, _ = _boxes(sights)
+    middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
+    d = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    reflect = np.eye(3) - 2.0 * d[:, :, None] * d[:, None, :]
+    rotations = reflect @ poses[:, :, :3] @ np.diag([1.0, 1.0, -1.0])
+    translations = middle - np.einsum("sij,sj->si", rotations, centres)
+    return np.concatenate([rotations, translations[:, :, None]], axis=2)
+
+
+# Share of a sight's observations; with less of them in use its pose was not understood. Of 40 boards before a
+# fisheye, 30 % outliers, 9 end in a wrong pose, 19 at 0.33; nothing changes at 0.67.
+_LOST = 0.5
+# Points that a consensus is sought among: four make a pose, two more agree by chance hardly ever. Nothing changes
+# from half to double.
+_FEWEST = 6
+
+
+def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimate) -> tuple[Estimate, int]:
+    """The estimate with lost private placements posed again where that lowers their cost, and how many were.
+
+    Args:
+        problem: of all observations, those rejected too, weighted with a loss that bears outliers.
+    """
+    sights, weighting, count = problem.sights, problem.weighting, 0
+    for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):
+        sight = sights[int(number)]
+        pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in problem.private else None
+        if pose is None:
+            continue
+        as_is, _ = placement_costs(sight, estimate, weighting, estimate.pose_stack(sight.keys))
+        tried = [placement_costs(sight, estimate, weighting, p) for p in (pose, mirrored(sight, pose))]
+        cost, best = min(tried, key=lambda one: float(one[0][0]))
+        if cost[0] < 0.99 * as_is[0]:
+            estimate = estimate.with_placements(sight.keys, best)
+            count += 1
+    return estimate, count
+
+
+def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Array | None:
+    """cam_from_target (1, 3, 4) that most points agree on, or None."""
+    camera = estimate.cameras[sight.key.camera]
+    rays = camera.rays(sight.pixels)
+    ahead = rays[:, 2] > 0.0  # NaN is not
+    points, rays = sight.points[ahead], rays[ahead]
+    if len(points) < _FEWEST or np.ptp(points[:, 2]) > 1e-9:
+        return None
+    ideal = np.column_stack([camera.phi * rays[:, :2] / rays[:, 2:], np.ones(len(rays))])
+    limit_px = max(5.0 * weighting.point_scale * median(sight.sigma_px), 1.0)
+    homography = consensus_homography(points[:, :2], ideal, limit_px)
+    if homography is None:
+        return None
+    pose = pose_from_homography(homography, camera.phi)
+    translation = pose.translation - points[0, 2] * pose.rotation[:, 2]
+    return np.column_stack([pose.rotation, translation])[None]
+
+
+FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
 # Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
 _OTHER = 0.25
 _APART = 0.05  # of the height: places that are no farther apart are one valley, which the standard deviations show
-_ALIKE = 0.01  # of natural sizes: two solves that ended no farther apart are one minimum
-_LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
 
 
 def least_of_few(
-    problem: Problem, observations: Observations, end: RobustSolution, elsewhere: Sequence[Estimate] = ()
-) -> tuple[RobustSolution, tuple[Solution, ...]]:
-    """The end of all rounds in the least minimum that is found from there, and others, with what they cost beyond it;
-    where all observations are inliers.
+    problem: Problem, estimate: Estimate, elsewhere: Sequence[Estimate] = ()
+) -> tuple[Estimate, tuple[Solution, ...]]:
+    """The estimate in the least minimum that is found from there, and others, with what they cost beyond it; of very
+    many observations the estimate as it is.
 
     Args:
-        problem: of all the observations. end: of its rounds. elsewhere: starts that showed the observations alike.
+        problem: of all the observations, none of which was taken out: that belongs to the minimum it was judged in.
+            elsewhere: starts that showed the observations alike.
     """
-    count = end.problem.sights.equations
-    if count >= _FEW or count < problem.sights.equations:  # what was taken out belongs to the minimum it was judged in
-        return end, ()
-    least = solve(end.problem, end.solution.estimate)
-    others = list(_ends(end.problem, (*_at_other_phi(end.problem, least.estimate), *elsewhere)))
+    lower = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
+    if problem.sights.equations >= FEW:
+        return estimate, ()
+    least = solve(problem, estimate)
+    starts = (*_at_other_phi(problem, least.estimate), *elsewhere)
+    others = [end for start in starts if (end := solved_soon(problem, start, is_near=False)) is not None]
     lowest = min(others, key=lambda one: one.cost, default=least)
-    if 2.0 * (least.cost - lowest.cost) > _LOWER:
+    if 2.0 * (least.cost - lowest.cost) > lower:
         others.append(least)
-        least = solve(end.problem, lowest.estimate)
-        end = replace(end.moved_to(least.estimate, observations, problem), reduced=None)
-    return end, tuple(replace(one, cost=one.cost - least.cost) for one in others)
+        least = solve(problem, lowest.estimate)
+        estimate = least.estimate
+    return estimate, tuple(replace(one, cost=one.cost - least.cost) for one in others)
 
 
 def minima_of(
@@ -64,13 +207,14 @@ def minima_of(
         others: with what they cost beyond the estimate. information: by the model, about the K numbers.
         half_width: standard deviations from the middle to an end of an interval.
     """
+    alike = 0.01  # of natural sizes: two solves that ended no farther apart are one minimum
     sizes = natural_sizes(estimate, information.keys)
-    shifts: list[Array] = []
-    odds: list[float] = []
+    shifts, odds = list[Array](), list[float]()
+    here = np.zeros(len(sizes))
     for one in sorted(others, key=lambda other: other.cost):
         shift = difference(one.estimate, estimate, information.keys)
         least = min(half_width**2, _OTHER * float(shift @ information.matrix @ shift))
-        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > _ALIKE for d in shifts):
+        if 2.0 * one.cost < least and all(np.max(np.abs(shift - d) / sizes) > alike for d in (here, *shifts)):
             shifts.append(shift)
             odds.append(float(np.exp(-max(one.cost, 0.0))))
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
@@ -96,18 +240,23 @@ def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float
                 break
 
 
-def _ends(problem: Problem, starts: Iterable[Estimate]) -> Iterator[Solution]:
-    """Where solves end; the same minimum may come again."""
-    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
-    for start in starts:
-        with suppress(CalibrationError):  # quiet: nothing is seen from there, so no minimum is
-            solution = solve(replace(problem, options=short), start, is_near=False)
-            if not solution.failed:
-                yield solution
+def solved_soon(problem: Problem, start: Estimate, *, is_near: bool = True) -> Solution | None:
+    """Where a short solve ends; None where it finds nothing. Along a flat valley the solver creeps for hundreds of
+    iterations that change nothing here.
+    """
+    near = 1e-6  # of a variance: how nearly an end costs the least; by a thousandth of a standard deviation it is off
+    short = replace(problem.options, max_iterations=min(30, problem.options.max_iterations))
+    try:
+        precision = near / max(problem.equations, 1)
+        solution = solve(replace(problem, options=short), start, is_near=is_near, precision=precision)
+    except CalibrationError:  # quiet: nothing is seen from there, so no minimum is
+        return None
+    return None if solution.failed else solution
 
 
 def _at_other_phi(problem: Problem, estimate: Estimate) -> Iterator[Estimate]:
+    factors = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
-        for factor in _FACTORS:
+        for factor in factors:
             camera = estimate.cameras[name]
             yield replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})

@@ -13,7 +13,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.base.words import two_digits
 from ceres_cal.observations import Observations
-from ceres_cal.problem.information import Key
+from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
@@ -24,7 +24,6 @@ LEVEL = 1e-3
 word back, so it is as rare as a coin that falls on one side ten times."""
 _FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 1e-3: "km"}
 _STATED = {"prior": "stated", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
-_NEAR = 0.1  # relative: how near a unit must bring the two to be the likely cause
 
 
 @dataclass(frozen=True)
@@ -85,6 +84,17 @@ class Statement:
         names = " and ".join(key.quantity for key in self.keys)
         return f"the {_STATED[self.kind]} {names} of {self.keys[0].whose}"
 
+    @property
+    def spanning(self) -> GaussianPrior:
+        """One normal distribution with the moments of its priors, each as likely as any other."""
+        means, variances = [], []
+        for key in self.keys:
+            known = np.array([stated_value(prior, key) for prior in self.priors if key in prior.keys])
+            means.append(float(known[:, 0].mean()))
+            variances.append(float(np.mean(known[:, 1] ** 2 + (known[:, 0] - means[-1]) ** 2)))
+        sigmas = dict(zip(self.keys, np.sqrt(variances).tolist(), strict=True))
+        return GaussianPrior(Information.of_sigmas(sigmas), np.array(means))
+
     def left_out(self, problem: Problem, estimate: Estimate) -> Problem:
         """The problem without it."""
         if self.priors:
@@ -131,6 +141,24 @@ def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
     yield from groups
 
 
+def agreed(priors: Sequence[GaussianPrior], conflicts: Sequence[Conflict]) -> tuple[GaussianPrior, ...]:
+    """What is left of priors where some are in conflict: a statement that everything else contradicts is set aside as
+    an outlier is, and of those that contradict each other alone one is left that spans them.
+    """
+    left = list(priors)
+    disputed = {
+        kind: {(one.owner, one.quantity, one.unit) for one in conflicts if one.kind == kind}
+        for kind in ("prior", "priors")
+    }
+    for one in grouped(priors):
+        own = {key[1:] for key in one.keys if one.kind == "prior"}
+        is_wrong = bool(own & disputed["prior"])
+        if is_wrong or own & disputed["priors"]:
+            left = [prior for prior in left if prior not in one.priors]
+            left += [] if is_wrong else [one.spanning]
+    return tuple(left)
+
+
 def _held(options: Options, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
     """What the options hold by name, the principal point as one."""
     for name in observations.cameras:
@@ -166,12 +194,21 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
         alone: whether nothing but observations stands against it. rivals: names of other statements that may be wrong
             in its place.
     """
+    key, also = test.key, "".join(f", or else {one}" for one in rivals)
+    words = f"{_apart(statement, test, alone)}: {_in_another_unit(test)}correct or remove it{also}"
+    return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
+
+
+def doubted(statement: Statement, test: WaldTest, alone: bool, probability: float) -> str:
+    """A statement that is in doubt, in words."""
+    wrong = f"It may be wrong (probability {100.0 * probability:.0f} %)"
+    return f"{_apart(statement, test, alone)}. {wrong}. The stated uncertainties include this: measure again"
+
+
+def _apart(statement: Statement, test: WaldTest, alone: bool) -> str:
     key, who = test.key, "the observations alone say" if alone else "everything else says"
     about = f"{_STATED[statement.kind]} {key.quantity} of {key.whose}, {number_text(*test.stated, key)}"
-    apart = f"{who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
-    advice = f"{_in_another_unit(test)}correct or remove it{''.join(f', or else {one}' for one in rivals)}"
-    words = f"the {about}: {apart}: {advice}"
-    return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
+    return f"the {about}: {who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
 
 
 def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Conflict]]:
@@ -192,8 +229,9 @@ def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Confli
 
 def _in_another_unit(test: WaldTest) -> str:
     """The likely cause, where the two agree in another unit."""
+    near = 0.1  # relative: how near a unit must bring the two to be the likely cause
     if test.key.unit != "m" or not test.seen[0]:
         return ""
     ratio = test.stated[0] / test.seen[0]
-    units = [unit for factor, unit in _FACTORS.items() if abs(ratio / factor - 1.0) < _NEAR]
+    units = [unit for factor, unit in _FACTORS.items() if abs(ratio / factor - 1.0) < near]
     return f"is it in {units[0]}? Give metres; " if units else ""

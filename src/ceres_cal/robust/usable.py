@@ -10,11 +10,10 @@ pictures, too, turned about the principal point; residuals tell nothing of any o
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, distinct
+from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
@@ -25,14 +24,32 @@ from ceres_cal.problem.residuals import Residuals
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 
-if TYPE_CHECKING:
-    from ceres_cal.robust.competing import Explanation
-
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
 _NEARER = 0.5
 _LARGEST_M = 50.0  # of a target that somebody holds before a camera, from its origin
 _BELOW = 0.5  # of the camera's height over the floor: noise sinks a board by centimetres
+
+# Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
+# that is too simple stays below a few pixels. Nothing changes from half to double.
+_NO_FIT = 0.015
+
+
+def require_fits(end: RobustSolution, problem: Problem) -> None:
+    """Raise SolutionError where the solve failed, or its end explains too little."""
+    if end.solution.failed:
+        raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
+    points, curves = end.residuals.lengths
+    for name, camera in end.solution.estimate.cameras.items():
+        own = problem.sights.of_camera(name)
+        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
+        met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
+        met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
+        if 2 * met < len(own.point_rows) + len(own.curve_rows):
+            raise SolutionError(
+                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
+                "check labels, target dimensions and which lens it is"
+            )
 
 
 def require_possible(observations: Observations, sights: Sights, estimate: Estimate, residuals: Residuals) -> None:
@@ -136,8 +153,12 @@ def all_shown(camera: Camera, sights: Sights) -> bool:
     return all(bool(np.all(camera.lens.shows(pixels, camera.phi))) for pixels in places)
 
 
-def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
-    """Warnings about the solution; SolutionError where it must not be used."""
+def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]) -> tuple[str, ...]:
+    """Warnings about the solution; SolutionError where it must not be used.
+
+    Args:
+        wholes: (N + M,) of each the observations that were taken out as one.
+    """
     warnings = []
     for name, camera in end.solution.estimate.cameras.items():
         width, height = camera.image_size
@@ -164,7 +185,7 @@ def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
             f"observations reach {observed.reach_px:.0f} px"
         )
-    return (*warnings, *_lost(end.inliers, problem, explanations))
+    return (*warnings, *_lost(end.inliers, problem, wholes))
 
 
 def _is_of_smaller(camera: Camera, reach: Array, off_px: float) -> bool:
@@ -176,11 +197,11 @@ def _is_of_smaller(camera: Camera, reach: Array, off_px: float) -> bool:
     )
 
 
-def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:
+def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterator[str]:
     """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
     used = np.concatenate([inliers.points, inliers.curves])
-    for one in explanations:
-        used |= one.rows & one.is_taken
+    for rows in wholes:
+        used |= rows
     shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     for number in np.flatnonzero(shares < 0.5):
         out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"

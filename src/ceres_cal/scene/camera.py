@@ -32,9 +32,7 @@ from ceres_cal.scene.foreign import (
 )
 from ceres_cal.scene.lens import Lens
 
-_ALONG_AN_EDGE = 16  # steps along each side of the image
 _ACROSS = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
-_FAR_M = 10.0  # a height of as many metres, far over its camera, is one in millimetres
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,8 @@ class Camera:
         """
         if not isinstance(height_m, Real):
             raise InputError(f"height_m must be a number of metres, such as 0.15, not {height_m!r}")
-        if abs(height_m) > max(_FAR_M, 2.0 * abs(self.position[2])):
+        far_m = 10.0  # a height of as many metres, far over its camera, is one in millimetres
+        if abs(height_m) > max(far_m, 2.0 * abs(self.position[2])):
             raise InputError(
                 f"height_m {height_m:g} is in metres, and the camera's is {self.position[2]:.2f}: "
                 f"for {height_m:g} mm give {1e-3 * height_m:g}"
@@ -329,7 +328,8 @@ def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:
 @lru_cache(maxsize=64)
 def _along_edge(image_size: tuple[int, int]) -> Array:
     """(N, 2) places along an image's edge, px."""
-    along = np.linspace(-0.5, 0.5, _ALONG_AN_EDGE + 1)
+    along_an_edge = 16  # steps along each side of the image
+    along = np.linspace(-0.5, 0.5, along_an_edge + 1)
     ends = [np.full_like(along, end) for end in (-0.5, 0.5)]
     sides = [np.column_stack(one) for end in ends for one in ((along, end), (end, along))]
     size = np.array(image_size)

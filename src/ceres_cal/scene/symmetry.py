@@ -13,7 +13,6 @@ from ceres_cal.scene.targets import Target
 
 _SAME_M = 1e-6
 _PIECES = 32  # of a curve, whose ends have to lie on another one
-_MOST_TURNS = 12
 
 
 # ---- feature by feature ---------------------------------------------------------------------------------------------
@@ -53,9 +52,10 @@ def _is_along(curve: Curve, sent: Array, other: Curve) -> bool:
 
 def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
     """The turns about the upright through its middle that put the painted curves onto themselves; the first is none."""
+    most_turns = 12
     painted = _painted(target, curves)
     middle, samples = middle_of(target, curves), _samples(painted)
-    for count in range(_MOST_TURNS, 1, -1):
+    for count in range(most_turns, 1, -1):
         sent = _turn(2.0 * np.pi / count, middle).transform(samples)
         away = np.min([distance_to_curve(curve, sent) for curve in painted], axis=0)
         if np.max(away) < _SAME_M * max(1.0, float(np.max(np.abs(sent)))):

@@ -28,7 +28,6 @@ _WORKDAY = Disturbance(
 )
 """An ordinary day at the field: robots and people in the way, and one observation in twenty is wrong."""
 
-_PAPER = (1.07761103142178, -0.00096240306505, 0.00000401304361)
 _PAPER_PHI = 736.0
 """The paper's a1, a2, a3 (section 2), and a phi to go with them (the paper prints none): that of a 4.2 mm lens on a
 third-inch sensor of 780 x 580 pixels, 683 px at the centre, times a1."""
@@ -40,7 +39,8 @@ def _overhead_camera() -> Camera:
 
 
 def _camera_2004() -> Camera:
-    lens, phi = Radial.from_paper(*_PAPER, phi=_PAPER_PHI)
+    paper = (1.07761103142178, -0.00096240306505, 0.00000401304361)
+    lens, phi = Radial.from_paper(*paper, phi=_PAPER_PHI)
     return Camera((780, 580), phi, (392.3, 287.6), lens)
 
 

@@ -18,7 +18,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.scene import Scene, ViewPlan
 
-_MARGIN_PX = 5.0  # a board stays this far inside the image, so that noise moves no corner out
 _TRIES = 5_000
 
 
@@ -116,9 +115,10 @@ def board_pose(
 
 def well_inside(camera: Camera, points_world: Array) -> Mask:
     """(N,) whether points (N, 3) are before the camera, so far inside the image that noise keeps them there."""
+    margin_px = 5.0  # a board stays this far inside the image, so that noise moves no corner out
     pixels = camera.project(points_world)
     with np.errstate(invalid="ignore"):
-        inside = np.all((pixels >= _MARGIN_PX) & (pixels <= np.array(camera.image_size) - 1.0 - _MARGIN_PX), axis=1)
+        inside = np.all((pixels >= margin_px) & (pixels <= np.array(camera.image_size) - 1.0 - margin_px), axis=1)
     return np.asarray(inside & (camera.cam_from_world.transform(points_world)[:, 2] > 0.0))
 
 

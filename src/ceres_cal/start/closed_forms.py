@@ -20,12 +20,8 @@ from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
 from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies
 
-_POINT_NS = 100.0  # that a point's share of a homography takes
 # Medians of the errors: no clean residual is that long, nine standard deviations. Nothing changes at half of it.
 _WRONG = 8.0
-_NO_SECOND = 1e-6  # root of the second least eigenvalue: as small, and the null vector is one of many
-_SINGULAR = 1e-12
-_OF_A_PLANE = 8  # numbers of a homography
 
 
 @dataclass(frozen=True)
@@ -232,6 +228,7 @@ def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Arr
 
     The normalised DLT, reweighted to distances in the image, and against wrong labels where some points do not fit.
     """
+    point_ns = 100.0  # that a point's share of a homography takes
     homographies, errors = np.empty((len(data.bounds) - 1, 3, 3)), np.empty(len(data.plane))
     coefficients = np.array(profile.coefficients)
 
@@ -239,7 +236,7 @@ def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Arr
         bounds, part = data.bounds[first : last + 1], homographies[first:last]
         plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, _WRONG, part, errors)
 
-    run_parts(solve, parts_of(len(homographies), len(errors), _POINT_NS))
+    run_parts(solve, parts_of(len(homographies), len(errors), point_ns))
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
 
 
@@ -260,11 +257,13 @@ def fit_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array | N
     Returns:
         H, None where the lines cannot fix it; the median distance on the plane, in units of its size.
     """
+    singular = 1e-12
+    no_second = 1e-6  # root of the second least eigenvalue: as small, and the null vector is one of many
     fit = _LineFit.of(lines, image_points[None], rounds)
     inverse = fit.inverse[0] * np.copysign(1.0, median(fit.sent[0, :, 2]))
     typical = float(fit.typical[0])
     # More than one G fits, or one that sends the image to a line.
-    if fit.second[0] < _NO_SECOND**2 or abs(np.linalg.det(inverse)) < _SINGULAR:
+    if fit.second[0] < no_second**2 or abs(np.linalg.det(inverse)) < singular:
         return None, typical
     return np.asarray(np.linalg.inv(fit.plane_scale @ inverse @ fit.image_scale[0])), typical
 
@@ -294,6 +293,7 @@ class _LineFit:
     @classmethod
     def of(cls, lines: Array, image_points: Array, rounds: int) -> _LineFit:
         """Of image points (C, N, 3) on lines (N, 3)."""
+        of_a_plane = 8  # numbers of a homography
         plane_scale = np.array([1.0, 1.0, 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9)])
         reach = np.max(np.abs(image_points[:, :, :2]), axis=(1, 2))
         image_scale = np.column_stack([1.0 / reach, 1.0 / reach, np.ones_like(reach)])
@@ -301,7 +301,7 @@ class _LineFit:
         rows = (lines[:, :, None] * image_points[:, :, None, :]).reshape(*image_points.shape[:2], 9)
         weights = np.ones(image_points.shape[:2])
         # The middle of those that G's eight numbers cannot fit exactly: the median itself may be 0 beside what decides.
-        middle = min((len(lines) + _OF_A_PLANE) // 2, len(lines) - 1)
+        middle = min((len(lines) + of_a_plane) // 2, len(lines) - 1)
         for _ in range(rounds):
             values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
             inverse = vectors[:, :, 0].reshape(-1, 3, 3)

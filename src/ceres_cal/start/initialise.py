@@ -30,10 +30,8 @@ from ceres_cal.start.world import Placed, beforehand, placed
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
 of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
-_ENOUGH_VIEWS = 50  # for phi
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
-_LEAST_SD = 1e-3  # of phi, as a share: a start is no better
 
 
 @dataclass(frozen=True)
@@ -175,11 +173,12 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
 
 def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> tuple[float, float]:
     """Mean and standard deviation of log phi that a search of a sight begins with."""
+    least_sd = 1e-3  # of phi, as a share: a start is no better
     if told:
         return float(np.log(phi)), 0.0
     for prior in priors:
         if prior.quantity == "phi":
-            return float(np.log(prior.value[0])), max(prior.sigma[0] / prior.value[0], _LEAST_SD)
+            return float(np.log(prior.value[0])), max(prior.sigma[0] / prior.value[0], least_sd)
     return float(np.log(ANY_PHI[0] * unit)), ANY_PHI[1]
 
 
@@ -256,11 +255,12 @@ def _choose_phi(
     Where no view is tilted enough and nothing is known, a usual field of view is guessed; the bundle then says
     how little is known.
     """
+    enough_views = 50  # for phi
     if "phi" in options.fixed:
         return options.fixed["phi"], "fixed"
     known = [p for p in priors if p.quantity in ("phi", "height_m", "position_m")]
 
-    some = slice(None, None, max(1, len(homographies.matrices) // _ENOUGH_VIEWS))
+    some = slice(None, None, max(1, len(homographies.matrices) // enough_views))
 
     def cost(phi: Array) -> Array:
         error = orthogonality_error(homographies.matrices[some], phi) * homographies.sizes_px[some]

@@ -11,14 +11,13 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
 
-_MARGIN = 1.15  # of what a start takes for the edge of the picture: its profile is least sure there
 RADII = np.linspace(0.02, 1.0, 50)  # of the observed ones, at which lenses are compared
-_GRAZING = 0.02  # cosine of the angle at which a ray has no ideal radius any more
 
 
 def edge_over(camera: Camera, reach_px: float) -> float:
     """How many times as far out as its observations reach a camera's lens is asked about."""
-    return _MARGIN * max(1.0, camera.corner_radius / reach_px)
+    margin = 1.15  # of what a start takes for the edge of the picture: its profile is least sure there
+    return margin * max(1.0, camera.corner_radius / reach_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +49,10 @@ class LensProfile:
         Args:
             blank: with the values of the coefficients that are held.
         """
+        grazing = 0.02  # cosine of the angle at which a ray has no ideal radius any more
         r = self.radii_px
         with np.errstate(divide="ignore", invalid="ignore"):
-            ideal = np.where(np.cos(self.angles) > _GRAZING, phi * np.tan(self.angles), np.nan)
+            ideal = np.where(np.cos(self.angles) > grazing, phi * np.tan(self.angles), np.nan)
         columns, right = blank.start_equations(r, ideal, self.angles, phi)
         free = [i for i, name in enumerate(blank.names) if name in columns and name not in held]
         ahead = np.isfinite(right)

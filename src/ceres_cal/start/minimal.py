@@ -14,11 +14,6 @@ from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
-_FEW_ELEMENTS, _MOST_SETS = 9, 120  # of so few all sets of four are taken, else so many at random
-_LEVEL = 1e-9
-_SECOND = 1e-4  # of the greatest singular value: where the second least is smaller, the four make no homography
-_SPREAD = 1e-6  # of an image line's rows, below which they are one place
-
 
 def minimal_sets(lines: Sightlines, log_phi: Array) -> Candidates:
     """Cameras by four points or lines of the floor each.
@@ -26,6 +21,7 @@ def minimal_sets(lines: Sightlines, log_phi: Array) -> Candidates:
     Args:
         log_phi: (P,) among which that of each is chosen.
     """
+    second = 1e-4  # of the greatest singular value: where the second least is smaller, the four make no homography
     floor, image, is_line = _elements(lines)
     if len(floor) < 4:
         return Candidates.none()
@@ -37,7 +33,7 @@ def minimal_sets(lines: Sightlines, log_phi: Array) -> Candidates:
     _, sizes, vectors = np.linalg.svd(rows)
     matrices = vectors[:, -1].reshape(-1, 3, 3)
     matrices = np.linalg.inv(to_image) @ matrices @ to_floor
-    good = (sizes[:, -2] > _SECOND * sizes[:, 0]) & (np.abs(np.linalg.det(to_image @ matrices)) > 1e-12)
+    good = (sizes[:, -2] > second * sizes[:, 0]) & (np.abs(np.linalg.det(to_image @ matrices)) > 1e-12)
     return _cameras(matrices[good], lines, log_phi)
 
 
@@ -67,20 +63,22 @@ def _floor(lines: Sightlines) -> float:
 
 def _elements(lines: Sightlines) -> tuple[Array, Array, Mask]:
     """Points and straight lines of the floor (E, 3), as they are seen (E, 3), and which are lines (E,)."""
+    spread = 1e-6  # of an image line's rows, below which they are one place
+    level = 1e-9
     height, seen = _floor(lines), np.column_stack([lines.pixels, lines.w])
     floor, image, is_line = [], [], []
-    for row in np.flatnonzero(np.abs(lines.places[: lines.counts[0], 2] - height) < _LEVEL):
+    for row in np.flatnonzero(np.abs(lines.places[: lines.counts[0], 2] - height) < level):
         floor.append([*lines.places[row, :2], 1.0])
         image.append(seen[row])
         is_line.append(False)
     arcs = 2 * lines.counts[0] + lines.counts[1]
     for first, last in lines.spans:
         place, along = lines.places[first], lines.along[first]
-        if first >= arcs or abs(place[2] - height) > _LEVEL or abs(along[2]) > _LEVEL * np.linalg.norm(along):
+        if first >= arcs or abs(place[2] - height) > level or abs(along[2]) > level * np.linalg.norm(along):
             continue
         scaled = seen[first:last] / [lines.unit_px, lines.unit_px, 1.0]
         _, sizes, vectors = np.linalg.svd(scaled, full_matrices=True)
-        if len(scaled) < 2 or sizes[1] < _SPREAD * sizes[0]:
+        if len(scaled) < 2 or sizes[1] < spread * sizes[0]:
             continue
         normal = np.array([-along[1], along[0]])
         floor.append([*normal, -normal @ place[:2]])
@@ -109,7 +107,8 @@ def _skew(v: Array) -> Array:
 
 def _drawn(count: int) -> Indices:
     """(S, 4) sets of four of so many: all, or some at random, alike in every run."""
-    if count <= _FEW_ELEMENTS:
+    few_elements, most_sets = 9, 120  # of so few all sets of four are taken, else so many at random
+    if count <= few_elements:
         return np.array(list(combinations(range(count), 4)), dtype=np.int64)
     rng = np.random.default_rng(0)
-    return np.array([rng.permutation(count)[:4] for _ in range(_MOST_SETS)], dtype=np.int64)
+    return np.array([rng.permutation(count)[:4] for _ in range(most_sets)], dtype=np.int64)

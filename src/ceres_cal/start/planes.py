@@ -29,8 +29,6 @@ from ceres_cal.start.closed_forms import (
 )
 
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
-_ENOUGH_BOARDS = 24  # for a profile
-_ENOUGH_POINTS = 40.0  # of a board
 _GOLDEN = 0.6180339887498949
 # A median beyond it may be no fit at all, however even: corners are detected to a tenth of it. Nothing changes from
 # half to double.
@@ -199,7 +197,8 @@ def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialPro
 
     A profile needs no more: every other homography follows from it.
     """
-    numbers = distinct(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64))
+    enough_boards = 24  # for a profile
+    numbers = distinct(np.linspace(0, len(board) - 1, enough_boards).round().astype(np.int64))
     rows, sizes = ranges(data.bounds, numbers), np.diff(board.point_bounds)[numbers]
     few = PlaneData(
         bounds_of(np.diff(data.bounds)[numbers]), data.plane.take(rows, axis=0), data.offsets.take(rows, axis=0)
@@ -218,10 +217,11 @@ def _spread_rows(bounds: Indices) -> Indices:
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
     """
+    enough_points = 40.0  # of a board
     sizes = np.diff(bounds)
     order = (np.arange(sizes.max()) * _GOLDEN) % 1.0
     place = np.arange(bounds[-1]) - np.repeat(bounds[:-1], sizes)
-    return np.flatnonzero(order[place] < np.repeat(_ENOUGH_POINTS / sizes, sizes))
+    return np.flatnonzero(order[place] < np.repeat(enough_points / sizes, sizes))
 
 
 def _plane_data(board: Sights, rows: Indices) -> PlaneData:

@@ -22,10 +22,6 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import posed_sights
 
 _START = Options(lens="radial")
-# Of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike.
-_ALIKE = 0.15
-# By how much another labelling must be worse, as a factor, to be out of the question.
-_CLEARLY = 3.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +111,10 @@ def _turns(
     observations: Observations, shared: Sequence[tuple[SightKey, SightKey]], poses: dict[SightKey, Pose]
 ) -> list[Pose | None] | None:
     """How each second sight of the pairs must be turned, None where it is right; None where nothing tells."""
+    # Of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike.
+    # By how much another labelling must be worse, as a factor, to be out of the question.
+    clearly = 3.0
+    alike = 0.15
     target_of = {view.placement: observations.targets[view.target] for view in observations.views}
     turns = [symmetries(target_of[b.placement]) for _, b in shared]
     between = [[poses[b] @ turn @ poses[a].inverse for turn in own] for (a, b), own in zip(shared, turns, strict=True)]
@@ -124,8 +124,8 @@ def _turns(
         off = [[_apart(pose, other, depth) for other in own] for own in between]
         answers.append((float(np.mean(np.min([row + [np.inf] * (4 - len(row)) for row in off], axis=1))), off, pose))
     cost, off, best = min(answers, key=lambda answer: answer[0])
-    others = [answer[0] for answer in answers if _apart(answer[2], best, depth) > _ALIKE]
-    if len(shared) < 2 or (others and min(others) < _CLEARLY * max(cost, 0.01)):
+    others = [answer[0] for answer in answers if _apart(answer[2], best, depth) > alike]
+    if len(shared) < 2 or (others and min(others) < clearly * max(cost, 0.01)):
         return None
     numbers = [int(np.argmin(row)) for row in off]
     return [own[number] if number else None for own, number in zip(turns, numbers, strict=True)]

@@ -63,7 +63,7 @@ class Beforehand:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class BestCameras:
     """The best cameras, the least cost first.
 
     Attributes:
@@ -197,7 +197,7 @@ def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: flo
     return judged(lines, known, poses, least_px)[0]
 
 
-def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates | None = None) -> Found:
+def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates | None = None) -> BestCameras:
     """The best cameras of those proposed and of a grid.
 
     Args:
@@ -214,12 +214,12 @@ def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Ca
     return best_of(lines, known, Candidates.joined(proposed, refined(lines, known, some, _STEPS)))
 
 
-def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> Found:
+def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> BestCameras:
     """The best of them, brought to their minima."""
     some = refined(lines, known, some, _LAST_STEPS)
     cost, scale = judged(lines, known, some, known.least_px)
     order = np.argsort(cost)
-    return Found(some.take(order), cost[order], float(scale[order[0], 0]))
+    return BestCameras(some.take(order), cost[order], float(scale[order[0], 0]))
 
 
 def apart(poses: Candidates, costs: Array, least: float) -> Indices:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
 from ceres_cal.base.cached import cached_property
 
 _LEAST = 1e-12  # of a length, which is divided by
@@ -224,7 +224,7 @@ class Sightlines:
             right = np.einsum("kni,kn->ki", weighted, np.sum(rows * places, axis=2)) + _RIDGE * middle
             positions = np.linalg.solve(matrix, right[..., None])[..., 0]
             off = np.sum(rows * (places - positions[:, None]), axis=2)
-            usual = np.maximum(np.median(np.abs(off), axis=1, keepdims=True), _LEAST)
+            usual = np.maximum(medians(np.abs(off))[:, None], _LEAST)
             weights = 1.0 / (1.0 + (off / usual) ** 2)
         return np.asarray(positions)
 

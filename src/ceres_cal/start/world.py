@@ -11,7 +11,7 @@ from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.start.closed_forms import RadialProfile
-from ceres_cal.start.search import Beforehand, Found, apart, best_of, information, searched
+from ceres_cal.start.search import Beforehand, BestCameras, apart, best_of, information, searched
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
 _MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
@@ -32,7 +32,7 @@ _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "len
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class CameraPlace:
     """Where a camera stands, by one sight.
 
     Attributes:
@@ -52,7 +52,7 @@ class Placed:
         open: numbers that the sight leaves open, by name. tells_phi: whether it tells phi.
     """
 
-    places: tuple[Place, ...]
+    places: tuple[CameraPlace, ...]
     open: tuple[str, ...]
     tells_phi: bool
 
@@ -95,13 +95,13 @@ def placed(
 
 def _searched(
     sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates
-) -> tuple[Sightlines, RadialProfile, Beforehand, Found]:
+) -> tuple[Sightlines, RadialProfile, Beforehand, BestCameras]:
     lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
     few = sightlines_of(sight, profile, _FEW_POINTS, _FEW_OF_A_CURVE)
     return lines, profile, known, searched(lines, few, known, given)
 
 
-def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, found: Found) -> Placed:
+def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, found: BestCameras) -> Placed:
     """With what the best place leaves open, and the others that fit alike."""
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
     matrix = information(lines, known, best, scale)
@@ -110,7 +110,7 @@ def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, foun
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
-def holds(lines: Sightlines, known: Beforehand, found: Found, unit_px: float) -> bool:
+def holds(lines: Sightlines, known: Beforehand, found: BestCameras, unit_px: float) -> bool:
     """Whether nearly all of what is seen agrees with a place, and more than any place would take up."""
     best = found.poses.take(np.array([0]))
     distance = np.abs(lines.equations(best)[0][0])
@@ -143,10 +143,10 @@ def _sd_of(matrix: Array, number: int) -> float:
     return float(np.sqrt(np.sum(share**2 / np.maximum(values, 1e-300))))
 
 
-def _place(poses: Candidates, number: int, profile: RadialProfile) -> Place:
+def _place(poses: Candidates, number: int, profile: RadialProfile) -> CameraPlace:
     rotation = poses.rotations[number].T
     pose = np.column_stack([rotation, -rotation @ poses.positions[number]])
-    return Place(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
+    return CameraPlace(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
 
 
 def sightlines_of(sight: Sights, profile: RadialProfile, most_points: int, most_of_a_curve: int) -> Sightlines:

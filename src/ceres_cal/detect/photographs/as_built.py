@@ -34,13 +34,10 @@ _BEAM, _MOST = 24, 9
 # Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
 _OTHER_FIELD = 0.02
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
-_DETERMINED = 1e-12  # of what the curves' numbers are known to in all: below is rounding
 _FARTHEST_M = 0.12  # of all curves that lie aside, root sum of squares: farther, they are others
 # Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
 # wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
 _MOST_MISFIT = 6.0
-_LEAST_SIGMA_PX = 0.05  # of places on a curve: what a model of its shape is good for
-_TOGETHER = 4.0  # neighbouring places whose errors go together, at least
 _APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
 
 
@@ -113,8 +110,11 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     Args:
         priors: on its intrinsics.
     """
+    together = 4.0  # neighbouring places whose errors go together, at least
+    least_sigma_px = 0.05  # of places on a curve: what a model of its shape is good for
+    determined = 1e-12  # of what the curves' numbers are known to in all: below is rounding
     rows = lines.found
-    sigma = np.sqrt(_TOGETHER) * np.maximum(lines.sigma_px[rows], _LEAST_SIGMA_PX)
+    sigma = np.sqrt(together) * np.maximum(lines.sigma_px[rows], least_sigma_px)
     seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
     free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
     problem, estimate = problem_of(camera, seen, free, priors)
@@ -131,11 +131,11 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     normal, slope = model.left_of(columns[:, there])
     bent = model.with_columns(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
     misfit = float(bent.left_over @ bent.left_over) / max(bent.spare, 1)
-    noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / _TOGETHER)
+    noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / together)
     names = tuple(dimensions_of(seen.targets))
     drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
-    effects = RandomEffects.of(normal / noise, slope / noise, _DETERMINED * float(np.trace(normal)) / noise)
+    effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
     shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m)
     return replace(shape.explained(), misfit=misfit)
 

@@ -19,15 +19,11 @@ from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observati
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
-_SPACING_PX = 12.0
 # Of half the image's diagonal, how far to either side others are looked for.
 _REACH = 0.06
 _FAINT = 0.4  # of the usual brightness, what may be a line
-# Places that a line may be hidden for, and by how much it may bend from one to the next, px.
-_GAP, _BEND_PX = 4, 1.2
 _LEAST = 0.35  # of a curve's places, those on a line that runs along it
 _MOST_BESIDE, _MOST_CHOICES = 3, 48
-_SIGMA_PX = 0.5  # of a peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +38,16 @@ def among_others(
     grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics
 ) -> tuple[Camera, Target] | None:
     """The camera by which curves are other lines than those next to where they were predicted; None where none are."""
-    course = predict(target, camera, curves, _SPACING_PX, 2.0)
+    sigma_px = 0.5  # of a peak
+    spacing_px = 12.0
+    course = predict(target, camera, curves, spacing_px, 2.0)
     best, least = None, np.inf
     for nearest, chosen in _choices(_lines_beside(grey, course, _REACH * 0.5 * float(np.hypot(*camera.image_size)))):
         rows, offset = (
             np.concatenate(one) for one in zip(*((line.rows, line.offset_px) for line in chosen), strict=True)
         )
         places = course.pixels[rows] + offset[:, None] * course.normals[rows]
-        sigma = np.full(len(rows), _SIGMA_PX)
+        sigma = np.full(len(rows), sigma_px)
         seen = observations_of(target, camera.image_size, course.curve[rows], places, sigma)
         there = refit_camera(camera, seen, free.names, free.priors)
         left = np.inf if there is None else misfit(there[0], seen)
@@ -92,13 +90,15 @@ def _lines_beside(grey: Array32, course: Course, reach_px: float) -> list[list[_
 
 def _joined(rows: Indices, steps: Array, seen: Mask) -> list[_PaintLine]:
     """Peaks at neighbouring rows that are about as far off, joined."""
+    # Places that a line may be hidden for, and by how much it may bend from one to the next, px.
+    gap, bend_px = 4, 1.2
     lines: list[list[tuple[int, float]]] = []
     for row in rows.tolist():
         for offset in steps[seen[row]].tolist():
             before = [
                 line
                 for line in lines
-                if 0 < row - line[-1][0] <= _GAP and abs(line[-1][1] - offset) < _BEND_PX * (row - line[-1][0]) ** 0.5
+                if 0 < row - line[-1][0] <= gap and abs(line[-1][1] - offset) < bend_px * (row - line[-1][0]) ** 0.5
             ]
             if before:
                 min(before, key=lambda line: abs(line[-1][1] - offset)).append((row, offset))

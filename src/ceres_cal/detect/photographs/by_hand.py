@@ -21,14 +21,10 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import USUAL_PHI
 
-_FILLED = 0.8  # of the picture, by a field of which nothing is known yet
-_HELD_PX = 300.0  # how loosely points that nobody showed stay where they were
 _AS_SHOWN = Weighting(loss="trivial")
 # How many equations free which intrinsics; fewer leave the lens as it was.
 _FREED = ((8, ("phi",)), (12, ("phi", "a3")), (24, ("phi", "a3", "cx", "cy")), (36, ("phi", "a3", "a2", "cx", "cy")))
 _AGAINST = 4.0  # standard deviations of a hand by which a click contradicts the others
-_FAR = 10.0  # of them: no camera near puts it there
-_ENOUGH = 10  # equations from which on a contradiction can be seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +77,7 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
     Args:
         side: of the picture, towards which the field's left end lies.
     """
+    filled = 0.8  # of the picture, by a field of which nothing is known yet
     low, high = target.box
     size, (width, height) = high - low, image_size
     turns = {"left": 0, "top": 1, "right": 2, "bottom": 3}
@@ -88,7 +85,7 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
     turn = 0.5 * np.pi * turns.get(side.rpartition("-")[2], default)
     across = size if round(turn / (0.5 * np.pi)) % 2 == 0 else size[::-1]
     phi = USUAL_PHI * 0.5 * float(np.hypot(*image_size))
-    above = phi * float(np.max(across / (_FILLED * np.array(image_size))))
+    above = phi * float(np.max(across / (filled * np.array(image_size))))
     cos, sin = np.cos(turn), np.sin(turn)
     rotation = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])
     position = np.array([*(0.5 * (low + high)), above])
@@ -130,9 +127,10 @@ def settled(target: Target, shown: Shown, before: Camera, base: Camera) -> tuple
     """The camera once nothing is dragged any more, the clicks that contradict the others (see `judged`), and what is
     wrong with them all.
     """
+    far = 10.0  # of them: no camera near puts it there
     camera, wrong = solved(target, shown, before, base), ""
     off_px, sigma_px = off(target, shown, camera)
-    if len(shown.names) >= FEWEST and np.any(off_px > _FAR * sigma_px):
+    if len(shown.names) >= FEWEST and np.any(off_px > far * sigma_px):
         other, wrong = answer_or_reason(lambda: anew(target, shown, base.image_size))
         camera = other or camera
     return *judged(target, shown, camera, base), wrong
@@ -148,8 +146,9 @@ def judged(target: Target, shown: Shown, camera: Camera, base: Camera) -> tuple[
     """The camera without the clicks that contradict the others, and by how many px those are off, by name or "#2" of a
     place of a curve.
     """
+    enough = 10  # equations from which on a contradiction can be seen
     off_px, sigma_px = off(target, shown, camera)
-    if shown.equations < _ENOUGH or np.all(off_px <= 0.5 * _AGAINST * sigma_px):  # others take a share of it
+    if shown.equations < enough or np.all(off_px <= 0.5 * _AGAINST * sigma_px):  # others take a share of it
         return camera, {}
     robust = _fitted(target, shown, camera, _turned(target, shown, base), ROBUST) or camera
     off_px, sigma_px = off(target, shown, robust)
@@ -214,13 +213,14 @@ def _cost(target: Target, shown: Shown, camera: Camera) -> float:
 
 def _hints(target: Target, shown: Shown, base: Camera) -> PointHints:
     """What was shown, and loosely the other points where they were."""
+    held_px = 300.0  # how loosely points that nobody showed stay where they were
     rest = np.setdiff1d(np.arange(len(target.points), dtype=np.int32), shown.index)
     there = base.project(target.point_array[rest])
     rest, there = rest[np.isfinite(there[:, 0])], there[np.isfinite(there[:, 0])]
     return PointHints(
         np.concatenate([shown.index, rest]),
         np.concatenate([shown.pixels, there]),
-        np.concatenate([shown.sigma_px, np.full(len(rest), _HELD_PX)]),
+        np.concatenate([shown.sigma_px, np.full(len(rest), held_px)]),
         shown.curve,
         shown.places,
         shown.place_sigma_px,

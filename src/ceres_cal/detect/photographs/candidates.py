@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from time import thread_time
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
 from ceres_cal.detect.photographs.painted import likelihood_of_place
@@ -52,6 +53,7 @@ class FieldSearch:
         turns: of the target that put its painted curves onto themselves; the first is none.
         others: the target drawn with other lengths, where some are not known.
         until_s: of this thread's processor time, after which no further camera is looked at.
+        reached: what was followed so far. refused: those of it that are surely not the field.
     """
 
     grey: Array32
@@ -60,6 +62,8 @@ class FieldSearch:
     turns: tuple[Pose, ...]
     others: tuple[LineGrid, ...] = ()
     until_s: float = np.inf
+    reached: list[Followed] = field(default_factory=list)
+    refused: list[Followed] = field(default_factory=list)
 
     @property
     def is_out_of_time(self) -> bool:

@@ -34,11 +34,8 @@ FORMAT, VERSION = "ceres-cal/corners", 1
 # How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
 SIGMA_PX = 15.0
 FEWEST = 4
-_STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
 _WRONG = 6.0  # standard deviations of a click: as far off, and it is another place's
 _FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
-# A standard deviation of fy / fx where a picture was stretched one way.
-_STRETCH = 0.03
 
 
 @dataclass(frozen=True)
@@ -92,6 +89,7 @@ def starts_from_clicks(
     Raises:
         InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
+    stretches = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
     for name in clicks.points:
         if name not in target.point_index:
             raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
@@ -102,7 +100,7 @@ def starts_from_clicks(
     pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 1e-6:
         raise InputError(f"all {len(plane)} points to start from lie on one line: show more corners")
-    every = [_with_stretch(stretch, pixels, plane, image_size) for stretch in _STRETCHES]
+    every = [_with_stretch(stretch, pixels, plane, image_size) for stretch in stretches]
     fitting = [camera for camera, off_px in every if off_px.max() < _WRONG * SIGMA_PX]
     if not fitting:
         raise InputError(_odd_one(list(clicks.points), min((off for _, off in every), key=np.median)))
@@ -124,11 +122,13 @@ def unknown_optics(
     """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are; and
     of lengths of the target.
     """
+    # A standard deviation of fy / fx where a picture was stretched one way.
+    stretch = 0.03
     middle = 0.5 * (np.array(image_size) - 1.0)
     priors = (
         Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
-        Prior("camera", CAMERA, "aspect", (1.0,), (_STRETCH,)),
+        Prior("camera", CAMERA, "aspect", (1.0,), (stretch,)),
     )
     return FreeIntrinsics(_FREED, (*priors, *lengths), hints)
 

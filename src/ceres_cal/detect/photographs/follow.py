@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice, product
 
 import numpy as np
@@ -45,6 +45,7 @@ _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX = 0.02
+_SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
 
 
 def follow(
@@ -76,9 +77,20 @@ def follow(
     return best if best.holds else tracker.stretched(best)
 
 
-def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
-    """`follow` from one start, up to where the lens remains that it started from."""
-    return next(_Tracker(grey, target, curves, free).tried([camera]))
+def approach(
+    grey: Array32,
+    target: Target,
+    camera: Camera,
+    curves: Collection[str],
+    free: FreeIntrinsics,
+    reached: list[Followed],
+) -> Followed:
+    """`follow` from one start, up to where the lens remains that it started from.
+
+    Args:
+        reached: what other starts led to, and by and by this one: what leads there, too, is not followed to its end.
+    """
+    return next(_Tracker(grey, target, curves, free, reached=reached).tried([camera]))
 
 
 def look_again(
@@ -119,6 +131,7 @@ class _Tracker:
     curves: Collection[str]
     free: FreeIntrinsics
     missing: tuple[str, ...] = ()
+    reached: list[Followed] = field(default_factory=list)
 
     def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
         """What was measured from a camera."""
@@ -188,7 +201,15 @@ class _Tracker:
         other = among_others(self.grey, tracker.target, camera, tracker.curves, self.free)
         if other is not None:
             tracker, camera = replace(tracker, target=other[1]), other[0]
-        return tracker.at_rest(camera, self.free.names)
+        there = tracker._reached_before(camera) or tracker.at_rest(camera, self.free.names)
+        self.reached.append(there)
+        return there
+
+    def _reached_before(self, camera: Camera) -> Followed | None:
+        """What was at rest before, of the same lines, so near that it is where this camera would come to rest."""
+        own = self.target.spec, tuple(self.curves)
+        alike = [one for one in self.reached if (one.target.spec, one.curves) == own]
+        return next((one for one in alike if moved_px(one.camera, camera, one.lines.course.pixels) < _SAME_PX), None)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more."""
@@ -234,7 +255,8 @@ class _Tracker:
     def stretched(self, other: Followed) -> Followed:
         """What does not hold with square pixels, or the field in a picture that was stretched one way."""
         names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
-        anew = replace(self.lacking(other.lacks_wholly), free=replace(self.free, names=("aspect", *names)))
+        free = replace(self.free, names=("aspect", *names))
+        anew = replace(self.lacking(other.lacks_wholly), free=free, reached=[])
         starts = [replace(other.camera, phi=other.camera.phi / one**0.5, aspect=one) for one in _ASPECTS]
         tried = [anew.close_in(start, _SHOWN_REACHES_PX) for start in starts]
         there = max(tried, key=lambda one: (one.holds, one.share))

@@ -14,15 +14,12 @@ from ceres_cal.detect.photographs.painted import BY_CHANCE
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.scene.targets import Target
 
-_COURSE_PX = 3.0
 # Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
 # double.
 _NEAR_PX = 6.0
 # Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
 # stripes of sun it is 0.83 at least, of other fields 0.6 at most.
 _EXPLAINED = 0.75
-# The same of a field whose paint is found at fewer than half of the places; worn lines in dashes: 1.
-_EXPLAINED_IF_WORN = 0.9
 # The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole,
 # and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
 # A corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
@@ -30,7 +27,6 @@ _OF_ALL, _OF_ALL_IF_WHOLE, _MANY_CURVES = 0.55, 0.4, 6
 # Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
 # another line's at least.
 _PARALLEL, _AS_STRONG = 0.07, 0.5
-_RIM = 0.02  # of its size
 # Found on a curve, and curves of which so many were: fewer could be any lines. Nothing changes from half to double.
 _FEWEST_PLACES, _FEWEST_CURVES = 5, 3
 # Cosine of the tilt: 65 degrees, 20 more than is promised. Nothing changes at half of it; at double, 33 degrees,
@@ -83,12 +79,14 @@ def is_shown(search: FieldSearch, followed: Followed) -> bool:
     """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own, and on
     more than half of its curves: a few cables lie on some of any field's.
     """
+    # The same of a field whose paint is found at fewer than half of the places; worn lines in dashes: 1.
+    explained_if_worn = 0.9
     if followed.holds or not followed.may_be_worn:
         return followed.holds
     if 2 * len({*detected_curves(search, followed), *followed.visible}) <= len(search.curves):
         return False
     everywhere = explained(search, followed, everywhere=True)
-    return everywhere > _EXPLAINED and explained(search, followed) > _EXPLAINED_IF_WORN
+    return everywhere > _EXPLAINED and explained(search, followed) > explained_if_worn
 
 
 def likelihood(followed: Followed) -> float:
@@ -105,12 +103,14 @@ def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = Fal
     Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
     stripes of sun that run otherwise, or are fainter, say nothing against it.
     """
+    rim = 0.02  # of its size
+    course_px = 3.0
     strokes, camera, target = search.stroke_map.strokes, followed.camera, followed.target
-    course = predict(target, camera, search.curves, _COURSE_PX)
+    course = predict(target, camera, search.curves, course_px)
     ends = np.stack([camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
     middles, along = ends.mean(axis=0), np.abs(ends[1] - ends[0])
     places = replace(search.grid, target=target).outline
-    margin = _RIM * np.ptp(places, axis=0)
+    margin = rim * np.ptp(places, axis=0)
     with np.errstate(invalid="ignore"):
         inside = np.all((middles > places.min(axis=0) - margin) & (middles < places.max(axis=0) + margin), axis=1)
         inside |= everywhere

@@ -30,12 +30,9 @@ _CELL = 0.03
 # Choices of two lines one way, at least, that are tried with each one across: it only saves time.
 _PAIRS = 120
 _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
-_KEPT = 800
-_TELLS_PX = 40.0  # of a line, as much as one place on it tells
 # Of the places on the target: a camera nearer than that sees too little of it.
 _LEAST_IN_VIEW = 0.03
 CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
-_BLOCK = 2000
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
 
@@ -136,17 +133,18 @@ def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
 
 def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[Match]:
     """The best hypotheses for these lines, the best first."""
+    kept = 800
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     scored: list[tuple[float, Array, Array]] = []
     for quarters in range(4 // gcd(4, grid.turns)):
         turned = replace(upright, rotation=upright.rotation @ _QUARTERS[quarters])
         hypotheses = _hypotheses(lines.turned(quarters), grid)
         score = _scores(stroke_map, turned, hypotheses, few)
-        best = np.argsort(-score)[:_KEPT]
+        best = np.argsort(-score)[:kept]
         score = _scores(stroke_map, turned, hypotheses[best], many)
         scored += [(float(value), hypotheses[row], turned.rotation) for value, row in zip(score, best, strict=True)]
     scored.sort(key=lambda one: -one[0])
-    return [_as_match(score, place, rotation, grid) for score, place, rotation in scored[:_KEPT]]
+    return [_as_match(score, place, rotation, grid) for score, place, rotation in scored[:kept]]
 
 
 def _as_match(score: float, place: Array, rotation: Array, grid: LineGrid) -> Match:
@@ -220,18 +218,20 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
 
 def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
     """(K,) of each hypothesis, from 0 to 1."""
-    blocks = range(0, len(hypotheses), _BLOCK)
-    parts = [_scored(stroke_map, upright, hypotheses[b : b + _BLOCK].astype(np.float32), places) for b in blocks]
+    block = 2000
+    blocks = range(0, len(hypotheses), block)
+    parts = [_scored(stroke_map, upright, hypotheses[b : b + block].astype(np.float32), places) for b in blocks]
     return np.concatenate([np.empty(0), *parts])
 
 
 def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
+    tells_px = 40.0  # of a line, as much as one place on it tells
     floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
     pixels = stroke_map.centre.astype(np.float32) + np.float32(stroke_map.unit_px) * upright.offsets(floor)
     with np.errstate(invalid="ignore"):
         inside = np.all((pixels > -0.5) & (pixels < np.array(stroke_map.image_size) - 0.5), axis=2)
     step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
-    step = np.where(inside & ~places.first & np.isfinite(step), np.minimum(step, _TELLS_PX), 0.0)
+    step = np.where(inside & ~places.first & np.isfinite(step), np.minimum(step, tells_px), 0.0)
     near = stroke_map.near.at(pixels[..., 0], pixels[..., 1])
     covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
     enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW

@@ -17,7 +17,6 @@ from ceres_cal.scene.targets import Target
 # Where lines are sought: px apart, and to either side as a share of half the image's diagonal.
 _SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12
 BY_CHANCE = 0.3  # of the places on any lines, those that look like paint: what is brighter than the others does
-_ANYWHERE = 400  # places of lines laid anywhere, by which that brightness is known
 _R3 = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 _NEAR = 0.012  # the same where they are known to lie
 # Log-likelihood ratio from which on paint along a curve is none by chance.
@@ -57,11 +56,12 @@ def _seen(
 
 def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
     """Places of lines all over an image, in all directions: a low-discrepancy sequence (Roberts 2018, R3)."""
-    x, y, turn = np.mod(np.outer(_R3, np.arange(1.0, _ANYWHERE + 1.0)), 1.0)
+    anywhere = 400  # places of lines laid anywhere, by which that brightness is known
+    x, y, turn = np.mod(np.outer(_R3, np.arange(1.0, anywhere + 1.0)), 1.0)
     pixels = np.column_stack([x, y]) * (np.array(image_size) - 1.0)
     normals = np.column_stack([np.cos(np.pi * turn), np.sin(np.pi * turn)])
-    none = np.zeros(_ANYWHERE)
-    return Course(none.astype(np.int32), none, pixels, normals, none, np.full(_ANYWHERE, width_px))
+    none = np.zeros(anywhere)
+    return Course(none.astype(np.int32), none, pixels, normals, none, np.full(anywhere, width_px))
 
 
 def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:

@@ -127,7 +127,9 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
         if problem.is_out_of_time:
             break
         own = replace(problem, grid=grid)
-        followed = _followed(own, auto, _turned(problem, auto, camera))
+        first = followed = _followed(own, auto, _turned(problem, auto, camera))
+        if any(followed is one for one in problem.refused):
+            continue
         against = objection(problem, followed)
         if against and followed.share >= SURE_SHARE:
             free = _free(own.target, auto, followed.camera)
@@ -135,8 +137,10 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
             against = objection(problem, followed)
         if not against:
             good.append(followed)
-        elif seen is None or followed.share > seen.share:
-            seen, reason = followed, against
+        else:
+            problem.refused.append(first)
+            if seen is None or followed.share > seen.share:
+                seen, reason = followed, against
         if good and explained(problem, good[-1]) > _SURE:
             break
     return good, seen, reason
@@ -157,7 +161,7 @@ def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
 def _followed(problem: FieldSearch, auto: Auto, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
     free = _free(problem.target, auto, camera)
-    return approach(problem.grey, problem.target, camera, problem.curves, free)
+    return approach(problem.grey, problem.target, camera, problem.curves, free, problem.reached)
 
 
 def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:

@@ -32,6 +32,7 @@ _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
 _ROUNDS = 12
+_STEP = 1e-5  # of bend and log phi, for slopes
 # Of the strokes, in the direction that has fewer: a floor needs both. Nothing changes from half to double. And of what
 # the target has there: fields without touch lines have little.
 _LEAST_SHARE, _LEAST_OF_OWN = 0.06, 0.3
@@ -117,7 +118,8 @@ def _rotations() -> Array:
 
 def _normals(optics: Upright, ends: Array) -> Array:
     """(N, 3) unit normals of the planes through the camera and the strokes."""
-    normal = np.cross(optics.rays(ends[:, 0]), optics.rays(ends[:, 1]))
+    (a, b, c), (x, y, z) = optics.rays(ends[:, 0]).T, optics.rays(ends[:, 1]).T
+    normal = np.column_stack([b * z - c * y, c * x - a * z, a * y - b * x])
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
@@ -148,10 +150,8 @@ def _moved(one: Upright, step: Array) -> Upright:
 
 def _refined(one: Upright, ends: Array, weights: Array, least: float) -> Upright:
     """Gauss-Newton on turn, bend and log phi, robust and ever finer."""
-    step_sizes = 1e-5 * np.eye(5)
     for tolerance in np.geomspace(_ROUGH, _FINE, _ROUNDS):
-        base, which = _deviation(one, ends, None)
-        columns = np.array([(_deviation(_moved(one, step), ends, which)[0] - base) / 1e-5 for step in step_sizes])
+        base, columns = _deviation(one, ends)
         weight = weights / weights.sum() * np.exp(-((base / tolerance) ** 2)) / tolerance**2
         prior = _PRIOR_WEIGHT * np.diag([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(USUAL_PHI_FACTOR) ** -2])
         off = np.array([0.0, 0.0, 0.0, one.bend - _USUAL_BEND, np.log(one.phi / USUAL_PHI)])
@@ -162,11 +162,20 @@ def _refined(one: Upright, ends: Array, weights: Array, least: float) -> Upright
     return replace(one, share=float(_score(normals, weights, one.rotation[None], 2.0 * _FINE, least)[0]))
 
 
-def _deviation(one: Upright, ends: Array, which: Array | None) -> tuple[Array, Array]:
-    """(N,) sine of the angle between each stroke and the nearer direction, or the one that was nearer."""
-    off = _normals(one, ends) @ one.rotation[:, :2]
-    which = np.argmin(np.abs(off), axis=1) if which is None else which
-    return off[np.arange(len(off)), which], which
+def _deviation(one: Upright, ends: Array) -> tuple[Array, Array]:
+    """(N,) sine of the angle between each stroke and the nearer direction, and (5, N) its slopes by turn, bend and log
+    phi.
+    """
+    off = _normals(one, ends) @ one.rotation
+    x, y, z = off.T
+    is_x, none = np.abs(x) <= np.abs(y), np.zeros(len(off))
+    base = np.where(is_x, x, y)
+    turns = np.where(is_x, [none, -z, y], [z, none, -x])  # of the axis, w x e
+    others = []
+    for step in _STEP * np.eye(5)[3:]:
+        there = _normals(_moved(one, step), ends) @ one.rotation[:, :2]
+        others.append((np.where(is_x, *there.T) - base) / _STEP)
+    return base, np.vstack([turns, others])
 
 
 def _apart(one: Upright, other: Upright) -> bool:

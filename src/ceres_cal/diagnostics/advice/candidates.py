@@ -18,24 +18,15 @@ from ceres_cal.scene.curves import Arc, curve_points
 from ceres_cal.scene.targets import Target, checkerboard, custom
 from ceres_cal.simulate import ViewPlan, board_pose, well_inside
 
-HEIGHT_SIGMAS_M = (0.02, 0.01, 0.005)
-POSITION_SIGMA_M = 0.01
 POLE_M, POLE_SIGMA_M = 1.0, 0.005
 """Height of a pole, and how far its top may stand aside from where it should, along x and along y."""
 BOARD = checkerboard(9, 6, 0.1)
-_POLE_COUNTS, _BOARD_COUNTS, _LINE_COUNTS = (1, 3), (3, 6), (1, 3)
 _FRAMES = 10
 _LINE_SPACING_M, _FRAME_SPACING_M = 0.05, 0.1
-_FINE = 199  # pieces of a curve, to tell which stretch is seen
-_GRID_M = 0.5  # between two places that a pole is tried at
 # A marked place does for a pole where another one leaves not much less: nobody measures a place to save a tenth.
 # Nothing changes from half to double.
 _MARKED = 1.1
-_BOARD_SIZES = (0.5, 0.3)  # shares of the image's shorter side that a board's diagonal takes
-_BOARD_PLACES = (0.2, 0.5, 0.8)  # of the image's width and height
-_BOARD_TILTS_DEG = (20.0, 40.0)
 _NEARER = ("upper", "right", "lower", "left")  # the edge that leans towards the camera, by quarter turns
-_LEAST_HEIGHT_M = 0.05  # of any corner of a board over the floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +52,12 @@ class CandidateSearch:
 
     def candidates(self) -> Iterator[Measurement]:
         """The least work first."""
+        pole_counts, board_counts, line_counts = (1, 3), (3, 6), (1, 3)
         yield from heights(self.station, self.camera)
-        yield from self._best(poles(self), _POLE_COUNTS, _poles_words, _marked_first)
-        yield from self._best(lines(self), _LINE_COUNTS, _lines_words)
+        yield from self._best(poles(self), pole_counts, _poles_words, _marked_first)
+        yield from self._best(lines(self), line_counts, _lines_words)
         yield from frames(self)
-        yield from self._best(boards(self), _BOARD_COUNTS, self._boards_words)
+        yield from self._best(boards(self), board_counts, self._boards_words)
 
     def _best(
         self,
@@ -99,12 +91,14 @@ class CandidateSearch:
 
 def heights(station: str, camera: Camera) -> Iterator[Measurement]:
     """The height, or the whole position, by tape."""
+    position_sigma_m = 0.01
+    height_sigmas_m = (0.02, 0.01, 0.005)
     x, y, height = camera.position.tolist()
-    for sigma in HEIGHT_SIGMAS_M:
+    for sigma in height_sigmas_m:
         prior = Prior("station", station, "height_m", (height,), (sigma,))
         yield Measurement("tape", f"measure the camera's height to {1e3 * sigma:.0f} mm", priors=(prior,))
-    position = Prior("station", station, "position_m", (x, y, height), (POSITION_SIGMA_M,) * 3)
-    words = f"measure the camera's x, y and height to {1e3 * POSITION_SIGMA_M:.0f} mm each"
+    position = Prior("station", station, "position_m", (x, y, height), (position_sigma_m,) * 3)
+    words = f"measure the camera's x, y and height to {1e3 * position_sigma_m:.0f} mm each"
     yield Measurement("tape", words, priors=(position,))
 
 
@@ -116,11 +110,12 @@ def poles(search: CandidateSearch) -> Iterator[Measurement]:
 
     Where phi is followed along its profile, that is wherever the camera may be by it, if not hardly over the pole.
     """
+    grid_m = 0.5  # between two places that a pole is tried at
     camera, grid = search.camera, search.outlook.today
     top = min(POLE_M, float(np.floor(4.0 * camera.position[2]) / 10.0))  # a short one under a low camera
     elsewhere = [estimate.camera_at(search.station) for _, estimate in search.outlook.possible]
     cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]
-    x, y = (np.arange(np.ceil(a[0] / _GRID_M), a[-1] / _GRID_M + 1e-9) * _GRID_M for a in (grid.x_m, grid.y_m))
+    x, y = (np.arange(np.ceil(a[0] / grid_m), a[-1] / grid_m + 1e-9) * grid_m for a in (grid.x_m, grid.y_m))
     places = [("", float(a), float(b)) for a in x for b in y]
     for _, target in still(search.ground.targets):
         places += [(name, a, b) for name, (a, b, z) in target.points.items() if z == 0.0]
@@ -159,21 +154,25 @@ def _poles_words(taken: Sequence[Measurement]) -> str:
 
 def boards(search: CandidateSearch) -> Iterator[Measurement]:
     """The board at several places of the image, distances and tilts, where it is seen whole and over the floor."""
+    least_height_m = 0.05  # of any corner of a board over the floor
+    board_tilts_deg = (20.0, 40.0)
+    board_places = (0.2, 0.5, 0.8)  # of the image's width and height
+    board_sizes = (0.5, 0.3)  # shares of the image's shorter side that a board's diagonal takes
     name, board = search.board
     camera, size = search.camera, np.array(search.camera.image_size, dtype=float)
     diagonal = float(np.linalg.norm(np.ptp(board.point_array, axis=0)))
-    for share in _BOARD_SIZES:
+    for share in board_sizes:
         distance = camera.phi * diagonal / (share * float(size.min()))
-        for column in _BOARD_PLACES:
-            for row in _BOARD_PLACES:
+        for column in board_places:
+            for row in board_places:
                 pixel = np.round(size * (column, row))
-                for tilt in _BOARD_TILTS_DEG:
+                for tilt in board_tilts_deg:
                     for quarter, edge in enumerate(_NEARER):
                         turn = (np.deg2rad(tilt), 0.5 * np.pi * quarter, 0.0)
                         pose = board_pose(board, camera, pixel, distance, turn)
                         held = camera.cam_from_world.inverse @ pose
                         corners = held.transform(board.point_array)
-                        if np.min(corners[:, 2]) < _LEAST_HEIGHT_M or not np.all(well_inside(camera, corners)):
+                        if np.min(corners[:, 2]) < least_height_m or not np.all(well_inside(camera, corners)):
                             continue
                         label = f"advised_{share:.1f}_{pixel[0]:.0f}_{pixel[1]:.0f}_{tilt:.0f}_{edge}"
                         words = (
@@ -209,8 +208,9 @@ def lines(search: CandidateSearch) -> Iterator[Measurement]:
 
 def _seen_stretch(search: CandidateSearch, target: Target, name: str) -> str | None:
     """What of a curve the image shows, in words; None where it shows none of it."""
+    fine = 199  # pieces of a curve, to tell which stretch is seen
     curve = target.curves[name]
-    places = curve_points(curve, 0, _FINE)
+    places = curve_points(curve, 0, fine)
     seen = well_inside(search.camera, places)
     if not seen.any():
         return None

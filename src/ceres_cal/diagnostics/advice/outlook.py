@@ -18,7 +18,6 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import moved
 
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`posterior.assess` leaves it there)
-_NODES = 7  # of a valley at which a promise is worked out
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +103,12 @@ class Outlook:
     @cached_property
     def possible(self) -> tuple[tuple[int, Estimate], ...]:
         """Some nodes of the valley within its 95 % bounds, by number; none where phi is not followed."""
+        nodes = 7  # of a valley at which a promise is worked out
         if self.valley is None:
             return ()
         keys, steps, (at, roots) = self.valley.keys, self.valley.steps, self.valley.chains[0]
         within = at[np.abs(roots) <= self.posterior.half_width]
-        some = within[np.unique(np.linspace(0, len(within) - 1, _NODES).round().astype(int))]
+        some = within[np.unique(np.linspace(0, len(within) - 1, nodes).round().astype(int))]
         return tuple((int(node), moved(self.estimate, keys, steps[node])) for node in some)
 
     def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
@@ -129,7 +129,7 @@ class Outlook:
             if not np.any(added.matrix):
                 yield float(phi[node]), np.inf, Errors(np.inf, np.inf)
                 continue
-            across, along = valley.information[node].matrix, tangents[node]
+            across, along = valley.information[valley.at[node]].matrix, tangents[node]
             coupling = -across @ along
             of_phi = along @ across @ along + bend / phi[node] ** 2
             matrix = np.block([[np.atleast_2d(of_phi), coupling[None]], [coupling[:, None], across]])

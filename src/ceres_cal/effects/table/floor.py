@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, Wrong, amounts
-
-_CELL_M = 1.0  # side of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
-# Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted. Nothing
-# changes from half to double.
-_FEWEST_AT_PLACE = 8
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
 
 
-class _Floor(Effect):
-    """What moves the places of targets that are part of the world up or down."""
-
-    wrong: ClassVar[Wrong] = "model"
-    absorbed = True
-
-
-class FloorBowed(_Floor):
+class FloorBowed(Effect):
     """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
 
     kind = "floor bowed"
+    absorbed = True
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         target, names = _target_of(case)
@@ -54,24 +42,29 @@ def _lower(mm: float) -> str:
     return f"{'higher' if mm > 0.0 else 'lower'} by {abs(mm):.1f}"
 
 
-class FloorUneven(_Floor):
+class FloorUneven(Effect):
     """The floor is higher or lower at one place."""
 
     kind = "floor uneven"
+    absorbed = True
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
+        # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted.
+        # Nothing changes from half to double.
+        fewest_at_place = 8
+        cell_m = 1.0  # of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
         target, names = _target_of(case)
-        cell = np.floor(case.equations.place[:, :2] / _CELL_M + 0.5).astype(np.int64)
+        cell = np.floor(case.equations.place[:, :2] / cell_m + 0.5).astype(np.int64)
         span = 2 * int(np.abs(cell).max(initial=0)) + 1
         key = (np.maximum(target, 0) * span + cell[:, 0] + span // 2) * span + cell[:, 1] + span // 2
         numbers, group = grouped(key, target >= 0)
         counts = np.bincount(group[(group >= 0) & case.model.used], minlength=len(numbers) + 1)
-        group = np.where((group >= 0) & (counts[group] >= _FEWEST_AT_PLACE), group, -1)
+        group = np.where((group >= 0) & (counts[group] >= fewest_at_place), group, -1)
         subjects = []
         for number in numbers.tolist():
             rest, y = divmod(number, span)
             of, x = divmod(rest, span)
-            at = [(place - span // 2) * _CELL_M for place in (x, y)]
+            at = [(place - span // 2) * cell_m for place in (x, y)]
             subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
         yield EffectColumns(self.kind, _raised(case)[:, None], group, tuple(subjects))
 

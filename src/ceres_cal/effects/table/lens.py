@@ -12,7 +12,6 @@ from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words
 from ceres_cal.problem.parameters import unit_px
 from ceres_cal.scene.lens import LENSES, Lens
 
-_RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
 # Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few
 # observations.
 _WAVES = range(5, 25)
@@ -25,13 +24,14 @@ class Radius(Effect):
     absorbed = True
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
-        columns = np.zeros((len(case.equations), max(_RADIAL_BASIS, len(_WAVES))))
+        radial_basis = 3  # powers of the radius past the lens's: enough for any trend that one more power mends
+        columns = np.zeros((len(case.equations), max(radial_basis, len(_WAVES))))
         for number, name in enumerate(case.cameras):
             own = case.camera == number
             if case.estimate.cameras[name].lens.roughness:
                 columns[own, : len(_WAVES)] = _waves(case, name, own)
                 continue
-            for k, power in enumerate(_missing_powers(case, name)[:_RADIAL_BASIS]):
+            for k, power in enumerate(_missing_powers(case, name)[:radial_basis]):
                 columns[own, k] = _radial_column(case, name, power)[own]
         yield EffectColumns(self.kind, columns, case.camera, case.cameras)
 

@@ -102,8 +102,6 @@ class Phi(HeldNumbers):
         )
 
 
-# How near to half a pixel a shift must be to be called that: in standard deviations, and px.
-_HALF_SD, _HALF_PX = 3.0, 0.1
 _HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
 
 
@@ -120,8 +118,10 @@ class PointsShifted(Effect):
         yield EffectColumns(self.kind, case.equations.direction * ~is_curve[:, None], group, case.cameras)
 
     def words(self, evidence: Evidence) -> Words:
+        # How near to half a pixel a shift must be to be called that: in standard deviations, and px.
+        half_sd, half_px = 3.0, 0.1
         px, sd = evidence.score.amount, evidence.score.sd
-        half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(_HALF_SD * sd, _HALF_PX)))
+        half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(half_sd * sd, half_px)))
         return Words(
             f"camera {evidence.score.subject!r}: its points are shifted against its curves by ({px[0]:+.2f} ± "
             f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px ({evidence.size})",

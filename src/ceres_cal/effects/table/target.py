@@ -20,10 +20,6 @@ _FEWEST_ON_CURVE = 8
 # Observations that say whether a point lies aside: one could be an outlier that was just not taken out. Nothing
 # changes from half to double.
 _FEWEST_OF_POINT = 2
-# Features aside of one target from which on it is the target. Two may be lines that somebody painted anew.
-_SEVERAL = 3
-# Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
-_CLEAR = 2.0
 
 
 class _StructureTest(Effect):
@@ -57,9 +53,11 @@ class _StructureTest(Effect):
 
 def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
     """One finding for a target of which several features lie aside."""
+    # Features aside of one target from which on it is the target. Two may be lines that somebody painted anew.
+    several = 3
     for target in dict.fromkeys(one.subject.partition("/")[0] for one in findings):
         own = [one for one in findings if one.subject.partition("/")[0] == target]
-        if len(own) < _SEVERAL:
+        if len(own) < several:
             yield from own
             continue
         counts = np.array([one.observations for one in own], dtype=float)
@@ -137,12 +135,14 @@ class BoardBent(_StructureTest):
     places: ClassVar[slice] = slice(2, 2 + len(WARP))
 
     def words(self, evidence: Evidence) -> Words:
+        # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
+        clear = 2.0
         name = evidence.score.subject
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
         further = [
             f"{words} {a:+.2f} ± {s:.2f} mm"
             for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
-            if abs(a) > _CLEAR * s
+            if abs(a) > clear * s
         ]
         return Words(
             f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "

@@ -129,7 +129,7 @@ def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Region:
+class _ShownRegion:
     """The part of the plane at depth 1 that a photograph shows, without holes.
 
     Attributes:
@@ -159,7 +159,7 @@ def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
     return np.asarray(there)
 
 
-def _region(camera: Camera, angle: float) -> _Region:
+def _region(camera: Camera, angle: float) -> _ShownRegion:
     slope = float(np.tan(angle))
     border = _at_depth_1(camera, _border(camera.image_size), slope)
     turn = np.linspace(0.0, 2.0 * np.pi, _RIM_STEPS, endpoint=False)
@@ -172,7 +172,7 @@ def _region(camera: Camera, angle: float) -> _Region:
             f"no pixel of the camera looks to within {np.degrees(angle):.1f} degrees of its axis: "
             "its principal point lies far outside of the image"
         )
-    return _Region(camera, slope, float(np.degrees(angle)) if len(rim) else None, outline)
+    return _ShownRegion(camera, slope, float(np.degrees(angle)) if len(rim) else None, outline)
 
 
 def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
@@ -206,12 +206,12 @@ def _border(size: tuple[int, int]) -> Array:
     return np.concatenate(sides)
 
 
-def _box(region: _Region) -> Array:
+def _box(region: _ShownRegion) -> Array:
     """(2, 2) the low and the high corner around all of it."""
     return np.array([region.outline.min(axis=0), region.outline.max(axis=0)])
 
 
-def _largest_rectangle(region: _Region, aspect: float | None) -> Array:
+def _largest_rectangle(region: _ShownRegion, aspect: float | None) -> Array:
     """(2, 2) the low and the high corner of the largest upright rectangle inside; `aspect` is width over height.
 
     Around a centre the rectangle grows until it meets the outline: its half height is the smallest of

@@ -19,7 +19,6 @@ from ceres_cal.base.cached import cached_property
 from ceres_cal.scene.lens.base import Lens
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
-_SHORT = 1e-9  # of a pole: the map is finite before it
 
 
 def horner(polynomial: Array, x: Array) -> Array:
@@ -96,8 +95,9 @@ class Ratio:
     @cached_property
     def limit(self) -> float:
         """Where it stops growing or q reaches 0, or else its end."""
+        short = 1e-9  # of a pole: the map is finite before it
         limit = min(self.end, first_root(self._rising))
-        return limit if self.below is None else min(limit, (1.0 - _SHORT) * first_root(self.below))
+        return limit if self.below is None else min(limit, (1.0 - short) * first_root(self.below))
 
 
 def _reach(profile: Profile, target: Array) -> Array:
@@ -144,9 +144,6 @@ def dense_polynomial(values: Sequence[float], powers: Sequence[int]) -> Array:
     polynomial[1] = 1.0
     polynomial[list(powers)] = values
     return polynomial
-
-
-_LONGEST = 0.1  # step of Newton's method, of the limit
 
 
 class Planar(Lens):
@@ -219,6 +216,7 @@ class Planar(Lens):
 
     def _newton(self, start: Array, measured: Array) -> Array:
         """Points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
+        longest = 0.1  # step of Newton's method, of the limit
         flat, rows = start.copy(), np.arange(len(start))
         for _ in range(STEPS):
             here = flat[rows]
@@ -228,7 +226,7 @@ class Planar(Lens):
             step /= (xx * yy - xy * yx)[:, None]
             # At the limit the map hardly grows, and a whole step would end behind others that lead past it.
             length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, _LONGEST * self._limit / np.maximum(length, 1e-300))[:, None]
+            step *= np.minimum(1.0, longest * self._limit / np.maximum(length, 1e-300))[:, None]
             flat[rows] = here - step
             rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
             if not len(rows):

@@ -16,9 +16,6 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, horner, invert_increasing
 
-_MOST_POWER = 30  # 100,000 px to this power has a square that a computer holds
-_STEPS = 30  # of a fixed point, each of which gains some two digits
-
 
 @dataclass(frozen=True)
 class Radial(Lens):
@@ -40,11 +37,12 @@ class Radial(Lens):
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"tangential": ("p1", "p2")})
 
     def __post_init__(self) -> None:
+        most_power = 30  # 100,000 px to this power has a square that a computer holds
         powers = tuple(int(p) for p in self.powers)
         distinct = powers and len(set(powers)) == len(powers) and powers == tuple(self.powers)
-        if not distinct or not all(2 <= power <= _MOST_POWER for power in powers):
+        if not distinct or not all(2 <= power <= most_power for power in powers):
             raise InputError(
-                f"powers of the radial lens must be different whole numbers from 2 to {_MOST_POWER}, not {self.powers}"
+                f"powers of the radial lens must be different whole numbers from 2 to {most_power}, not {self.powers}"
             )
         object.__setattr__(self, "powers", powers)
         super().__post_init__()
@@ -147,9 +145,10 @@ class Radial(Lens):
         return measured + phi * self._decentring(ideal / phi) if self._across else measured
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
+        steps = 30  # of a fixed point, each of which gains some two digits
         ideal = self._ideal(offsets)
         if self._across:
-            for _ in range(_STEPS):
+            for _ in range(steps):
                 before, ideal = ideal, self._ideal(offsets - phi * self._decentring(ideal / phi))
                 if not np.nanmax(np.abs(ideal - before), initial=0.0) > 1e-12 * phi:
                     break

@@ -31,16 +31,12 @@ from ceres_cal.scene.lens.surface import (
     roughness,
 )
 
-_CONRADY = 3  # terms of the decentring
-_MOST = 9  # powers across the radius
 _TINY = 1e-150
 _TURNS = 48  # directions, between which nothing turns
 _STEPS = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
-_START_WEIGHT = 1e-4  # of the roughness of a start beside its equations
 # Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
 # ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
 _LOOSE, _LOOSE_ACROSS, _LEAST, _LEAST_ACROSS = 1000.0, 1e-2, 0.1, 3e-3
-_LOOSE_SURFACE, _LEAST_SURFACE = 1e-3, 1e-5
 _BEYOND = 1.15  # of the picture, how far a surface goes: places move by less than that
 
 
@@ -63,9 +59,10 @@ def _monomials(powers: tuple[int, ...]) -> tuple[_Monomial, ...]:
     with Conrady's further terms, |q|^2 and |q|^4 times as large. Of odd powers q |q|^2k is along the radius, or a
     twist, which no lens has.
     """
+    conrady = 3  # terms of the decentring
     every = []
     for power in powers:
-        for k in range(_CONRADY if power == 2 else 0):
+        for k in range(conrady if power == 2 else 0):
             names = (f"p{2 * k + 2}", f"p{2 * k + 1}")
             every.append(_Monomial(names, False, k + 1, k + 1, 2.0 / 3.0))
             every.append(_Monomial(names, True, k + 2, k, 1.0 / 3.0))
@@ -111,10 +108,11 @@ class Spline(Planar):
     set_at_start: ClassVar[tuple[str, ...]] = ("rim", *EXTENTS)
 
     def __post_init__(self) -> None:
+        most = 9  # powers across the radius
         powers = tuple(int(p) for p in self.powers)
-        if len(set(powers)) != len(powers) or powers != tuple(self.powers) or not all(2 <= p <= _MOST for p in powers):
+        if len(set(powers)) != len(powers) or powers != tuple(self.powers) or not all(2 <= p <= most for p in powers):
             raise InputError(
-                f"powers of the spline lens must be different whole numbers from 2 to {_MOST}, not {powers}"
+                f"powers of the spline lens must be different whole numbers from 2 to {most}, not {powers}"
             )
         object.__setattr__(self, "powers", powers)
         object.__setattr__(self, "values", tuple(self.values) or (0.0,) * len(self.names))
@@ -173,15 +171,17 @@ class Spline(Planar):
         return self.with_values(list(given.values()))
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
+        start_weight = 1e-4  # of the roughness of a start beside its equations
         rim = self._rim_px
         u = 2.0 * phi * np.tan(0.5 * angle) / rim
         sizes, directions = np.linalg.eigh(bending())
-        rough = directions * np.sqrt(np.maximum(sizes, 0.0)) * _START_WEIGHT
+        rough = directions * np.sqrt(np.maximum(sizes, 0.0)) * start_weight
         rows = np.vstack([profile_columns(np.nan_to_num(u)), rough.T])
         return {f"g{k + 1}": rows[:, k] for k in range(COUNT)}, np.append(measured - rim * u, np.zeros(COUNT))
 
     @property
     def roughness(self) -> tuple[Roughness, ...]:
+        loose_surface, least_surface = 1e-3, 1e-5
         rim, names = self._rim_px, self.names
         along = Roughness(names[1 : 1 + COUNT], bending(), _LOOSE * rim, _LEAST * rim)
         across = []
@@ -191,7 +191,7 @@ class Spline(Planar):
             across.append(Roughness(own, np.eye(len(own)), _LOOSE_ACROSS * rim, least))
         if self._surface is not None:
             matrix = roughness(*self._surface.extents.tolist())
-            across.append(Roughness(NODES, matrix, _LOOSE_SURFACE * rim, _LEAST_SURFACE * rim))
+            across.append(Roughness(NODES, matrix, loose_surface * rim, least_surface * rim))
         return (along, *across)
 
     # ---- in arrays ---------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from ceres_cal.scene.targets.painted_fields import painted_field as painted_fiel
 from ceres_cal.scene.targets.painted_fields import ssl_field as ssl_field
 from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS
 from ceres_cal.scene.targets.registry import target_from_spec as target_from_spec
+from ceres_cal.scene.targets.registry import target_named as target_named
 from ceres_cal.scene.targets.registry import targets_by_name as targets_by_name
 from ceres_cal.scene.targets.registry import targets_from_specs as targets_from_specs
 from ceres_cal.scene.targets.target import Grid as Grid

@@ -20,7 +20,6 @@ Place = tuple[float, float, float]
 MOST_CURVES = 300
 """More than these are no drawing that somebody reads names off: their crossings have none."""
 _SAME_M = 1e-6
-_LEAST_SINE = 0.17  # of the angle between them
 
 
 def crossings(curves: Mapping[str, Curve]) -> dict[str, Place]:
@@ -82,6 +81,7 @@ def _box(curve: Curve) -> Array:
 
 def _met(one: Curve, other: Curve) -> list[Place]:
     """The places at which two curves of one height cross, in their order along the first, or along the line."""
+    least_sine = 0.17  # of the angle between them
     if isinstance(one, Arc) and isinstance(other, Segment):
         return _met(other, one)
     heights = {place[2] for curve in (one, other) for place in _levels(curve)}
@@ -95,7 +95,7 @@ def _met(one: Curve, other: Curve) -> list[Place]:
         s = np.sort(np.mod(_on_both(one, other) - one.from_rad, 2.0 * np.pi)) + one.from_rad  # type: ignore[arg-type]
     there = along_curve(one, s)
     kept = (
-        _between_ends(one, there, slack) & _between_ends(other, there, slack) & (_sine(one, other, there) > _LEAST_SINE)
+        _between_ends(one, there, slack) & _between_ends(other, there, slack) & (_sine(one, other, there) > least_sine)
     )
     return [(float(x), float(y), float(z)) for x, y, z in there[kept]]
 

@@ -54,6 +54,12 @@ def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, T
     return targets
 
 
+def target_named(name: str) -> Target | None:
+    """One of `targets_by_name`, without making the others; None where there is none of the name."""
+    every = (kind.examples() for kind in TARGET_KINDS.values() if name != kind.name)
+    return next((examples[name] for examples in every if name in examples), None)
+
+
 def targets_by_name() -> dict[str, Target]:
     """The targets of any kind that exist in the world, such as ssl-a."""
     every = ((kind, *example) for kind in TARGET_KINDS.values() for example in kind.examples().items())
