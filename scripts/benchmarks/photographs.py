@@ -26,13 +26,16 @@ SAMPLE = Path(__file__).parents[2] / "data" / "ssl_field" / "photographs"
 _OURS = """
 import sys
 from pathlib import Path
+from time import process_time
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.scene.targets import checkerboard
 columns, rows, *paths = sys.argv[1:]
+imported = process_time()
 found = detect_boards([Path(path) for path in paths], checkerboard(int(columns), int(rows), 0.03))
+detected = process_time()
 fit = calibrate(found.observations).fit
-print(len(found.found), fit.points_rms_px)
+print(len(found.found), fit.points_rms_px, imported, detected - imported, process_time() - detected)
 """
 _OPENCV = """
 import sys, cv2, numpy as np
@@ -92,7 +95,9 @@ def _row(one: BoardSet, repeat: int) -> dict[str, Any]:
     row: dict[str, Any] = {"set": one.name}
     for name, program in programs.items():  # files are read once
         said = subprocess.run([sys.executable, "-c", *program], capture_output=True, text=True, check=True).stdout
-        row[f"{name}_boards"], row[f"{name}_rms_px"] = int(said.split()[0]), float(said.split()[1])
+        boards, rms_px, *parts = map(float, said.split())
+        row[f"{name}_boards"], row[f"{name}_rms_px"] = int(boards), rms_px
+        row |= dict(zip(("imports", "corners", "calibration"), parts, strict=False))
     turns = []
     for _ in range(repeat):
         turn = {name: spent([sys.executable, "-c", *program]) for name, program in programs.items()}

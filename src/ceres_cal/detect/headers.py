@@ -11,14 +11,11 @@ _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the ot
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:
-    """(width, height) of a PNG, JPEG, BMP, TIFF, WebP, JPEG 2000 or PNM file; None where it is none of them."""
-    try:
-        return _size(content)
-    except struct.error:  # reads: "not an image that OpenCV can read (cut short?)"
-        return None
+    """(width, height) of a PNG, JPEG, BMP, TIFF, WebP, JPEG 2000 or PNM file; None where it is none of them.
 
-
-def _size(content: bytes) -> tuple[int, int] | None:
+    Raises:
+        struct.error: its header is cut short.
+    """
     if content.startswith(b"\x89PNG\r\n\x1a\n"):
         return _png(content)
     if content.startswith(b"BM"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -58,14 +60,12 @@ def read_colour(path: str | Path) -> Image:
 
 def _decoded(path: str | Path, channels: int) -> Image:
     content = read_bytes(path)
-    size = claimed_size(content)
-    if size is not None:
-        _require_believable(size, len(content), str(path))
     flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = None if size is None else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error:  # reads: "not an image that OpenCV can read (cut short?)"
-        image = None
+    image = None
+    with suppress(cv2.error, struct.error):  # reads: "not an image that OpenCV can read (cut short?)"
+        if size := claimed_size(content):
+            _require_believable(size, len(content), str(path))
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
         raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
     return image

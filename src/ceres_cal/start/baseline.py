@@ -46,8 +46,8 @@ def four_point_baseline(sights: Sights, start: Estimate) -> Estimate:
 def _with_rings(camera: Camera, name: str, sights: Sights) -> Camera:
     for sight in sights.of_camera(name):
         if isinstance(camera.lens, Radial) and len(set(sight.track_index[sight.on_arc])) > 2:
-            radii = ring_radii(sight.about(camera))
-            a1, *rest = fit_rings(radii.measured_px, radii.ring_m, (1, *camera.lens.powers))
+            _, measured_px, ring_m = ring_radii(sight.about(camera))
+            a1, *rest = fit_rings(measured_px, ring_m, (1, *camera.lens.powers))
             return replace(camera, lens=camera.lens.with_values(np.array(rest) / a1))
     return camera
 

@@ -91,51 +91,29 @@ class PosedSights:
 
 def posed_sights(observations: Observations, sights: Sights, options: Options) -> PosedSights:
     """Every camera with the sights that pose it, each camera by itself."""
-    starts: dict[str, _CameraStart] = {}
-    numbers: list[Indices] = []
-    others: list[tuple[SightKey, Array, Camera]] = []
-    left: dict[int, tuple[str, ...]] = {}
     priors = (*observations.priors, *options.priors)
+    parts: list[PosedSights] = []
     for name, image_size in observations.cameras.items():
         blank = _blank_camera(name, image_size, options, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
-        start = _start_camera(blank, seen, options, [p for p in priors if _concerns(p, name, seen)])
-        starts[name] = start
-        numbers.append(own[start.sights])
-        others += [(seen.keys[n], pose, camera) for n, pose, camera in start.others]
-        left |= {int(own[n]): names for n, names in start.open.items()}
+        one = _start_camera(name, blank, seen, options, [p for p in priors if _concerns(p, name, seen)])
+        there = {int(own[number]): names for number, names in one.open.items()}
+        parts.append(replace(one, numbers=own[one.numbers], open=there))
     return PosedSights(
-        {name: start.camera for name, start in starts.items()},
-        {name: start.phi_from for name, start in starts.items()},
-        np.concatenate(numbers),
-        np.concatenate([start.poses for start in starts.values()]),
-        tuple(others),
-        left,
+        {name: camera for part in parts for name, camera in part.cameras.items()},
+        {name: source for part in parts for name, source in part.phi_from.items()},
+        np.concatenate([part.numbers for part in parts]),
+        np.concatenate([part.poses for part in parts]),
+        tuple(other for part in parts for other in part.others),
+        {number: names for part in parts for number, names in part.open.items()},
     )
 
 
 # ---- one camera -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _CameraStart:
-    """Of one camera.
-
-    Attributes:
-        sights, poses: numbers (K,) and cam_from_frame (K, 3, 4). others: number of a sight, its pose (3, 4) and the
-            camera where that is seen from elsewhere. open: what each other sight of the world leaves open.
-    """
-
-    camera: Camera
-    phi_from: str
-    sights: Indices
-    poses: Array
-    others: tuple[tuple[int, Array, Camera], ...]
-    open: Mapping[int, tuple[str, ...]]
-
-
-def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior]) -> _CameraStart:
+def _start_camera(name: str, blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior]) -> PosedSights:
     """From the sights of one camera about its principal point, and the priors that concern it."""
     unit = unit_px(blank)
     given = _held_profile(blank, sights, options)
@@ -160,7 +138,7 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
             told = one.tells_phi
     poses |= {n: one.places[0].pose for n, one in found.items() if n in poses or not one.open}
     others = tuple(
-        (n, place.pose, _with_lens(blank, sights, place.profile, place.phi, options))
+        (sights.keys[n], place.pose, _with_lens(blank, sights, place.profile, place.phi, options))
         for n, one in found.items()
         for place in one.places[1:]
         if n in poses
@@ -168,7 +146,7 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     camera = _with_lens(blank, sights, profile, phi, options)
     numbers, stack = np.array(list(poses), dtype=np.int64), np.array(list(poses.values())).reshape(-1, 3, 4)
     lost = {n: one.open for n, one in found.items() if n not in poses}
-    return _CameraStart(camera, phi_from, numbers, stack, others, lost)
+    return PosedSights({name: camera}, {name: phi_from}, numbers, stack, others, lost)
 
 
 def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> tuple[float, float]:

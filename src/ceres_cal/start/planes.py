@@ -265,20 +265,9 @@ def _is_lens(c: tuple[float, ...]) -> bool:
 _RADII = np.linspace(0.0, 1.0, 21)
 
 
-@dataclass(frozen=True, eq=False)
-class RingRadii:
-    """Rings seen about frontally: their centre (2,) px, and for each observation (M,) its distance from there (px) and
-    the radius of its ring (m).
-    """
-
-    centre: Array
-    measured_px: Array
-    ring_m: Array
-
-
-def ring_radii(sight: Sights) -> RingRadii:
-    """Radii of the rings that a sight about its camera shows, around their own centre: it need not be the principal
-    point (paper, section 2).
+def ring_radii(sight: Sights) -> tuple[Array, Array, Array]:
+    """Of rings that a sight about its camera shows: their own centre (2,) px, which need not be the principal point
+    (paper, section 2), and of each observation (M,) its distance from there, px, and the radius of its ring, m.
     """
     on_ring = sight.on_arc
     offsets = sight.curve_pixels[on_ring]
@@ -291,16 +280,15 @@ def ring_radii(sight: Sights) -> RingRadii:
         mean = np.bincount(ring, radius) / np.bincount(ring)
         direction = away / np.maximum(radius, 1e-9)[:, None]
         centre = centre + np.linalg.lstsq(direction, radius - mean[ring], rcond=None)[0]
-    return RingRadii(centre, np.linalg.norm(offsets - centre, axis=1), radii)
+    return centre, np.linalg.norm(offsets - centre, axis=1), radii
 
 
 def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
-    radii = ring_radii(sight)
-    if len(distinct(radii.ring_m)) < 3:  # they tell a magnification, and nothing of the lens
-        profile, kappa = RadialProfile((0.0, 0.0), unit), float(np.mean(radii.measured_px / radii.ring_m))
+    (cx, cy), measured_px, ring_m = ring_radii(sight)
+    if len(distinct(ring_m)) < 3:  # they tell a magnification, and nothing of the lens
+        profile, kappa = RadialProfile((0.0, 0.0), unit), float(np.mean(measured_px / ring_m))
     else:
-        profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
-    cx, cy = radii.centre
+        profile, kappa = ring_profile(measured_px, ring_m, unit)
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 

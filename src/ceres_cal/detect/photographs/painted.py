@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,33 +24,30 @@ _SURELY = 3.0
 _LACKS = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class _PaintCoverage:
-    """Of each of the target's C curves: places in view, and those of them that have paint nearby."""
-
-    places: Array
-    bright: Array
-
-    def lacks(self, target: Target, part: Collection[str]) -> bool:
-        """Whether these curves are in view and hardly more is seen of them than by chance."""
-        rows = [target.curve_index[name] for name in part]
-        return bool(np.sum(self.bright[rows]) < _LACKS * np.sum(self.places[rows]))
-
-
 def _seen(
     grey: Array32, target: Target, camera: Camera, curves: Collection[str], share_of_image: float = _REACH
-) -> _PaintCoverage:
+) -> tuple[Array, Array]:
+    """Of each of the target's C curves: places in view, and those of them that have paint nearby."""
     course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
     count = len(target.curves)
     if len(course) < _FEWEST:
-        return _PaintCoverage(np.zeros(count), np.zeros(count))
+        return np.zeros(count), np.zeros(count)
     reach_px = 0.5 * share_of_image * float(np.hypot(*camera.image_size))
     anywhere = _laid_anywhere(camera.image_size, float(np.median(course.width_px)))
     by_chance = float(np.quantile(search(grey, anywhere, reach_px)[1], 1.0 - BY_CHANCE))
     bright = search(grey, course, reach_px)[1] > by_chance
-    return _PaintCoverage(
-        *(np.bincount(course.curve, one, count).astype(float) for one in (np.ones(len(course)), bright))
-    )
+    places, painted = (np.bincount(course.curve, one, count) for one in (np.ones(len(course)), bright))
+    return places.astype(float), painted.astype(float)
+
+
+def _lacking(target: Target, places: Array, bright: Array) -> set[str]:
+    """Curves of the optional parts that are in view, and of which hardly more is seen than by chance."""
+    names: set[str] = set()
+    for part in target.optional:
+        rows = [target.curve_index[name] for name in part]
+        if np.sum(bright[rows]) < _LACKS * np.sum(places[rows]):
+            names |= set(part)
+    return names
 
 
 def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
@@ -66,8 +62,7 @@ def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
 
 def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
     """These curves without the optional parts of the target that are not in the picture, where the camera sees them."""
-    seen = _seen(grey, target, camera, curves)
-    lacking = {name for part in target.optional if seen.lacks(target, part) for name in part}
+    lacking = _lacking(target, *_seen(grey, target, camera, curves))
     return tuple(name for name in curves if name not in lacking)
 
 
@@ -75,9 +70,9 @@ def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
     other paint, to be measured.
     """
-    seen = _seen(grey, target, camera, curves, _NEAR)
-    share = np.maximum(seen.bright / np.maximum(seen.places, 1.0), BY_CHANCE)
-    sure = seen.places * divergence(share, BY_CHANCE) > _SURELY
+    places, bright = _seen(grey, target, camera, curves, _NEAR)
+    share = np.maximum(bright / np.maximum(places, 1.0), BY_CHANCE)
+    sure = places * divergence(share, BY_CHANCE) > _SURELY
     return tuple(name for name in curves if sure[target.curve_index[name]])
 
 
@@ -88,11 +83,10 @@ def likelihood_of_place(grey: Array32, target: Target, camera: Camera, curves: C
     target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere. Optional parts
     that are not seen say nothing.
     """
-    seen = _seen(grey, target, camera, curves)
-    painted = np.ones(len(target.curves), dtype=bool)
-    for part in target.optional:
-        painted[[target.curve_index[name] for name in part]] &= not seen.lacks(target, part)
-    places, bright = seen.places[painted], seen.bright[painted]
+    places, bright = _seen(grey, target, camera, curves)
+    lacking = _lacking(target, places, bright)
+    painted = np.array([name not in lacking for name in target.curves], dtype=bool)
+    places, bright = places[painted], bright[painted]
     if not np.sum(places):
         return -np.inf
     own, share = bright / np.maximum(places, 1.0), max(float(np.sum(bright) / np.sum(places)), BY_CHANCE)
