@@ -265,7 +265,7 @@ def test_from_photographs_alone_to_a_calibration(
         assert message in capsys.readouterr().err
     without = [argument for argument in detect if argument != "--auto"]
     assert main([*without, "--start", calibration, "--facing", "LeftGoalLine=top"]) == 2
-    assert "--facing goes with --auto" in capsys.readouterr().err
+    assert "--facing is for --auto" in capsys.readouterr().err
     assert main([*without, "--target", "ssl-b"]) == 2
     assert "or --auto" in capsys.readouterr().err
 

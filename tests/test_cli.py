@@ -365,7 +365,7 @@ def test_a_wrong_prior_is_said_by_every_command(say: Say, tmp_path: Path) -> Non
     out = tmp_path / "calibration.json"
     text = say("calibrate", SAMPLE, "-o", out, "--prior", "height_m=3:0.005").out
     assert "warning   the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 4.02" in text
-    assert "verdict   Do not trust this calibration: what was known beforehand is contradicted." in text
+    assert "verdict   Do not trust this calibration: the observations contradict what was stated beforehand." in text
     diagnosed = say("diagnose", out, SAMPLE, "--json")
     (conflict,) = json.loads(diagnosed.out)["conflicts"]
     assert diagnosed.code == 1 and conflict["stated"] == 3.0 and abs(conflict["seen"] - 4.02) < 0.02
@@ -543,7 +543,7 @@ def test_what_is_usual_of_cameras_is_taken_where_observations_say_less(say: Say,
 def test_says_what_boards_alone_cannot_tell(say: Say, tmp_path: Path) -> None:
     say("simulate", "boards", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--fix", "a3=6.1e-7", "--free-aspect")
-    assert "held as the world" in said.out and "height" not in said.out
+    assert "defines the world" in said.out and "height" not in said.out
     assert "a3              6.1e-07 (held)" in said.out and "aspect          1.000" in said.out
 
 

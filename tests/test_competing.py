@@ -220,7 +220,7 @@ def test_rejected_warning_and_screen_say_which_and_how_far(tmp_path: Path, capsy
     calibration = calibrate(observations, RADIAL)
     reason = "the whole of line 'CenterLine' in frame '0001': 25 rows, "
     assert {one.reason[: len(reason)] for one in calibration.rejected} == {reason}
-    aside_px = float(calibration.rejected[0].reason.removeprefix(reason).removesuffix(" px aside"))
+    aside_px = float(calibration.rejected[0].reason.removeprefix(reason).removesuffix(" px off"))
     assert aside_px == pytest.approx(6.0, abs=0.3)  # 0.1 measured
     assert any(warning.startswith(reason) for warning in calibration.warnings)
     again = Calibration.from_file(calibration.to_file())
@@ -229,7 +229,7 @@ def test_rejected_warning_and_screen_say_which_and_how_far(tmp_path: Path, capsy
     assert main(["calibrate", str(tmp_path / "seen.json"), "-o", str(tmp_path / "calibration.json")]) == 0
     screen = capsys.readouterr().out
     assert "25  the whole of line 'CenterLine' in frame '0001'" in screen
-    assert "taken out as one" in " ".join(screen.split())
+    assert "taken out together" in " ".join(screen.split())
 
 
 def test_a_suspect_without_which_nothing_is_determined_stays_in() -> None:

@@ -91,7 +91,7 @@ def test_nothing_is_promised_then() -> None:
     assert height.value == pytest.approx(HEIGHT_M, abs=0.1) and height.low < 3.0 < HEIGHT_M < height.high
     judged = verdict(wrong(), seen())
     assert judged.level == "no" and "mm" not in judged.headline
-    assert judged.headline == "Do not trust this calibration: what was known beforehand is contradicted."
+    assert judged.headline == "Do not trust this calibration: the observations contradict what was stated beforehand."
     found = diagnose(wrong(), seen())
     assert found.conflicts == wrong().conflicts
 

@@ -83,7 +83,7 @@ def test_distorted_views_widen_everything() -> None:
 def test_lines_that_are_each_aside_are_named() -> None:
     calibration = calibrate(half_a_field(partial(along_lines, length_m=50.0), 1), HALF.options)
     assert np.median(factors(calibration)) > 1.3
-    assert "errors go together along lines" in calibration.uncertainty.widening
+    assert "errors are correlated along lines" in calibration.uncertainty.widening
 
 
 def test_what_all_frames_share_does_not_shrink_with_them() -> None:

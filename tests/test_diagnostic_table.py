@@ -110,7 +110,9 @@ def test_it_is_in_the_command_s_answer_and_in_the_report(
     assert finding["kind"] == "wave" and finding["wrong"] == "model" and finding["amounts"][0]["unit"] == "px"
     write_report(tmp_path / "report.html", calibration, swayed, diagnose(calibration, swayed))
     page = (tmp_path / "report.html").read_text()
-    assert "its rows of pixels sway by" in page and "The model is wrong: wave (overhead)" in page
+    assert (
+        "its rows of pixels sway by" in page and "The model is wrong by up to " in page and ": wave (overhead)" in page
+    )
 
 
 def test_without_it_the_fault_has_no_name(
@@ -136,4 +138,4 @@ def test_what_the_data_cannot_tell_apart_is_named_by_both_names(
     monkeypatch.setitem(EFFECTS, "shaking", Shaking())
     (finding,) = diagnose(calibration, swayed).findings
     other = {"wave": "shaking", "shaking": "wave"}[finding.kind]
-    assert finding.sentence.endswith(f"; these data cannot tell it from {other} (overhead)")
+    assert finding.sentence.endswith(f"; these data do not distinguish it from {other} (overhead)")

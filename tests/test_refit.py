@@ -186,7 +186,7 @@ def test_few_lines_do_not_tell_a_large_move(calibration: Calibration) -> None:
 
 def test_parallel_lines_are_refused(calibration: Calibration) -> None:
     lines = only(seen(HOME, NOISE, 3).observations, "CenterLine", "TopTouchLine")
-    with pytest.raises(DegenerateError, match="do not tell its"):
+    with pytest.raises(DegenerateError, match="do not determine its"):
         refit(calibration, lines)
 
 

@@ -41,7 +41,7 @@ SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
 HOSTILE = '<script>alert("x")</script>&\'$a_b$'
 PICTURES = (
     "vectors-0", "radius-0", "lens-0", "frames", "outliers", "map-0-0", "image-0", "map-0-1", "correlation",
-    "convergence", "closed-form",
+    "convergence", "closed-form", "support-0",
 )  # fmt: skip
 
 
@@ -130,7 +130,7 @@ def test_every_reference_in_the_page_leads_to_one_place() -> None:
 
 def test_verdict_first_then_findings_numbers_pictures() -> None:
     sections = re.findall(r'<section id="(\w+)"', sample_page())
-    assert sections == ["verdict", "findings", "numbers", "residuals", "maps", "solve"]
+    assert sections == ["verdict", "support", "findings", "numbers", "residuals", "maps", "solve"]
     assert headline(sample_page()).startswith("good: This calibration can be trusted: to 0.")
 
 
@@ -141,7 +141,7 @@ def test_every_picture_has_its_sentence_and_its_table() -> None:
     for name, figure in zip(names, figures, strict=True):
         reading = re.search(r"<figcaption>(.*?)</figcaption>", figure)
         assert reading is not None and len(reading[1]) > 60, name
-        assert figure.count("<svg") == (2 if name.startswith("vectors") else 1)
+        assert figure.count("<svg") == (2 if name.startswith(("vectors", "support")) else 1)
         table = re.search(r"<details><summary>.*?</summary>.*<tbody>(.*?)</tbody>", figure, flags=re.S)
         assert table is not None and table[1].count("<tr>") >= 4, name
 
@@ -199,9 +199,9 @@ def test_a_report_of_other_observations_says_so(tmp_path: Path) -> None:
 
 def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
     page = frontal_page()
-    assert headline(page).startswith("care: Trust it on the floor alone, to ")
-    assert headline(page).endswith("places at robot height (150\N{NO-BREAK SPACE}mm) cannot be told.")
-    assert "only their ratio is known" in page and "the observations cannot tell how far off" in page.lower()
+    assert headline(page).startswith("care: Usable on the floor only, to ")
+    assert headline(page).endswith("places at robot height (150\N{NO-BREAK SPACE}mm) are not known.")
+    assert "only their ratio is known" in page and "the observations do not determine how far off" in page.lower()
     assert "nan" not in re.sub(r"<svg.*?</svg>|<style.*?</style>", "", page, flags=re.S).lower().split()
 
 
@@ -209,8 +209,8 @@ def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
 def test_a_wrong_model_is_never_simply_trusted() -> None:
     observations = sample()[1]
     page = make_report(calibrate(observations, Options(powers=(3,))), observations)
-    assert headline(page).startswith("no: Do not trust this calibration: what is named below moves it by ")  # 69 sd
-    assert "The accuracy in the first line includes it" in page
+    assert headline(page).startswith("no: Do not trust this calibration: the faults below move it by ")  # 69 sd
+    assert "The accuracy in the first line includes this" in page
     cards = re.findall(r'<article class="card (\w+)"><h3>(.*?)</h3>', page)
     assert cards[0][0] == "no" and "residuals follow the radius" in cards[0][1]
 
@@ -225,7 +225,7 @@ def test_no_accuracy_is_stated_where_the_noise_is_three_times_the_stated_one() -
     )
     judged = judge_quality(quality_of(calibrate(stated, RADIAL), stated))
     assert judged.level == "care"
-    assert judged.headline == "Use it with care, no accuracy can be stated: the noise is 3.5 times what was stated."
+    assert judged.headline == "Usable with limits, without a stated accuracy: the noise is 3.5 times the stated sigma."
 
 
 def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
@@ -268,17 +268,17 @@ def test_boards_alone_tell_no_places() -> None:
     observations = simulate(scene, disturbance, seed=1).observations
     page = make_report(calibrate(observations, RADIAL), observations)
     assert headline(page) == (
-        "good: The intrinsics can be trusted, to 1.8 px of the picture that was observed. No station sees a field: "
-        "places in the world cannot be told."
+        "good: The intrinsics can be trusted, to 1.8 px in the observed part of the image. No station sees a field, "
+        "so places in the world are not known."
     )
-    assert '<figure id="map' not in page and "held as the world" in page
+    assert '<figure id="map' not in page and "defines the world" in page
 
 
 @pytest.mark.usefixtures("words_alone")
 def test_the_closed_form_alone_is_not_to_be_used() -> None:
     observations = sample()[1]
     page = make_report(calibrate(observations, Options(lens="radial", closed_form_only=True)), observations)
-    assert headline(page).startswith("no: Not to be used: nothing was minimised")
+    assert headline(page).startswith("no: Not to be used: this is the closed form of the paper")
 
 
 def test_a_solve_that_did_not_come_to_rest_is_not_trusted() -> None:
@@ -296,8 +296,8 @@ def test_a_diagnosis_that_fails_lowers_the_verdict(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(quality, "diagnose", fails)
     judged = judge_quality(quality_of(calibration, observations))
     assert judged.level == "care" and "can be trusted" not in judged.headline
-    assert judged.headline == "Use it with care, no accuracy can be stated: its residuals could not be judged."
-    assert "Its residuals could not be judged, so nothing says whether the model is right: nothing came out." in [
+    assert judged.headline == "Usable with limits, without a stated accuracy: its residuals could not be judged."
+    assert "Its residuals could not be judged. So it is not known whether the model is right: nothing came out." in [
         words for level, words in judged.reasons if level == "care"
     ]
 
@@ -311,7 +311,7 @@ def test_levels(radius: float, level: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "turned_deg, found", [(0.0, "good: This"), (0.05, "care: Use it"), (0.5, "no: It does not hold")]
+    "turned_deg, found", [(0.0, "good: This"), (0.05, "care: Usable with limits"), (0.5, "no: It does not hold")]
 )
 @pytest.mark.usefixtures("words_alone")
 def test_new_data_tell_a_camera_that_was_bumped(turned_deg: float, found: str) -> None:
@@ -425,7 +425,7 @@ def test_no_number_is_green_under_a_verdict_that_promises_nothing() -> None:
     )
     page = make_report(calibration, observations)
     assert headline(page).startswith("no: ") and 'class="tile good"' not in page
-    assert "these maps hold only if what it doubts is set right" in page
+    assert "These maps hold only after its reasons are corrected" in page
     assert "these maps hold only" not in sample_page() and 'class="tile good"' in sample_page()
 
 
@@ -457,7 +457,7 @@ def test_what_a_lens_shows_is_as_uncertain_as_lenses_scatter() -> None:
 @pytest.mark.usefixtures("words_alone")
 def test_commands_write_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one, page, again = tmp_path / "one.json", tmp_path / "one.html", tmp_path / "again.html"
-    assert main(["calibrate", str(SAMPLE), "-o", str(one), "--report", str(page), "--quiet"]) == 0
+    assert main(["calibrate", str(SAMPLE), "-o", str(one), "--report", str(page)]) == 0
     assert str(page) in capsys.readouterr().out
     assert main(["diagnose", str(one), str(SAMPLE), "--report", str(again), "--json"]) in (0, 1)
     assert f'"report": "{again}"' in capsys.readouterr().out

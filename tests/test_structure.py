@@ -165,7 +165,7 @@ def test_what_each_number_moves() -> None:
 @pytest.mark.parametrize(
     "tolerances, message",
     [
-        ({"pitch": Tolerance(lines_m=0.01)}, "a tolerance names target 'pitch'"),
+        ({"pitch": Tolerance(lines_m=0.01)}, "a tolerance: there is no target 'pitch'"),
         ({"field": Tolerance(warp_m=0.01)}, "a warp is for checkerboards"),
     ],
 )

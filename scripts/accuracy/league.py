@@ -160,8 +160,8 @@ def _fault(calibration: Calibration, scene: Scene, priors: Sequence[Prior]) -> s
         return f"a place is {radii:.1f} radii off"
     for prior in priors:
         sd = calibration.uncertainty.verdict("station", prior.name, "height").sd
-        doubt = f"in doubt about the stated height of station {prior.name!r}"
-        if sd > prior.sigma[0] * (1.0 + 1e-9) and not any(doubt in one for one in calibration.warnings):
+        said = (one for one in calibration.warnings if f"the stated height of station {prior.name!r}" in one)
+        if sd > prior.sigma[0] * (1.0 + 1e-9) and not any("It may be wrong" in one for one in said):
             return f"height is stated to {1e3 * prior.sigma[0]:.1f} mm and known to {1e3 * sd:.1f} mm"
     return ""
 

@@ -37,18 +37,18 @@ if TYPE_CHECKING:
 
 
 _UNKNOWN = (
-    "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
-    "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
+    "camera {!r}: its views are too frontal to determine phi (95 %: {}). Heights are correlated with phi: places on "
+    "the floor are right, places above it are not. Add boards tilted by 20 degrees, or a prior on height_m"
 )
 # Sizes that move a pixel of the image's corner by half the diagonal: a lens in which so many are one standard deviation
 # is none. Where as many equations as numbers leave a coefficient to rounding it is thousands of times that.
 _LOST = 1e3
 # Times the standard deviation of phi without what is usual of cameras: what rests on it is said.
 _RESTING = 1.5
-RESTING = "rests on what is usual of cameras"
+RESTING = "are determined only with what is usual of cameras"
 _USUAL = (
-    f"camera {{!r}}: phi, and what goes with it, {RESTING}, a usual phi, a principal point near the middle of the "
-    "image, square pixels and little decentring: without that its standard deviation is {}"
+    f"camera {{!r}}: phi and the numbers correlated with it {RESTING} (a usual phi, a principal point near the "
+    "middle of the image, square pixels, little decentring). Without that the standard deviation of phi is {}"
 )
 
 
@@ -63,7 +63,7 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
         ]
         if lost:
             raise DegenerateError(
-                f"camera {name!r}: its observations do not tell {', '.join(lost)} of the {camera.lens.kind} lens: "
+                f"camera {name!r}: its observations do not determine {', '.join(lost)} of the {camera.lens.kind} lens: "
                 f"show more of the targets, or hold them, such as --fix {lost[-1]}=0"
             )
 

@@ -11,7 +11,7 @@ from ceres_cal.report.document import Card, Chapter, Piece, Table, Text, Tile, T
 from ceres_cal.report.page import page
 
 _MOST_CARDS = 40
-_WORDS = {"failed": "failed", "no": "not to be trusted, or moved", "care": "to be used with care", "good": "good"}
+_WORDS = {"failed": "failed", "no": "not to be trusted, or moved", "care": "usable with limits", "good": "good"}
 _LEVELS = {"failed": "no"}
 """What the page colours otherwise."""
 

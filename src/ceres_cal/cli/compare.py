@@ -127,5 +127,5 @@ def _explained(one: Agreement) -> str:
     return {
         True: f"explained by their uncertainties (probability {one.probability:.2g})",
         False: f"more than their uncertainties explain (probability {one.probability:.1g})",
-        None: "nothing can be said of uncertainty: it is not told of both",
+        None: "no statement on uncertainty: one of the calibrations does not have it",
     }[one.holds]

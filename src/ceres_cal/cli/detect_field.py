@@ -162,7 +162,7 @@ def _require_fitting(args: FieldArguments) -> None:
     if args.auto and args.corner:
         raise InputError("--corner says where to start and --auto to do without: give one of them")
     if args.facing and not args.auto:
-        raise InputError("--facing goes with --auto: a start says which way round the field is")
+        raise InputError("--facing is for --auto: a start already says which way round the field is")
 
 
 # ---- where to start -------------------------------------------------------------------------------------------------

@@ -195,7 +195,10 @@ def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step
     observations = [data["output"] for data in detected]
     priors = [word for prior in args.prior for word in ("--prior", prior)]
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    asked = [*observations, "--lens", args.lens, *priors, *goal]
+    folders = [str(args.output / video.stem) for video in images_and_videos(args.images)[1]]
+    shown = [name for name in (*args.images, *folders) if Path(name).is_dir() or Path(name).suffix in IMAGE_ENDINGS]
+    images = [word for name in shown if args.target is not None or args.board for word in ("--images", name)]
+    asked = [*observations, "--lens", args.lens, *priors, *goal, *images]
     return _step(args, "calibrate", asked, titles=_SHOWN)
 
 

@@ -25,7 +25,7 @@ _TITLE = re.compile(r"^([a-z][a-z ]{0,8})(?=[ ]*(?<=^.{10})\S)", re.MULTILINE)
 _DOUBTFUL = {"warning", "weak", "unknown", "widened"}
 _ANSWERS = (
     (_GREEN, re.compile(r"^(?:verdict +This calibration can be trusted|(?:check|audit) +yes).*$", re.MULTILINE)),
-    (_YELLOW, re.compile(r"^verdict +Use it with care.*$", re.MULTILINE)),
+    (_YELLOW, re.compile(r"^verdict +Usable (?:with limits|on the floor).*$", re.MULTILINE)),
     (_RED, re.compile(r"^(?:verdict +Do not trust|(?:check|audit) +no\b).*$", re.MULTILINE)),
 )
 

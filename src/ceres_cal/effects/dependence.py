@@ -190,7 +190,7 @@ def _root_of(rising: Callable[[float], float], low: float, high: float) -> float
 
 _DETERMINED = 1e-12  # share of the largest variance of a score: what is below is rounding
 _LIKELY = 0.5  # probability from which on a cause is named
-_OVER = {"points": "errors go together between a target's points", "curves": "errors go together along lines"}
+_OVER = {"points": "errors are correlated between a target's points", "curves": "errors are correlated along lines"}
 
 
 @dataclass(frozen=True)

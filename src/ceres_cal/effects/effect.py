@@ -300,7 +300,7 @@ class Effect(ABC):
         sentence, advice, mending = self.words(evidence)
         if score.rivals:
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
-            sentence += f"; these data cannot tell it from {names}"
+            sentence += f"; these data do not distinguish it from {names}"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
             selection.log10_p(score.log_p), effect.observations, moves=case.moves(score),

@@ -157,8 +157,8 @@ def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     if known >= _UNIQUE or any(shift_m < _SMALL[0] and turn < _SMALL[1] for shift_m, turn in moves):
         return
     raise DegenerateError(
-        f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which tell a small "
-        f"move but not a large one for sure: show {_UNIQUE} (two a point or straight line, three an arc)"
+        f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which determine a "
+        f"small move, not a large one: show {_UNIQUE} (two a point or straight line, three an arc)"
     )
 
 
@@ -175,7 +175,7 @@ def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
             poses[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ candidates[0].pose
     for key in plan.sights.keys:
         if key.placement is not None and key.placement not in poses:
-            raise DegenerateError(f"{key}: its pose cannot be told: show at least four points, not on one line")
+            raise DegenerateError(f"{key}: its pose is not determined: show four points or more, not on one line")
     return poses
 
 
@@ -188,7 +188,7 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
     for key, sd in zip(posterior.keys, posterior.sd.tolist(), strict=True):
         if key.kind == "station" and key.owner in plan.moved and not np.isfinite(sd):
             raise DegenerateError(
-                f"station {key.owner!r}: the observations do not tell its {key.quantity.replace('_', ' ')}: "
+                f"station {key.owner!r}: the observations do not determine its {key.quantity.replace('_', ' ')}: "
                 "add points, or lines in another direction"
             )
     for name in plan.moved:

@@ -108,7 +108,9 @@ def _start(
             numbers.append(number)
             poses.append(candidates[0].pose.matrix)
     if not poses:
-        raise DegenerateError(f"{sights.keys[0]}: its pose cannot be told: show at least four points, not on one line")
+        raise DegenerateError(
+            f"{sights.keys[0]}: its pose is not determined: show four points or more, not on one line"
+        )
     stations, placements = chained_poses(observations, sights, np.array(numbers), np.array(poses), known)
     return Estimate(calibration.cameras, stations, placements, EXACT)
 

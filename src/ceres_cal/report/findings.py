@@ -17,12 +17,11 @@ _MOST_CARDS, _MOST_ROWS = 8, 8
 _MOST_SAID = 3  # amounts that the sentence of a finding says itself
 _CHOSEN_BY = "the simplest within 1.75 standard errors of the least error; radial 2,3 wins ties"
 _MODEL_ERROR = (
-    "the model is wrong by more than its noise can hide: no covariance or standard deviation of this calibration "
-    "contains that error"
+    "the model is wrong by more than its noise: no covariance or standard deviation of this calibration includes that "
+    "error"
 )
 _NEW_DATA = (
-    "residuals are those of the calibration as it stands; the findings are what would be left if it were refitted to "
-    "them"
+    "residuals are those of the calibration as it is; findings are what would remain after a refit to these data"
 )
 
 
@@ -47,17 +46,16 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: Choice | None) -> Iterator[
 def chapter(diagnosis: Diagnosis, choice: Choice | None) -> Chapter:
     """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
-    tested = (
-        f"{counted(diagnosis.tests, 'alternative')} of the model were tested; of sound data {rate} raise any finding."
-    )
+    alternatives = counted(diagnosis.tests, "alternative")
+    tested = f"{alternatives} of the model were tested. Correct data give a finding in {rate} of cases."
     pieces: list[Piece] = [Text(f"These are new data: {_NEW_DATA}.")] if diagnosis.new_data else []
     if diagnosis.findings:
-        pieces.append(Text(f"What is wrong with the calibration first, then the rest, each by size. {tested}"))
+        pieces.append(Text(f"Faults of the calibration come first, then the others, each by size. {tested}"))
         ordered = sorted(diagnosis.findings, key=lambda one: not is_against(one))
         pieces += [_card(one) for one in ordered[:_MOST_CARDS]]
         pieces += _others(ordered[_MOST_CARDS:])
     else:
-        pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
+        pieces.append(Text(f"Nothing was found: the residuals look like noise. {tested}"))
     pieces += _noise(diagnosis.noise).pieces
     pieces += () if choice is None else _held_out(choice).pieces
     return Chapter("findings", "What the residuals say", tuple(pieces))
@@ -68,12 +66,12 @@ def _verdict(diagnosis: Diagnosis) -> list[str]:
     lines = [f"new data: {_NEW_DATA}"] if diagnosis.new_data else []
     if diagnosis.conflicts:
         lines.append(
-            "what was known beforehand is contradicted: its standard deviations hold what is in dispute, and findings "
-            "may follow from it"
+            "the observations contradict what was stated beforehand: the standard deviations include the difference, "
+            "and findings may follow from it"
         )
     if not diagnosis.findings:
         sound = "nothing else" if diagnosis.conflicts else "sound"
-        return [*lines, f"{sound}: what is left over looks like noise ({rate})"]
+        return [*lines, f"{sound}: the residuals look like noise ({rate})"]
     lines.append(f"{plural(len(diagnosis.findings), 'finding')}, the largest first ({rate})")
     return [*lines, _MODEL_ERROR] if diagnosis.model_error else lines
 

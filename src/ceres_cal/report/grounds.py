@@ -111,11 +111,11 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     """Level and line of each."""
     calibration, diagnosis = quality.calibration, quality.diagnosis
     if calibration.converged:
-        yield "good", "The solve came to rest."
+        yield "good", "The solve converged."
     elif calibration.rounds:
-        yield "no", "The solve did not come to rest: raise --max-iterations."
+        yield "no", "The solve did not converge: raise --max-iterations."
     if quality.undiagnosed:
-        yield "care", f"{sentence(_UNJUDGED)}, so nothing says whether the model is right: {quality.undiagnosed}."
+        yield "care", f"{sentence(_UNJUDGED)}. So it is not known whether the model is right: {quality.undiagnosed}."
     yield from _of_findings(quality)
     yield from (("", f"{sentence(words)}.") for words in words_of(calibration.as_built))
     for conflict in calibration.conflicts:
@@ -123,8 +123,8 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     if noise_ratio(quality) >= LARGE_NOISE:
         yield (
             "care",
-            f"The noise is {short(noise_ratio(quality))} times what was stated: is it the right lens, are labels and "
-            "dimensions right?",
+            f"The noise is {short(noise_ratio(quality))} times the stated sigma: check the lens, the labels and the "
+            "dimensions.",
         )
     out = float(np.mean(diagnosis.table.outlier)) if diagnosis is not None and len(diagnosis.table) else 0.0
     if out > _MANY_OUTLIERS:
@@ -143,15 +143,15 @@ def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
         return
     wrong = [f"{finding.kind} ({finding.subject})" for finding in diagnosis.findings if finding.is_model_error]
     if not diagnosis.findings:
-        yield "good", "What the model leaves over looks like noise."
+        yield "good", "The residuals look like noise."
     elif not wrong:
-        yield "", f"{counted(len(diagnosis.findings), 'finding')} below; none says that the model is wrong."
+        yield "", f"{counted(len(diagnosis.findings), 'finding')} below. None says that the model is wrong."
     if wrong:
         yield _of_faults(quality, first_of(list(dict.fromkeys(wrong)), 4))
     if off_mm:
         yield (
             "no" if off_mm > GOOD_MM else "care",
-            f"A refit to these new data would move it by {mm(off_mm)} rms: was the camera bumped?",
+            f"A refit to these new data would move places by {mm(off_mm)} rms: the camera may have been moved.",
         )
 
 
@@ -160,10 +160,10 @@ def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
     sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
     worst_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
     level = "" if sigmas < MOVED else "no" if sigmas >= MOVED_FAR and not worst_mm <= GOOD_MM else "care"
-    counted_in = "The accuracy in the first line includes it" if places else "They do not contain it"
+    counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
     moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
     wrong_mm = mm(model_error_mm(quality))
-    return level, f"The model is wrong: {names}; up to {wrong_mm} rms. It moves {moved}. {counted_in}."
+    return level, f"The model is wrong by up to {wrong_mm} rms: {names}. This moves {moved}. {counted_in}."
 
 
 def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
@@ -182,7 +182,7 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     lost = quality.uncertainty.unknown_placements
     if lost:
         named = first_of([f"{' and '.join(parts)} of {name}" for name, parts in lost.items()], 3)
-        yield "", f"Not known of placements: {named}. The cameras do not need it."
+        yield "", f"Not determined: {named}. The cameras do not depend on it."
 
 
 # ---- the headline -------------------------------------------------------------------------------------------------
@@ -236,27 +236,27 @@ def level_of_verdict(verdict: Verdict) -> str:
 def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple[str, str]:
     """Level and headline."""
     if quality.uncertainty is None:
-        return "no", "Not to be used: nothing was minimised, this is the paper's closed form alone."
+        return "no", "Not to be used: this is the closed form of the paper. Nothing was minimised."
     if not every:
         px = quality.observed_px
         level = worst(reasons, level_of_px(px), *(level_of_verdict(verdict) for verdict in focal(quality)))
-        how = {"good": "can be trusted", "care": "are to be used with care", "no": "cannot be trusted"}[level]
-        promised = f", to {short(px)} px of the picture that was observed" if level != "no" and px <= CARE_PX else ""
-        return level, f"The intrinsics {how}{promised}. No station sees a field: places in the world cannot be told."
+        how = {"good": "can be trusted", "care": "are usable with limits", "no": "cannot be trusted"}[level]
+        promised = f", to {short(px)} px in the observed part of the image" if level != "no" and px <= CARE_PX else ""
+        return level, f"The intrinsics {how}{promised}. No station sees a field, so places in the world are not known."
     if misfit_mm(quality) > GOOD_MM:
-        return "no", f"It does not hold: on these new data it is off by {mm(misfit_mm(quality))} (rms)."
+        return "no", f"It does not hold: it is off by {mm(misfit_mm(quality))} rms on these new data."
     floor, above = every
     doubt = _doubt(quality)
     if reasons == "no" or floor.level == "no":
         return "no", f"Do not trust this calibration{f': {doubt}' if doubt else ''}."
     if doubt:
-        return "care", f"Use it with care, no accuracy can be stated: {doubt}."
+        return "care", f"Usable with limits, without a stated accuracy: {doubt}."
     promised = " and ".join(f"to {mm(r.radius_mm)} {r.where}" for r in every if r.level != "no")
     if above.level == "no":
-        how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "cannot be told"
-        return "care", f"Trust it on the floor alone, to {mm(floor.radius_mm)}: places {above.where} {how}."
+        how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "are not known"
+        return "care", f"Usable on the floor only, to {mm(floor.radius_mm)}: places {above.where} {how}."
     level = worst(reasons, floor.level, above.level)
-    return level, f"{'This calibration can be trusted' if level == 'good' else 'Use it with care'}: {promised}."
+    return level, f"{'This calibration can be trusted' if level == 'good' else 'Usable with limits'}: {promised}."
 
 
 def promises(quality: Quality) -> bool:
@@ -269,11 +269,11 @@ def _doubt(quality: Quality) -> str:
     if quality.undiagnosed:
         return _UNJUDGED
     if disputed(quality):
-        return "what was known beforehand is contradicted"
+        return "the observations contradict what was stated beforehand"
     if noise_ratio(quality) >= LARGE_NOISE:
-        return f"the noise is {short(noise_ratio(quality))} times what was stated"
+        return f"the noise is {short(noise_ratio(quality))} times the stated sigma"
     if off := misfit_mm(quality):
-        return f"on these new data it is off by {mm(off)} (rms)"
+        return f"it is off by {mm(off)} rms on these new data"
     if quality.fault_sigmas >= MOVED_FAR and not all(one.level == "good" for one in reaches(quality)):
-        return f"what is named below moves it by {short(quality.fault_sigmas)} of its standard deviations"
+        return f"the faults below move it by {short(quality.fault_sigmas)} standard deviations"
     return ""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base.words import counted, first_of, fixed
 from ceres_cal.calibration import Calibration
-from ceres_cal.report.document import Chapter, Gallery, PhotoFigure, Text
+from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
 from ceres_cal.report.pictures.files import jpeg_of_at_most, read_photograph
 from ceres_cal.report.pictures.frames import Frame, frames_of, marks_of, model_of
@@ -17,8 +17,8 @@ from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 MOST_PHOTOGRAPHS = 4
 _WIDEST_PX, _MOST_BYTES = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
 _READING = (
-    "Magenta: lines, arcs and corners where this calibration puts them, wide paint by its two edges. Where they do not "
-    "lie on the paint, the residuals cannot tell it: a line that nobody observed, another field, a label gone wrong."
+    "Magenta: lines, arcs and corners as the calibration predicts them; wide paint is drawn by its two edges. Look "
+    "whether they lie on the paint. Residuals do not show a line without observations, another field, or a wrong label."
 )
 
 
@@ -39,7 +39,8 @@ def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter
         shown = f"{len(chosen)} of {len(frames)} photographs: the first of each station, then the largest residuals"
         notes.append(Text(f"{shown}; `ceres-cal undistort --overlay` draws any other.", "note"))
     pictures = tuple(_picture(material, photographs, frame, number) for number, frame in enumerate(chosen))
-    return Chapter("photographs", "In the photograph", (*notes, Gallery(pictures)))
+    more = (Folded("More photographs", (Gallery(pictures[1:]),)),) if len(pictures) > 1 else ()
+    return Chapter("photographs", "In the photograph", (Gallery(pictures[:1]), *notes, *more))
 
 
 def _chosen(material: Material, frames: list[Frame]) -> list[Frame]:
@@ -65,7 +66,7 @@ def _picture(material: Material, photographs: FramePhotographs, frame: Frame, nu
     for before, name in _before(material, photographs, frame):
         layers.insert(0, Layer(model_of(before, frame), name, "before"))
         median, worst = model.apart_px(layers[0].model)
-        notes.append(f"Cyan: {name}, {fixed(median, 2)} px away in the median and {fixed(worst, 2)} px at most.")
+        notes.append(f"Cyan: {name}, median distance {fixed(median, 2)} px, at most {fixed(worst, 2)} px.")
     marks = [one for one in marks_of(calibration, material.observations, frame) if one.crosses]  # dots would hide paint
     notes += [f"Crosses: {counted(len(one.pixels), 'observation')} taken out." for one in marks]
     drawn = draw_overlay(photograph, layers, marks)

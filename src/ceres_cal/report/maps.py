@@ -163,7 +163,7 @@ def _reading(one: FieldMap) -> str:
     if np.isnan(radius):
         return "The image shows no place of the field"
     if np.isinf(radius):
-        return "Hatched: the observations cannot tell how far off a located point is"
+        return "Hatched: the observations do not determine how far off a located point is"
     return f"Darker is worse: 95 % of the points located at the worst place (ring) are within {mm(radius)}"
 
 
@@ -225,8 +225,8 @@ class _OverImage:
         return Figure(
             name,
             title,
-            f"{what} Dots: observations, in {_covered(self.observed, self.image_size)} of 192 parts of the image; "
-            "where there are none, the model of the lens speaks alone.",
+            f"{what} Dots: observations, in {_covered(self.observed, self.image_size)} of 192 parts of the image. "
+            "Where there are none, the lens model is extrapolated.",
             Drawing(self.draw, 0.92 * height / width + 0.2),
             grid_table(f"95 % within, {unit}, at y \\ x", self.radii, self.x, self.y, "{:.0f} px"),
             hover=Hover.of(self.x, self.y, spoken(self.radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
@@ -252,7 +252,7 @@ def image_figure(material: Material, station: str) -> Figure:
     return drawn.figure(
         f"image-{list(material.maps).index(station)}",
         f"On the floor, over the image{_named(material, station)}",
-        "The same, where the camera sees it.",
+        "The same accuracy, drawn where the camera sees each place.",
     )
 
 
@@ -269,8 +269,7 @@ def lens_image_figure(material: Material, name: str) -> Figure:
     return drawn.figure(
         f"image-{list(material.observations.cameras).index(name)}",
         "Over the image" + (f", {name}" if several else ""),
-        "How far off in the picture a direction may be that this lens gives, when the camera is turned as well as can "
-        "be. Darker is worse.",
+        "How far off the pixel of a direction may be, with the camera turned to its best pose. Darker is worse.",
     )
 
 

@@ -44,7 +44,7 @@ _PHI_FROM = {
     "guess": "started from a guess",
     "posterior": "under what was known of it",
 }
-_ANCHORED = "held as the world: boards alone do not tell where it stands"
+_ANCHORED = "defines the world: boards alone do not determine where it stands"
 _Row = tuple[str, ...]
 
 
@@ -120,10 +120,10 @@ def warnings(calibration: Calibration) -> Iterator[str]:
     if not calibration.rounds:  # nothing was solved
         return
     if not calibration.converged:
-        yield "the solve did not come to rest: raise --max-iterations"
+        yield "the solve did not converge: raise --max-iterations"
     out = len(calibration.outliers)
     if out > _MANY_OUTLIERS * (calibration.fit.points + calibration.fit.curves + out):
-        yield "so many observations were taken out: check labels, target dimensions and the choice of lens"
+        yield "many observations were taken out: check labels, target dimensions and the lens"
     scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
     if scale > _LARGE_SCALE:
         yield (

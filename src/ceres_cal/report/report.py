@@ -22,17 +22,18 @@ from ceres_cal.report.page import page
 from ceres_cal.report.residual_pictures import against_radius, by_frame, outliers, vectors
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation, distortion
 from ceres_cal.report.summary import numbers_chapter, verdict_chapter
+from ceres_cal.report.support import support
 
-_CHAPTERS = 7  # at most
+_CHAPTERS = 8  # at most
 MOST_CAMERAS = 8
 """Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
 
 _OF_MAPS = (
-    "How far off a located point may be, by what the calibration itself is unsure of: 95 % are within the mm shown. "
-    "Blue is good, amber wants care, brown is not to be used, in every report alike. The noise of the pixel that is "
-    "asked about comes on top; model error is not in it."
+    "How far off a located point may be because of the calibration: 95 % are within the mm shown. Blue is good, amber "
+    "is usable with limits, brown is not to be used; the colours are the same in every report. The noise of the "
+    "located pixel is not included, nor are model errors."
 )
-_NO_PROMISE = "The verdict above promises no accuracy: these maps hold only if what it doubts is set right."
+_NO_PROMISE = "The verdict above states no accuracy. These maps hold only after its reasons are corrected."
 
 
 def make_report(
@@ -83,12 +84,14 @@ def write_report(
 
 def _chapters(material: Material) -> Iterator[Chapter]:
     yield verdict_chapter(material)
-    yield findings.chapter(material.diagnosis, material.choice)
-    yield numbers_chapter(material, material.seams)
     if material.photographs is not None:
         from ceres_cal.report.in_photographs import in_photographs  # OpenCV, for photographs alone
 
         yield in_photographs(material, material.photographs)
+    supported = tuple(support(material, name) for name in list(material.observations.cameras)[:MOST_CAMERAS])
+    yield Chapter("support", "What was observed", (Gallery(supported),))
+    yield findings.chapter(material.diagnosis, material.choice)
+    yield numbers_chapter(material, material.seams)
     yield from _pictures(material)
 
 
@@ -102,7 +105,7 @@ def _pictures(material: Material) -> Iterator[Chapter]:
     yield Chapter("residuals", "Residuals and the lens", (*_left_out(cameras), Gallery(tuple(pictures))))
     places = tuple(_places(material))
     if places:
-        yield Chapter("maps", "How well places are told", places)
+        yield Chapter("maps", "Accuracy on the field", places)
     yield _solve(material)
 
 
@@ -138,7 +141,7 @@ def _solve(material: Material) -> Chapter:
         figures.insert(1, against_closed_form(material, closed))
     texts = () if isinstance(closed, ClosedForm) else (Text(f"No closed form to compare with: {closed}.", "note"),)
     gallery = Gallery(tuple(figure for figure in figures if figure is not None))
-    folded = Folded("Convergence, the closed form, and what may be wrong together", (gallery, *texts))
+    folded = Folded("Convergence, closed form, and correlations", (gallery, *texts))
     return Chapter("solve", "The solve", (folded,))
 
 

@@ -54,15 +54,15 @@ def vectors(material: Material, name: str) -> Figure:
     inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & table.outlier)
     step = stride(material, len(inliers) + len(outliers))
     means = significant_means(table, inliers, size)
-    shown, paint = (inliers[::step], outliers[::step]), _paint_in_image(material, name)
+    shown, paint = (inliers[::step], outliers[::step]), list(lines_in_image(material, name).values())
 
     def draw(axes: Axes, width_in: float) -> None:
         draw_vectors(axes, width_in, table, shown, size, means, paint)
 
     shape = size[1] / size[0]
     return Figure(
-        f"vectors-{_number_of(material, name)}",
-        f"Residual vectors over the image{_owner_suffix(material, name)}",
+        f"vectors-{number_of(material, name)}",
+        f"Residual vectors over the image{owner_suffix(material, name)}",
         f"Each stroke leads from an observation to where the model puts it, enlarged {_enlarged(table, inliers, size)} "
         "times. For a line or arc it is the shortest way to the curve. Strokes in random directions are noise. "
         f"Thick: means of regions that noise cannot explain ({len(means[0])} of {means[2]}). Where they grow "
@@ -100,10 +100,7 @@ def draw_vectors(
     """
     (inliers, outliers), (places, displaced, _) = rows, means
     enlarged = _enlarged(table, inliers, size)
-    axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal", xlabel="px")
-    axes.grid(visible=False)
-    for side in axes.spines.values():
-        side.set_visible(True)
+    frame_image(axes, size)
     for line in paint:
         axes.plot(*line.T, color=PAINT, linewidth=1.6 if width_in > canvas.NARROW_IN else 1.0, alpha=0.6)
     is_curve = table.is_curve[inliers]
@@ -126,11 +123,13 @@ def draw_vectors(
     canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
 
 
-def _owner_suffix(material: Material, camera: str) -> str:
+def owner_suffix(material: Material, camera: str) -> str:
+    """The camera's name behind a title, where there are several."""
     return f", {camera}" if len(material.observations.cameras) > 1 else ""
 
 
-def _number_of(material: Material, camera: str) -> int:
+def number_of(material: Material, camera: str) -> int:
+    """The camera's place among all."""
     return list(material.observations.cameras).index(camera)
 
 
@@ -162,17 +161,28 @@ def significant_means(table: ResidualTable, rows: Indices, size: tuple[int, int]
     return places[significant], means[significant], len(places)
 
 
-def _paint_in_image(material: Material, camera: str) -> list[Array]:
-    """The field's curves as the camera's first placed station sees them, (S, 2) px, NaN outside the image."""
+def lines_in_image(material: Material, camera: str) -> dict[str, Array]:
+    """The field's curves, "target/name", as the camera's first placed station sees them, (S, 2) px; NaN outside."""
     stations = [s for s, owner in material.observations.stations.items() if owner == camera]
     seen = [v.station for v in material.observations.views if v.placement is None and v.station in stations]
     if not seen:
-        return []
+        return {}
     posed = material.calibration.estimate.camera_at(seen[0])
-    lines = [posed.project(curve) for curve in paint_of(material.fields)]
+    targets = {name: one for name, one in material.calibration.targets.items() if not one.movable}
+    names = [f"{target}/{curve}" for target, one in targets.items() for curve in one.curves]
+    lines = [posed.project(curve) for curve in paint_of(targets.values())]
     with np.errstate(invalid="ignore"):
         inside = [np.all((line > -1.0) & (line < posed.image_size), axis=1) for line in lines]
-    return [np.where(keep[:, None], line, np.nan) for line, keep in zip(lines, inside, strict=True)]
+    shown = (np.where(keep[:, None], line, np.nan) for line, keep in zip(lines, inside, strict=True))
+    return dict(zip(names, shown, strict=True))
+
+
+def frame_image(axes: Axes, size: tuple[int, int]) -> None:
+    """The axes as an image of so many pixels."""
+    axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal", xlabel="px")
+    axes.grid(visible=False)
+    for side in axes.spines.values():
+        side.set_visible(True)
 
 
 def _region_table(summary: Summary, camera: str) -> Table:
@@ -207,10 +217,10 @@ def against_radius(material: Material, name: str) -> Figure:
         canvas.key(axes)
 
     return Figure(
-        f"radius-{_number_of(material, name)}",
-        f"Residuals against the radius{_owner_suffix(material, name)}",
-        "Each dot is the part of a residual that points away from the principal point. The trend should stay at 0 "
-        f"within its band: a wave means that the lens polynomial is too short.{_thinned(len(drawn), len(known))}",
+        f"radius-{number_of(material, name)}",
+        f"Residuals against the radius{owner_suffix(material, name)}",
+        "Each dot is the component of a residual away from the principal point. The trend should stay at 0 within its "
+        f"band. A wave means that the lens needs more coefficients.{_thinned(len(drawn), len(known))}",
         Drawing(draw, 0.66),
         Table(("radius, px", "trend px", "± sd", "mean / sd"), tuple(_trend_rows(trend))),
     )
@@ -260,8 +270,8 @@ def by_frame(material: Material) -> Figure:
     return Figure(
         "frames",
         "Residuals frame by frame",
-        "Root mean square residual of each frame over its expected noise: 1 is as everywhere. A frame that stands out "
-        "has wrong labels, motion blur or a bumped camera; a step that stays means that the camera moved then.",
+        "Root mean square residual of each frame in units of the expected noise; 1 is normal. A single high frame "
+        "has wrong labels, motion blur or a moved camera. A lasting step means that the camera moved at that frame.",
         Drawing(draw, 0.66),
         summary_table("frame", frames, range(len(frames.names))),
         hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
@@ -310,8 +320,8 @@ def outliers(material: Material) -> Figure | None:
         "outliers",
         "Outliers, by feature",
         f"{grouped(len(rows))} of {grouped(len(table))} observations did not take part "
-        f"({material.calibration.options.reject_sigma:g} sigma off and more). Here and there one is normal; most "
-        "of one feature means a wrong label, or paint that is not where it was drawn.",
+        f"({material.calibration.options.reject_sigma:g} sigma and more). A few are normal. Most of one feature "
+        "means a wrong label, or paint that is off its nominal position.",
         Drawing(draw, 0.2 + 0.055 * max(len(named), 6)),
         Table(
             ("farthest first", "feature", "frame", "px off", "sigma"),

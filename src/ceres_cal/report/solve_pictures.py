@@ -46,8 +46,8 @@ def correlation(material: Material) -> Figure | None:
     return Figure(
         "correlation",
         "Correlation of the numbers",
-        "Dark blue: two numbers may be wrong together in the same sense; brown: in opposite senses. What is nearly 1 "
-        "or -1 (such as phi and the height) is known as a ratio much better than each by itself. Grey: unknown."
+        "Dark blue: errors of two numbers have the same sign; brown: opposite signs. Where the correlation is near 1 "
+        "or -1 (such as phi and height), the ratio is known much better than each number. Grey: unknown."
         + (f" {counted(rest, 'further number')} not drawn." if rest else ""),
         Drawing(lambda axes, _: _draw_matrix(axes, matrix, labels), 0.86),
         _pairs(matrix, labels),
@@ -123,12 +123,12 @@ def convergence(material: Material) -> Figure | None:
         axes.yaxis.set_major_formatter(canvas.plain)
 
     solved = material.calibration
-    how = "It came to rest" if solved.converged else "It did not come to rest"
+    how = "It converged" if solved.converged else "It did not converge"
     return Figure(
         "convergence",
         "Convergence of the last solve",
-        f"A sound solve falls steeply and ends: a long flat tail means that some direction is hardly told. {how} after "
-        f"{counted(solved.rounds, 'solve')}; this is the last one, to a cost of {history[-1]:.6g}.",
+        f"The cost should fall steeply and end. A long flat tail means that some combination of numbers is hardly "
+        f"determined. {how} after {counted(solved.rounds, 'solve')}. The last one ends at {history[-1]:.6g}.",
         Drawing(draw, 0.66),
         Table(("iteration", "cost", "fall"), rows),
     )
@@ -158,9 +158,8 @@ def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
     return Figure(
         "closed-form",
         "Closed form against bundle",
-        f"Farther left is better. Half of the residuals are below {short(medians['bundle'])} px by the bundle, below "
-        f"{short(medians['closed form'])} px by the paper's closed form: that is what solving everything together, in "
-        "measured pixels, brings.",
+        f"Farther left is better. The median residual is {short(medians['bundle'])} px after the bundle adjustment and "
+        f"{short(medians['closed form'])} px after the closed form of the paper.",
         Drawing(draw, 0.66),
         _comparison(material.calibration, closed.calibration, curves, shares),
     )
@@ -221,9 +220,8 @@ def distortion(material: Material, name: str) -> Figure:
     return Figure(
         f"lens-{list(material.observations.cameras).index(name)}",
         "The distortion curve" + (f", {name}" if len(material.observations.cameras) > 1 else ""),
-        f"The paper's figure 4: how far from the principal point a pixel is (across) and would be without "
-        f"distortion (up), {model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px; "
-        "dotted, beyond them, the curve is a guess.",
+        f"Radius of a pixel from the principal point, measured (horizontal) and without distortion (vertical), "
+        f"{model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px. The dotted part is extrapolated.",
         Drawing(lambda axes, _: draw_distortion(axes, camera, reach), 0.66),
         Table(
             ("r, px", "r', px", "r' - r, px", "r' / r"),

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 _MOST_FINDINGS, _MOST_DIRECTIONS = 3, 4
 _MEANING = (
-    "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
-    "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: "
-    f"up to {GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
+    "The accuracy in the headline holds for 95 % of the points located at the worst place that a camera sees. ± is a "
+    "standard deviation. Both describe the calibration; the noise of the located pixel adds to them. Green: up to "
+    f"{GOOD_MM:g} mm, the width of a painted line. Amber: up to {CARE_MM:g} mm."
 )
 
 
@@ -136,7 +136,7 @@ def _seams(seams: Sequence[Seam]) -> Section:
         over = f" rms of {count}" if count else ""
         rows.append((f" {DASH} ".join(seam.stations), *means, f"{mm(rms)}{over}", mm(expected)))
     head = ("stations", *map(at_height, HEIGHTS_M), "found", "expected")
-    table = Table(head, tuple(rows), "Where two cameras see the same: by how much they disagree", stacked=True)
+    table = Table(head, tuple(rows), "Where two cameras overlap: by how much they disagree", stacked=True)
     return Section("seam", lines, {"uncertainty": {"seams": data}}, (table,) if rows else ())
 
 
@@ -151,7 +151,7 @@ def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
         for one in weak
     ]
     bullets = BulletList(tuple(("care", one.words) for one in weak))
-    pieces = (Text("What the observations hardly tell, weakest first:"), bullets) if weak else ()
+    pieces = (Text("What the observations hardly determine, weakest first:"), bullets) if weak else ()
     yield Section("weak", lines, {"uncertainty": {"weak_directions": data}}, pieces)
     unknown = uncertainty.unknown_placements
     if unknown:
@@ -193,7 +193,7 @@ def _tiles(material: Material) -> Iterator[Tile]:
         yield Tile("Residuals of new data", short(rms), "px rms", f"over {counted(len(distance), 'observation')}")
     else:
         total = counted(fit.points + fit.curves, "observation")
-        yield Tile("Residuals", short(fit.rms_px), "px rms", f"over {total}: how well data and model agree")
+        yield Tile("Residuals", short(fit.rms_px), "px rms", f"over {total}")
     out = int(np.count_nonzero(table.outlier))
     share = 100.0 * out / max(len(table), 1)
     yield Tile("Taken out", short(share), "%", f"{counted(out, 'outlier')} of {counted(len(table), 'observation')}")
@@ -206,9 +206,9 @@ def _map_tile(label: str, one: FieldMap) -> Tile:
     level = level_of(radius)
     if np.isinf(one.mean_mm):
         return Tile(
-            label, "unknown", "", "the observations do not tell it: add tilted boards or measure the height", level
+            label, "unknown", "", "not determined by the observations: add tilted boards or measure the height", level
         )
-    note = f"of a located point, in the mean; at worst {mm(one.worst_mm)}, at {metres(one.worst_place_m)}"
+    note = f"mean of located points; at worst {mm(one.worst_mm)}, at {metres(one.worst_place_m)}"
     return Tile(label, f"± {short(one.mean_mm)}", "mm", note, level)
 
 
@@ -222,8 +222,8 @@ def _focal_tile(verdict: Verdict) -> Tile:
 def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
     """The numbers on a page."""
     intro = (
-        "In the paper's units; coefficients with its a1 = 1 (another a1 goes with a1 a2, a1 a3 and a1 phi). Known "
-        "means to 1 % or better, weak to 30 %, in conflict that everything else contradicts what was stated."
+        "Coefficients use the paper's notation with a1 = 1. Known: to 1 % or better. Weak: to 30 %. In conflict: all "
+        "other observations contradict the stated value."
     )
     every = (*number_sections(quality), *accuracy_sections(quality, seams))
     return Chapter("numbers", "The numbers", (Text(intro), *(piece for one in every for piece in one.pieces)))

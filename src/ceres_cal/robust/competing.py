@@ -85,19 +85,19 @@ class Explanation:
     @property
     def words(self) -> str:
         """What it says."""
-        return f"the whole of {self.name}: {np.count_nonzero(self.rows)} rows, {two_digits(self.aside_px)} px aside"
+        return f"the whole of {self.name}: {np.count_nonzero(self.rows)} rows, {two_digits(self.aside_px)} px off"
 
     @property
     def warning(self) -> str:
         """What to know before the calibration is used."""
         if not self.is_doubtful:
-            return (
-                f"{self.words} of where all others put it: taken out as one; check its label, and where it is painted"
-            )
-        chosen, other = (self.words, self.instead) if self.is_taken else ("all of it belongs", self.words)
+            return f"{self.words}: taken out together; check the label, and where it is painted"
+        where = f"{self.name} may be {two_digits(self.aside_px)} px off its nominal position"
+        sure = f"probability {100.0 * (1.0 - self.doubt if self.is_taken else self.doubt):.0f} %"
+        how = "taken out together" if self.is_taken else "used"
         return (
-            f"in doubt about {self.name}: {chosen}, or {other} ({100.0 * self.doubt:.0f} %); standard deviations hold "
-            "for either: look at it in the picture, or observe more"
+            f"{where} ({sure}; {np.count_nonzero(self.rows)} rows, {how}). The stated uncertainties include this. "
+            "Look at it in the picture, or observe more"
         )
 
 

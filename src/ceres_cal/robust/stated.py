@@ -201,10 +201,8 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
 
 def doubted(statement: Statement, test: WaldTest, alone: bool, probability: float) -> str:
     """A statement that is in doubt, in words."""
-    which = f"({100.0 * probability:.0f} % that it is wrong)"
-    return (
-        f"in doubt about {_apart(statement, test, alone)} {which}; standard deviations hold for either: measure again"
-    )
+    wrong = f"It may be wrong (probability {100.0 * probability:.0f} %)"
+    return f"{_apart(statement, test, alone)}. {wrong}. The stated uncertainties include this: measure again"
 
 
 def _apart(statement: Statement, test: WaldTest, alone: bool) -> str:

@@ -103,7 +103,7 @@ class CurveAside(_StructureTest):
         along = np.subtract(curve.end, curve.start)[:2]
         x, y = mm[0] * np.array([-along[1], along[0]]) / np.hypot(*along)
         sentence = (
-            f"{name} is painted {abs(mm[0]):.1f} ± {sd[0]:.1f} mm aside of its drawing (x {x:+.1f}, y {y:+.1f} mm; "
+            f"{name} is painted {abs(mm[0]):.1f} ± {sd[0]:.1f} mm off its nominal position (x {x:+.1f}, y {y:+.1f} mm; "
             f"{evidence.size})"
         )
         return Words(sentence, advice, amounts(["left"], mm[:1], sd[:1], "mm"))

@@ -78,7 +78,7 @@ class Radial(Lens):
     def note(self) -> str:
         if self.powers != (2, 3):
             return ""
-        return "these are the paper's, with its a1 = 1: another a1 goes with a1 a2, a1 a3 and a1 phi"
+        return "coefficients use the paper's notation with a1 = 1"
 
     @classmethod
     def from_paper(cls, a1: float, a2: float, a3: float, phi: float) -> tuple[Radial, float]:
