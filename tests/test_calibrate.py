@@ -473,7 +473,7 @@ def test_priors_pull_as_gauss_says(owner: str, quantity: str) -> None:
 
 def test_a_prior_may_come_with_the_observations() -> None:
     simulation = observed(POINTS_SCENE)
-    prior = Prior("station", "overhead", "height_m", (5.3,), (0.01,))
+    prior = Prior("station", "overhead", "height_m", (5.205,), (0.01,))
     by_option = calibrate(simulation.observations, options_for(simulation.scene, priors=(prior,), **PLAIN))
     along = calibrate(replace(simulation.observations, priors=(prior,)), options_for(simulation.scene, **PLAIN))
     assert along.station() == by_option.station()

@@ -187,7 +187,7 @@ def test_join_as_typed(say: Say, tmp_path: Path) -> None:
     joined = tmp_path / "rig.json"
     said = say("join", *paths, "--same-frame", "left_*,right_*", "-o", joined)
     assert said.code == 0 and "11 seen by 2 cameras" in said.out and "'board_05' of 'right'" in said.out
-    said = say("calibrate", joined, "--lens", "brown", "--quiet", "-o", tmp_path / "c.json")
+    said = say("calibrate", joined, "--lens", "brown", "-o", tmp_path / "c.json")
     assert said.code == 0 and "left - right: baseline " in said.out
     data = json.loads(say("join", *paths, "--same-frame", "index", "-o", tmp_path / "i.json", "--json").out)
     assert data["moments_by_cameras"] == {"2": 11} and data["turned"] == [["right", "0005"]]
