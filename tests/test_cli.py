@@ -489,7 +489,7 @@ def test_warns_where_phi_is_unknown(say: Say, tmp_path: Path) -> None:
         "warning   ",
     ):
         assert words in said.out, words
-    assert "too frontal to tell phi, which is below " in " ".join(said.out.split())
+    assert "too frontal to determine phi (95 %: below " in " ".join(said.out.split())
     held = say("calibrate", tmp_path / "frontal.json", "--prior", "height_m=4:0.01")
     assert "warning" not in held.out and "weak" not in held.out and "unknown" not in held.out
 

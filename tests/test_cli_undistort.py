@@ -122,7 +122,7 @@ def test_several_stations(say: Say, folder: Path) -> None:
     assert "name one: --station camera or second" in refused(say("undistort", two, photograph, "-o", out, "--top-view"))
     named = say("undistort", two, photograph, "-o", out, "--top-view", "--station", "second", "--json")
     assert json.loads(named.out)["station"] == "second"
-    assert "camera 'x' is not there" in refused(say("undistort", two, photograph, "-o", out, "--camera", "x"))
+    assert "there is no camera 'x'" in refused(say("undistort", two, photograph, "-o", out, "--camera", "x"))
     assert "there is no station 'x'" in refused(say("undistort", two, photograph, "-o", out, "--station", "x"))
 
 

@@ -83,8 +83,8 @@ def test_priors_of_file_and_options_come_together() -> None:
 @pytest.mark.parametrize(
     "prior, message",
     [
-        (Prior("camera", "b", "phi", (800.0,), (5.0,)), "camera 'b'.*not there: there are 'overhead'"),
-        (Prior("station", "b", "height_m", (4.0,), (0.1,)), "station 'b'.*not there: there are 'overhead'"),
+        (Prior("camera", "b", "phi", (800.0,), (5.0,)), "no camera 'b': choose one of overhead"),
+        (Prior("station", "b", "height_m", (4.0,), (0.1,)), "no station 'b': choose one of overhead"),
         (Prior("camera", "overhead", "k1", (0.0,), (0.1,)), "it has no 'k1', only phi, aspect, cx, cy, a2, a3"),
     ],
 )
