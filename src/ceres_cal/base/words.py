@@ -113,7 +113,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def no_such(what: str, name: object, known: Iterable[str]) -> str:
-    """What a message says of a wrong name: the known one that is much like it, else which there are, or some of them."""
+    """What a message says of a wrong name: the known one that is much like it, else which there are, twelve at most."""
     every, most = list(known), 12
     rest = f" and {len(every) - most} more" if len(every) > most else ""
     listed = f": choose one of {', '.join(every[:most])}{rest}" if every else ": none is known"
