@@ -502,8 +502,8 @@ def test_a_height_prior_cures_the_view_from_straight_above() -> None:
 def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
     observations = observed(POINTS_SCENE).observations
     for prior, message in (
-        (Prior("camera", "left", "phi", (800.0,), (1.0,)), "'left'.*not there"),
-        (Prior("station", "left", "height_m", (5.0,), (1.0,)), "'left'.*not there"),
+        (Prior("camera", "left", "phi", (800.0,), (1.0,)), "there is no camera 'left'"),
+        (Prior("station", "left", "height_m", (5.0,), (1.0,)), "there is no station 'left'"),
         (Prior("camera", "overhead", "k1", (0.0,), (1.0,)), "no 'k1', only phi, aspect, cx, cy, a2, a3"),
     ):
         with pytest.raises(InputError, match=message):

@@ -29,7 +29,7 @@ a/0002.png - - -
 def test_corners_of_mrcal(tmp_path: Path) -> None:
     (tmp_path / "corners.vnl").write_text(CORNERS)
     seen = import_observations(tmp_path / "corners.vnl", sigma_px=0.3, camera="left", **BOARD)
-    assert seen.views == (View("0001", "left", "left", "target", "0001"),)
+    assert seen.views == (View("0001", "left", "left", "board", "0001"),)
     assert seen.points.feature.tolist() == [0, 1, 3, 4, 5]
     assert seen.points.sigma_px == pytest.approx([0.3, 0.6, 0.3, 0.3, 1.2])
     assert seen.points.pixels[1].tolist() == [30.0, 20.0]

@@ -210,8 +210,9 @@ def test_a_real_photograph(window: Browser, real_data: Path, tmp_path: Path) -> 
         press(window, "find")
         keep(window, "5-real")
         middle = window.run("page.now.model.points.CenterMark")
-        assert middle[0] == pytest.approx(465.0, abs=4.0)  # on the halfway line, by eye; measured: 466.1
-        assert middle[1] == pytest.approx(348.0, abs=10.0)  # between the goal areas' corners; measured: 345.4
+        # By eye at 465, 348. The field is not as drawn, and the camera not to be trusted: by 0.7 px of the clicks the mark
+        # comes to 465.9 to 474.1, 342 to 358.
+        assert middle == pytest.approx([465.0, 348.0], abs=12.0)
 
 
 def test_a_killed_browser_and_the_keyboard(window: Browser, tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ def test_files_of_before_load(tmp_path: Path) -> None:
 
 def test_the_command_line_takes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     seen("kannala-brandt-tangential").observations.save(tmp_path / "a.json")
-    arguments = ["calibrate", str(tmp_path / "a.json"), "--quiet", "-o", str(tmp_path / "b.json")]
+    arguments = ["calibrate", str(tmp_path / "a.json"), "-o", str(tmp_path / "b.json")]
     assert main([*arguments, "--lens", "kannala-brandt", "--terms", "tangential", "--free-skew"]) == 0
     assert "p2" in capsys.readouterr().out
     assert Calibration.load(tmp_path / "b.json").options.terms == ("tangential",)

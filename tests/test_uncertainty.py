@@ -88,7 +88,7 @@ def test_a_frontal_view_is_unknown_where_opencv_says_sd_nought() -> None:
         assert (verdict.low, verdict.high) == (0.0, np.inf)
     assert calibration.uncertainty.ratio_sd("overhead") == pytest.approx(0.002, rel=0.2)  # 0.00195 measured
     assert "only their ratio is known, to 0.2 %" in calibration.uncertainty.weak_directions[0].words
-    assert "too frontal to tell phi, which is anything at 95 %" in calibration.warnings[0]
+    assert "too frontal to determine phi (95 %: anything)" in calibration.warnings[0]
 
 
 def exactly_frontal() -> Uncertainty:

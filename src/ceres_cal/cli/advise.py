@@ -75,7 +75,7 @@ def _sections(advice: Advice, weak: list[str]) -> Iterator[Section]:
     where = f" at ({x:.1f}, {y:.1f} m)" if before.worst_mm < float("inf") else ""
     today = f"station {advice.station!r} at {height}: worst {_mm(before.worst_mm)}{where}, mean {_mm(before.mean_mm)}"
     asked = {name: getattr(advice, name) for name in ("station", "height_m", "good_enough_mm")}
-    yield Section("advice", wrapped(*verdict), {**asked, "verdict": verdict})
+    yield Section("advice", verdict, {**asked, "verdict": verdict})
     known = {**vars(before), "worst_place_m": list(advice.worst_place_m), "weak_directions": weak}
     yield Section("today", wrapped(today, *weak[:1]), {"today": known})
     lines = ["", f"{'worst':>9}  {'mean':>9}  would be left at {height} if you"]

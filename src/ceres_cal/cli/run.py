@@ -92,7 +92,8 @@ def _run(args: RunArguments) -> Document:
     data = {"images": len(images), "verdict": calibrated.data["verdict"]}
     data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
     made = level != "no" and not any(step.exit_code for step in asked)
-    return Document((Section(data=data), *_sections(args, images, steps, level)), 0 if made else 1)
+    sections = Section(data=data), *_sections(args, images, steps, level)
+    return Document(sections, 0 if made else 1, data["verdict"]["headline"])
 
 
 def _require_fitting(args: RunArguments) -> None:

@@ -138,5 +138,5 @@ def frames_of_videos(
         InputError: a video cannot be read, or count is below 1.
     """
     if count < 1:
-        raise InputError(f"frames must be at least 1, not {count}")
+        raise InputError(f"--frames must be at least 1, not {count}")
     return [path for one in videos for path in sharpest_frames(one, folder / one.stem, count, progress)]

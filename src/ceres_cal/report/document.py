@@ -8,6 +8,7 @@ start, six times as fast as frozen dataclasses.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from itertools import chain
 from textwrap import wrap
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,8 +17,9 @@ if TYPE_CHECKING:
     from ceres_cal.report.canvas import Drawing, Hover
 
 WIDTH = 100
-_RESULTS = ("verdict", "check", "audit", "jobs", "advice")
 """Of a text for people, in letters."""
+_RESULTS = ("verdict", "check", "audit", "jobs", "advice")
+_NOT_MADE = "error"  # what could not be made is said with --quiet as well
 
 
 def wrapped(*texts: str) -> list[str]:
@@ -149,7 +151,8 @@ class Section(NamedTuple):
 
     Attributes:
         title: what stands beside its lines in a terminal; without it they stand alone.
-        lines: for people. data: the same for scripts, numbers at full precision; pieces: the same on a page.
+        lines: for people, those of a result whole. data: the same for scripts, numbers at full precision; pieces: the
+            same on a page.
     """
 
     title: str = ""
@@ -159,7 +162,8 @@ class Section(NamedTuple):
 
     def shown(self) -> Iterator[str]:
         """Its lines, the title beside the first."""
-        for number, line in enumerate(self.lines):
+        lines = chain.from_iterable(map(wrapped, self.lines)) if self.title in _RESULTS else self.lines
+        for number, line in enumerate(lines):
             yield f"{'' if number else self.title:9} {line}" if self.title else line
 
 
@@ -168,10 +172,12 @@ class Document(NamedTuple):
 
     Attributes:
         exit_code: 0, or 1 where the answer is no or a part of it could not be made.
+        headline: the answer in a line, where it is not the first of its result's.
     """
 
     sections: tuple[Section, ...]
     exit_code: int = 0
+    headline: str = ""
 
     def text(self, titles: Collection[str] | None = None) -> str:
         """For people; of the sections with one of these titles, by default of all."""
@@ -180,11 +186,11 @@ class Document(NamedTuple):
 
     @property
     def one_line(self) -> str:
-        """The answer in one line, as with --quiet: the verdict, or what is said first."""
+        """The answer in one line, as with --quiet: the verdict, or what is said first; and what could not be made."""
         first = sorted(self.sections, key=lambda one: one.title not in _RESULTS)
-        lines = [" ".join(str(line).split()) for one in first for line in one.lines if str(line).strip()]
-        within = (line.removeprefix("verdict ") for line in lines if line.startswith("verdict "))  # of a step of `run`
-        return next(within, lines[0] if lines else "")
+        lines = (line for one in first for line in one.lines if line.strip())
+        failed = (" ".join(one.shown()) for one in self.sections if one.title == _NOT_MADE and one.lines)
+        return "\n".join((self.headline or next(lines, "").strip(), *failed)).strip()
 
     @property
     def data(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: Choice | None) -> Iterator[
     summaries = diagnosis.summaries
     own = ("model_error", "conflicts", "new_data", "tests", "false_alarm_rate", "findings")
     said = _verdict(diagnosis)
-    yield Section("verdict", wrapped(*said), {"verdict": said, **{name: getattr(diagnosis, name) for name in own}})
+    yield Section("verdict", said, {"verdict": said, **{name: getattr(diagnosis, name) for name in own}})
     yield from (Section("conflict", wrapped(conflict.words)) for conflict in diagnosis.conflicts)
     for number, finding in enumerate(diagnosis.findings, start=1):
         yield Section(f"finding {number}", _finding(finding))

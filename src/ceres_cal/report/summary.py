@@ -60,7 +60,7 @@ def _verdict(quality: Quality) -> Section:
     judged, findings = judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
     cause = disputed(quality)
     named = [one for one in findings if is_against(one) and not cause][:_MOST_FINDINGS]
-    lines = wrapped(judged.headline, *(f"{one.kind}: {one.sentence}" for one in named))
+    lines = [judged.headline, *(f"{one.kind}: {one.sentence}" for one in named)]
     if findings:
         whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
         lines.append(f"{plural(len(findings), 'finding')}{whence}")
