@@ -210,8 +210,8 @@ def test_a_real_photograph(window: Browser, real_data: Path, tmp_path: Path) -> 
         press(window, "find")
         keep(window, "5-real")
         middle = window.run("page.now.model.points.CenterMark")
-        # By eye at 465, 348. The field is not as drawn, and the camera not to be trusted: by 0.7 px of the clicks the mark
-        # comes to 465.9 to 474.1, 342 to 358.
+        # By eye at 465, 348. The field is not as drawn, and the camera not to be trusted: 0.7 px of the clicks move the
+        # mark from 465.9 to 474.1, and from 342 to 358.
         assert middle == pytest.approx([465.0, 348.0], abs=12.0)
 
 
