@@ -208,3 +208,11 @@ def test_too_many_stations_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"wrong by .* mm on the field, more than 0.001"):
         export(over_field(with_lens("radial-2-3")), "opencv", tmp_path / "a.yml", max_loss_mm=1e-3)
     assert not (tmp_path / "a.yml").exists()
+
+
+def test_elements_within_elements_by_the_thousand_are_refused(tmp_path: Path) -> None:
+    """OpenCV reads them by recursion: the process died."""
+    text = '<?xml version="1.0"?>\n<opencv_storage>\n' + "<extrinsic_parameters>\n" * 40_000
+    (tmp_path / "deep.xml").write_text(text)
+    with pytest.raises(InputError, match="more than 32 elements within each other"):
+        import_calibration(tmp_path / "deep.xml", "opencv")

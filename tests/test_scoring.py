@@ -48,6 +48,16 @@ def test_new_boards_are_predicted_to_the_noise(calibration: Calibration) -> None
     assert answer.solution is not None and answer.solution.estimate.cameras["camera"] == calibration.cameras["camera"]
 
 
+def test_one_camera_of_several_is_scored(calibration: Calibration) -> None:
+    """The rest of a rig has no observations, and no part."""
+    alone = score(calibration, _boards(3, 1))
+    cameras = {**calibration.estimate.cameras, "other": next(iter(calibration.estimate.cameras.values()))}
+    rig = replace(calibration, estimate=replace(calibration.estimate, cameras=cameras))
+    together = score(rig, _boards(3, 1))
+    assert list(together) == list(alone)
+    assert [one.misfit.all_rms_px for one in together.values()] == [one.misfit.all_rms_px for one in alone.values()]
+
+
 def test_plain_least_squares_is_that_of_opencv(calibration: Calibration) -> None:
     seen = _boards(1, 3)
     answer = score(calibration, seen, options=replace(calibration.options, loss="trivial", reject_sigma=1e9))

@@ -13,6 +13,7 @@ from ceres_cal.base.transforms import (
     euler_from_rotation,
     left_jacobian,
     nearest_rotation,
+    require_rotation,
     rotation_exp,
     rotation_from_euler,
     rotation_log,
@@ -193,3 +194,8 @@ def test_gamma_is_zero_at_gimbal_lock(sign: float) -> None:
     alpha, beta, gamma = euler_from_rotation(rotation_from_euler(0.4, sign * np.pi / 2, 0.3))
     assert gamma == 0.0 and beta == sign * np.pi / 2
     assert alpha == pytest.approx(0.4 - sign * 0.3, abs=1e-15)  # only this combination is left
+
+
+def test_numbers_too_large_for_a_rotation_are_refused_without_a_warning() -> None:
+    with pytest.raises(InputError, match="R is no rotation matrix"):
+        require_rotation(np.full((3, 3), 1e200), "R")

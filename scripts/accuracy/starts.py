@@ -256,7 +256,10 @@ def _drawn(seed: int) -> Outcome | None:
         place[0], place[1], place[2], tilt * np.cos(to), tilt * np.sin(to), yaw_deg=rng.uniform(-180.0, 180.0)
     )
     scene = field_scene(_FIELD, {"c": camera}, {"c": Station("c", pose)}, spacing_m=0.02)
-    every = _thinned(simulate(scene, Disturbance(), 1).observations)
+    try:
+        every = _thinned(simulate(scene, Disturbance(), 1).observations)
+    except CalibrationError:  # quiet: the camera looks past the field
+        return None
     seen = [(0, f) for f in np.unique(every.points.feature)] + [(1, f) for f in np.unique(every.curves.feature)]
     if len(seen) < 2:
         return None

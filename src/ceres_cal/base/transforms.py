@@ -93,7 +93,8 @@ def require_rotation(matrix: ArrayLike, name: str) -> Array:
     """A 3 x 3 matrix that somebody wrote with six digits or more; InputError where it is no rotation matrix."""
     rounding = 1e-6  # numbers that somebody copied have six digits or more
     m = np.asarray(matrix, dtype=float)
-    off = float(np.max([*np.abs(m @ m.T - np.eye(3)).flat, abs(np.linalg.det(m) - 1.0)]))
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers so large are no rotation matrix either
+        off = float(np.max([*np.abs(m @ m.T - np.eye(3)).flat, abs(np.linalg.det(m) - 1.0)]))
     if not off < rounding:
         raise InputError(
             f"{name} is no rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"

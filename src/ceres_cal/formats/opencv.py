@@ -119,9 +119,19 @@ class OpenCvOptions:
     camera: str = field(default="camera", metadata={"help": "name for the camera; default: camera"})
 
 
+def _require_shallow(text: str) -> None:
+    """InputError for elements within elements by the dozen: OpenCV reads them by recursion, and dies of thousands."""
+    deepest, depth = 32, 0
+    for tag in re.finditer(r"<(/?)\w[^<>]*?(/?)>", text):
+        depth += -1 if tag[1] else not tag[2]
+        if depth > deepest:
+            raise InputError(f"not a FileStorage of OpenCV: more than {deepest} elements within each other")
+
+
 def _read(request: ImportRequest) -> Any:
     import cv2
 
+    _require_shallow(request.text)
     try:
         storage = cv2.FileStorage(request.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         names = storage.root().keys()

@@ -76,10 +76,9 @@ def score(
     answers = {}
     for name in posed.cameras:
         own = np.array([view.camera == name for view in observed.views])
-        if own.any():
-            misfit = _misfit(own, observed, left, posed, noise)
-            its = tuple(view for camera, view in views if camera == name)
-            answers[name] = Agreement(name=name, misfit=misfit, views=its, pose_free=True, solution=posed)
+        misfit = _misfit(own, observed, left, posed, noise)
+        its = tuple(view for camera, view in views if camera == name)
+        answers[name] = Agreement(name=name, misfit=misfit, views=its, pose_free=True, solution=posed)
     return Agreements(answers)
 
 
@@ -98,7 +97,8 @@ def _start(
 ) -> Estimate:
     """Every sight's pose under the calibrated lens, chained into stations and placements."""
     stations = {name: Station(camera, Pose.identity()) for name, camera in observations.stations.items()}
-    blank = Estimate(calibration.cameras, stations, {}, EXACT)
+    cameras = {name: calibration.cameras[name] for name in observations.cameras}  # some of a rig's
+    blank = Estimate(cameras, stations, {}, EXACT)
     numbers, poses = [], []
     for number, key in enumerate(sights.keys):
         old = calibration.estimate.stations.get(key.station)
@@ -112,7 +112,7 @@ def _start(
             f"{sights.keys[0]}: its pose is not determined: show four points or more, not on one line"
         )
     stations, placements = chained_poses(observations, sights, np.array(numbers), np.array(poses), known)
-    return Estimate(calibration.cameras, stations, placements, EXACT)
+    return Estimate(cameras, stations, placements, EXACT)
 
 
 # ---- what is left ---------------------------------------------------------------------------------------------------
