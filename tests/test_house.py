@@ -32,8 +32,8 @@ FLOORS = {
     "detect": 10,
     "report": 11,
     "page": 12,
+    "functions": 12,
     "cli": 13,
-    "functions": 13,
 }
 
 # Library: who may import it, at the top or inside a function.

@@ -23,10 +23,11 @@ from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibration import Calibration, LensChoice, calibrating
 from ceres_cal.calibration import lens_choice as choosing
 from ceres_cal.calibration import lens_seen as seen
-from ceres_cal.calibration.calibrating import Watched, calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
 from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
 from ceres_cal.calibration.lens_kinds import Candidate
+from ceres_cal.calibration.solving import Watched
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.photographs import detect_field

@@ -177,7 +177,7 @@ def test_quiet_is_one_line(capsys: pytest.CaptureFixture[str], names: dict[str, 
     out, err = capsys.readouterr()
     assert err == "" and out.count("\n") == 1 and out.startswith("This calibration can be trusted: to ")
     assert main(["check", names["CAL"], names["OBS"], "--quiet"]) == 0
-    assert capsys.readouterr().out == "yes (1 % false alarms)\n"
+    assert capsys.readouterr().out == "The calibration holds (1 % false alarms).\n"
 
 
 def test_a_board_is_printed_as_it_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ceres_cal.base.transforms import Pose as Pose
     from ceres_cal.calibration import Calibration as Calibration
     from ceres_cal.calibration.calibrating import calibrate as calibrate
+    from ceres_cal.cli.run import run as run
     from ceres_cal.diagnostics.advice import advise as advise
     from ceres_cal.diagnostics.diagnose import Diagnosis as Diagnosis
     from ceres_cal.diagnostics.diagnose import diagnose as diagnose
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from ceres_cal.functions import detect_field as detect_field
     from ceres_cal.functions import join as join
     from ceres_cal.functions import refit as refit
-    from ceres_cal.functions import run as run
     from ceres_cal.moves.audits import audit as audit
     from ceres_cal.moves.comparisons import compare as compare
     from ceres_cal.moves.refit_plan import RefitOptions as RefitOptions
@@ -64,8 +64,9 @@ _HOME = {
     "InputError": "base.errors",
     "SolutionError": "base.errors",
     "RefitOptions": "moves.refit_plan",
-    **dict.fromkeys(("check", "detect_board", "detect_field", "join", "refit", "run"), "functions"),
+    **dict.fromkeys(("check", "detect_board", "detect_field", "join", "refit"), "functions"),
     **dict.fromkeys(("Diagnosis", "diagnose"), "diagnostics.diagnose"),
+    "run": "cli.run",
     "audit": "moves.audits",
     "compare": "moves.comparisons",
     "score": "moves.scores",

@@ -60,10 +60,12 @@ def _run(args: CheckArguments) -> Document:
             read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
         )
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
-    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * args.false_alarms:g} % false alarms{often})"
+    rate = f"({100.0 * args.false_alarms:g} % false alarms{often})"
+    holds = f"{'yes' if answer.holds else 'no'} {rate}"
+    headline = f"The calibration {'holds' if answer.holds else 'no longer holds'} {rate}."
     stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
     stations = map(_station, answer.values())
-    return Document((Section("check", [holds], stated), shown(detections), *stations), answer.exit_code)
+    return Document((Section("check", [holds], stated), shown(detections), *stations), answer.exit_code, headline)
 
 
 def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Agreements, KnownDetections]:

@@ -16,7 +16,7 @@ from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted
-from ceres_cal.calibration.calibrating import Again, Watched, solved_from
+from ceres_cal.calibration.solving import Again, Watched, solved_from
 from ceres_cal.moves.explanations import (
     judged,
     old_poses,

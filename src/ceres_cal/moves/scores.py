@@ -13,7 +13,7 @@ from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.calibrating import Again, solved_from
+from ceres_cal.calibration.solving import Again, solved_from
 from ceres_cal.moves.agreement import Agreement, Agreements, Misfit, matched, require_stations
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations

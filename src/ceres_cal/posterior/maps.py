@@ -106,6 +106,16 @@ def located_by(station: str, pixels: Array, height_m: float) -> Functional:
     )
 
 
+class RadiusMap:
+    """What maps of 95 % radii have in common: how they show themselves."""
+
+    __repr__ = brief
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+        return drawn("plot_map", self, ax)
+
+
 @dataclass(frozen=True, eq=False)
 class FieldGrid:
     """Places on the field at one height: all x_m (X,) at all y_m (Y,)."""
@@ -147,8 +157,8 @@ class ErrorMap(FieldGrid, ABC):
         return float(np.max(visible)) if len(visible) else np.nan
 
 
-@dataclass(frozen=True, eq=False)
-class FieldMap(ErrorMap):
+@dataclass(frozen=True, eq=False, repr=False)
+class FieldMap(RadiusMap, ErrorMap):
     """How well one station locates points at one height, over a grid.
 
     Attributes:
@@ -159,12 +169,6 @@ class FieldMap(ErrorMap):
     station: str
     sd_mm: Array
     radius_95_mm: Array
-
-    __repr__ = brief
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
-        return drawn("plot_map", self, ax)
 
     @property
     def errors_mm(self) -> Array:
@@ -209,8 +213,8 @@ _EXACT_PX = 1e-6  # places that are known better tell a turn alike
 _STEPS = 32  # along the longer side
 
 
-@dataclass(frozen=True, eq=False)
-class ImageMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class ImageMap(RadiusMap):
     """How well one camera knows its image, over a grid.
 
     Attributes:
@@ -222,12 +226,6 @@ class ImageMap:
     x_px: Array
     y_px: Array
     radius_95_px: Array
-
-    __repr__ = brief
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
-        return drawn("plot_map", self, ax)
 
 
 @dataclass(frozen=True, eq=False)

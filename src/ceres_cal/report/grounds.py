@@ -248,15 +248,21 @@ def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple
     floor, above = every
     doubt = _doubt(quality)
     if reasons == "no" or floor.level == "no":
-        return "no", f"Do not trust this calibration{f': {doubt}' if doubt else ''}."
+        why = doubt or (_short_of(floor) if floor.level == "no" else "")
+        return "no", f"Do not trust this calibration{f': {why}' if why else ''}."
     if doubt:
         return "care", f"Usable with limits, without a stated accuracy: {doubt}."
     promised = " and ".join(f"to {mm(r.radius_mm)} {r.where}" for r in every if r.level != "no")
     if above.level == "no":
-        how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "are not known"
-        return "care", f"Usable on the floor only, to {mm(floor.radius_mm)}: places {above.where} {how}."
+        return "care", f"Usable on the floor only, to {mm(floor.radius_mm)}: {_short_of(above)}."
     level = worst(reasons, floor.level, above.level)
     return level, f"{'This calibration can be trusted' if level == 'good' else 'Usable with limits'}: {promised}."
+
+
+def _short_of(reach: Reach) -> str:
+    """That places there are not known well enough."""
+    how = f"are known to {mm(reach.radius_mm)} only" if np.isfinite(reach.radius_mm) else "are not known"
+    return f"places {reach.where} {how}"
 
 
 def promises(quality: Quality) -> bool:

@@ -1,0 +1,187 @@
+"""From a start to a calibration with a named lens: solve, reject, compete, solve for targets as built, assess."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.threads import meanwhile
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.outcome import (
+    came_out,
+    of_all,
+    require_lens_told,
+    resting_phi,
+    unknown_phi,
+)
+from ceres_cal.effects.dependence import Scatter, measure_scatter
+from ceres_cal.effects.effect import AsBuilt
+from ceres_cal.effects.table import estimated
+from ceres_cal.observations import Observations
+from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.problem.bundle import Progress, Solution
+from ceres_cal.problem.parameters import Estimate, Layout
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.robust.as_built import require_measured, solve_as_built, taking_part, tolerances_of
+from ceres_cal.robust.competing import compete
+from ceres_cal.robust.conflicts import Conflicts, find_conflicts
+from ceres_cal.robust.groups import Subproblem
+from ceres_cal.robust.other_minima import least_of_few, seen_alike
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.usable import require_fits, require_possible, require_usable
+from ceres_cal.start.initialise import Start, initialise
+
+if TYPE_CHECKING:
+    from ceres_cal.robust.bulk import Settled
+
+
+@dataclass(frozen=True)
+class Again:
+    """How a calibration is taken up again after an earlier one.
+
+    Attributes:
+        known: the layout of everything that is known by a posterior, also where the solve holds it.
+        scales: noise scales of points and curves that were seen before; None for those of these observations alone.
+        assessed: whether the posterior is wanted.
+    """
+
+    known: Layout
+    scales: tuple[float, float] | None
+    assessed: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Who is told of the solves, and what solves for all observations where these are a part.
+
+    Attributes:
+        progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
+        bends: whether it matters how the uncertainty bends.
+    """
+
+    progress: Callable[[Progress], None] | None = None
+    settle: Callable[..., Settled] | None = None
+    bends: bool = True
+
+
+def solved_from(
+    start: Start, observations: Observations, problem: Problem, again: Again | None = None, watched: Watched = Watched()
+) -> Calibration:
+    """Solve, reject, solve, let explanations compete, solve for targets as built, assess, from a start.
+
+    Raises:
+        CalibrationError: see `calibrate`.
+    """
+    long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
+    takes_long = len(observations.points) + len(observations.curves) > long_to_digest
+    digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
+    usual = again.scales if again else None
+    end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
+    if again is None:
+        problem, start, end = _as_long_as_asked(problem, observations, start, end, watched)
+        require_measured(end.problem, end.solution.estimate)
+
+    def solved(others: Problem, some: Subproblem) -> RobustSolution:
+        return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
+
+    end, explanations = compete(problem, observations, end, solved)
+    as_built: tuple[AsBuilt, ...] = ()
+    if again is None and problem.options.as_built == "estimate":
+        end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
+    beside = None
+    if again is None and watched.settle is None and estimated():
+        from ceres_cal.robust.effects import solve_beside_effects
+
+        beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
+        problem, end = beside.problem, beside.end
+    others: tuple[Solution, ...] = ()
+    if again is None and end.problem.sights.equations == problem.sights.equations:
+        least, others = least_of_few(end.problem, end.solution.estimate, start.others)
+        if least is not end.solution.estimate:
+            end = replace(end.moved_to(least, observations, problem), reduced=None)
+    require_fits(end, problem)
+    require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
+    posterior, conflicts, settled = None, Conflicts(), None
+    assessed = again is None or again.assessed
+    if assessed:
+        part = taking_part(problem, observations, explanations) if again is None else None
+        conflicts = find_conflicts(problem, observations, end, usual, part)
+    if conflicts.answer is not None:
+        problem = replace(problem, priors=conflicts.answer.problem.priors)
+        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        end, others = replace(conflicts.answer, residuals=shown), ()
+    if watched.settle is not None:
+        settled = watched.settle(problem, end, explanations, watched.progress)
+        end = settled.end
+    warnings = tuple(one.warning for one in (settled.explanations if settled else explanations))
+    effects = beside.estimates if beside else ()
+    warnings = (*warnings, *(one.warning for one in effects))
+    if assessed:
+        end, posterior = _assess(end, observations, problem, again, watched.bends)
+        if again is None:
+            require_lens_told(end.solution.estimate, posterior)
+        posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
+        posterior = with_roughness(posterior, end, observations) if again is None else posterior
+        posterior = with_doubts(posterior, end, conflicts, explanations, others)
+        warnings = (*warnings, *conflicts.words, *unknown_phi(end, posterior))
+        warnings = (
+            *warnings,
+            *resting_phi(end, problem),
+            *seen_alike(others, end.solution.estimate, posterior.half_width),
+        )
+    if digest is not None:
+        digest.result()  # which the observations remember
+    calibration = came_out(start.phi_from, observations, problem, end, explanations)
+    if settled is not None:
+        calibration = of_all(calibration, settled)
+    wholes = [one.rows for one in explanations if one.is_taken]
+    warnings = (*calibration.warnings, *require_usable(end, problem, wholes), *warnings)
+    calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
+    tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
+    options = replace(problem.options, tolerances=tolerances)
+    return replace(calibration, options=options, as_built=as_built, effects=effects)
+
+
+def _as_long_as_asked(
+    problem: Problem, observations: Observations, start: Start, end: RobustSolution, watched: Watched
+) -> tuple[Problem, Start, RobustSolution]:
+    """With a lens whose powers were left open as long as the residuals ask for."""
+    if problem.options.powers:
+        return problem, start, end
+    from ceres_cal.calibration.lens_growing import grown
+
+    return grown(problem, observations, start, end, watched.progress)
+
+
+def _assess(
+    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None, bends: bool
+) -> tuple[RobustSolution, Posterior]:
+    """What is known of every number, by the observations that took part at the noise that they show.
+
+    Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
+    """
+    known = end.problem if again is None else replace(end.problem, layout=again.known)
+    estimate = end.solution.estimate
+    reduced = end.reduced if again is None else None
+    reduced = reduced or information(known, estimate)
+
+    def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
+        at_end = there is estimate
+        found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
+        return measure_scatter(observations, known, found, there, says)
+
+    freedom = end.inliers.degrees_of_freedom
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, bends=bends)
+    return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
+
+
+def _start_of(others: Problem, some: Subproblem, start: Start, again: Again | None) -> Estimate:
+    """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
+    alike = set(others.sights.keys) == set(some.problem.sights.keys)
+    if again is not None or not alike or all(key.placement is None for key in others.sights.keys):
+        return start.estimate  # that of the world was found with what does not belong among the rest
+    return initialise(some.observations, others.sights, others.options).estimate
