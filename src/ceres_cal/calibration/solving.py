@@ -16,7 +16,7 @@ from ceres_cal.calibration.outcome import (
     unknown_phi,
 )
 from ceres_cal.effects.dependence import Scatter, measure_scatter
-from ceres_cal.effects.effect import AsBuilt
+from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
@@ -37,6 +37,8 @@ from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
     from ceres_cal.robust.bulk import Settled
+    from ceres_cal.robust.competing import Explanation
+    from ceres_cal.robust.effects import EffectsEnd
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Watched:
 def solved_from(
     start: Start, observations: Observations, problem: Problem, again: Again | None = None, watched: Watched = Watched()
 ) -> Calibration:
-    """Solve, reject, solve, let explanations compete, solve for targets as built, assess, from a start.
+    """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -79,6 +81,73 @@ def solved_from(
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
+    seen = _explained(start, observations, problem, again, watched)
+    conflicts, assessed = Conflicts(), again is None or again.assessed
+    if assessed:
+        part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
+        usual = again.scales if again else None
+        conflicts = find_conflicts(seen.problem, observations, seen.end, usual, part)
+        seen = seen.without(conflicts, observations)
+    settled = None
+    if watched.settle is not None:
+        settled = watched.settle(seen.problem, seen.end, seen.explanations, watched.progress)
+        seen = replace(seen, end=settled.end)
+    explanations = settled.explanations if settled else seen.explanations
+    warnings = (*(one.warning for one in explanations), *(one.warning for one in seen.effects))
+    posterior = None
+    if assessed:
+        seen, posterior = _known(seen, observations, conflicts, again, watched)
+        alike = seen_alike(seen.others, seen.end.solution.estimate, posterior.half_width)
+        phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
+        warnings = (*warnings, *conflicts.words, *phi, *alike)
+    if digest is not None:
+        digest.result()  # which the observations remember
+    calibration = came_out(seen.start.phi_from, observations, seen.problem, seen.end, seen.explanations)
+    if settled is not None:
+        calibration = of_all(calibration, settled)
+    wholes = [one.rows for one in seen.explanations if one.is_taken]
+    warnings = (*calibration.warnings, *require_usable(seen.end, seen.problem, wholes), *warnings)
+    calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
+    tolerances = {**seen.problem.options.tolerances, **tolerances_of(seen.as_built)}
+    options = replace(seen.problem.options, tolerances=tolerances)
+    return replace(calibration, options=options, as_built=seen.as_built, effects=seen.effects)
+
+
+@dataclass(frozen=True, eq=False)
+class _Explained:
+    """A solution, and what explains the observations that it does not fit.
+
+    Attributes:
+        explanations: what else groups of observations may be. as_built: how targets were built.
+        beside: effects of the table that were solved for. others: further minima.
+    """
+
+    problem: Problem
+    start: Start
+    end: RobustSolution
+    explanations: tuple[Explanation, ...]
+    as_built: tuple[AsBuilt, ...] = ()
+    beside: EffectsEnd | None = None
+    others: tuple[Solution, ...] = ()
+
+    @property
+    def effects(self) -> tuple[EffectEstimate, ...]:
+        """What was solved for beside the problem."""
+        return self.beside.estimates if self.beside else ()
+
+    def without(self, conflicts: Conflicts, observations: Observations) -> _Explained:
+        """The answer without what was stated and everything else contradicts."""
+        if conflicts.answer is None:
+            return self
+        problem = replace(self.problem, priors=conflicts.answer.problem.priors)
+        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
+
+
+def _explained(
+    start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched
+) -> _Explained:
+    """Solve, reject, solve, let explanations compete; solve for targets as built and for effects."""
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
@@ -89,61 +158,49 @@ def solved_from(
         return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
 
     end, explanations = compete(problem, observations, end, solved)
-    as_built: tuple[AsBuilt, ...] = ()
-    if again is None and problem.options.as_built == "estimate":
+    seen = _Explained(problem, start, end, explanations)
+    if again is None:
+        seen = _of_targets(seen, observations, solved, watched)
+    require_fits(seen.end, seen.problem)
+    require_possible(observations, seen.problem.sights, seen.end.solution.estimate, seen.end.residuals)
+    return seen
+
+
+def _of_targets(
+    seen: _Explained,
+    observations: Observations,
+    solved: Callable[[Problem, Subproblem], RobustSolution],
+    watched: Watched,
+) -> _Explained:
+    """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
+    problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
+    if problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
-    beside = None
-    if again is None and watched.settle is None and estimated():
+    if watched.settle is None and estimated():
         from ceres_cal.robust.effects import solve_beside_effects
 
         beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
         problem, end = beside.problem, beside.end
     others: tuple[Solution, ...] = ()
-    if again is None and end.problem.sights.equations == problem.sights.equations:
-        least, others = least_of_few(end.problem, end.solution.estimate, start.others)
+    if end.problem.sights.equations == problem.sights.equations:
+        least, others = least_of_few(end.problem, end.solution.estimate, seen.start.others)
         if least is not end.solution.estimate:
             end = replace(end.moved_to(least, observations, problem), reduced=None)
-    require_fits(end, problem)
-    require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
-    posterior, conflicts, settled = None, Conflicts(), None
-    assessed = again is None or again.assessed
-    if assessed:
-        part = taking_part(problem, observations, explanations) if again is None else None
-        conflicts = find_conflicts(problem, observations, end, usual, part)
-    if conflicts.answer is not None:
-        problem = replace(problem, priors=conflicts.answer.problem.priors)
-        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
-        end, others = replace(conflicts.answer, residuals=shown), ()
-    if watched.settle is not None:
-        settled = watched.settle(problem, end, explanations, watched.progress)
-        end = settled.end
-    warnings = tuple(one.warning for one in (settled.explanations if settled else explanations))
-    effects = beside.estimates if beside else ()
-    warnings = (*warnings, *(one.warning for one in effects))
-    if assessed:
-        end, posterior = _assess(end, observations, problem, again, watched.bends)
-        if again is None:
-            require_lens_told(end.solution.estimate, posterior)
-        posterior = posterior.widened(beside.keys, beside.shifts) if beside else posterior
-        posterior = with_roughness(posterior, end, observations) if again is None else posterior
-        posterior = with_doubts(posterior, end, conflicts, explanations, others)
-        warnings = (*warnings, *conflicts.words, *unknown_phi(end, posterior))
-        warnings = (
-            *warnings,
-            *resting_phi(end, problem),
-            *seen_alike(others, end.solution.estimate, posterior.half_width),
-        )
-    if digest is not None:
-        digest.result()  # which the observations remember
-    calibration = came_out(start.phi_from, observations, problem, end, explanations)
-    if settled is not None:
-        calibration = of_all(calibration, settled)
-    wholes = [one.rows for one in explanations if one.is_taken]
-    warnings = (*calibration.warnings, *require_usable(end, problem, wholes), *warnings)
-    calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
-    tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
-    options = replace(problem.options, tolerances=tolerances)
-    return replace(calibration, options=options, as_built=as_built, effects=effects)
+    return _Explained(problem, seen.start, end, explanations, as_built, beside, others)
+
+
+def _known(
+    seen: _Explained, observations: Observations, conflicts: Conflicts, again: Again | None, watched: Watched
+) -> tuple[_Explained, Posterior]:
+    """What is known of every number, with what the lens hides and whatever else may be."""
+    end, posterior = _assess(seen.end, observations, seen.problem, again, watched.bends)
+    if again is None:
+        require_lens_told(end.solution.estimate, posterior)
+    if seen.beside:
+        posterior = posterior.widened(seen.beside.keys, seen.beside.shifts)
+    if again is None:
+        posterior = with_roughness(posterior, end, observations)
+    return replace(seen, end=end), with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
 def _as_long_as_asked(
