@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ceres_cal.base.transforms import Pose as Pose
     from ceres_cal.calibration import Calibration as Calibration
     from ceres_cal.calibration.calibrating import calibrate as calibrate
-    from ceres_cal.cli.run import run as run
+    from ceres_cal.cli.run_in_python import run as run
     from ceres_cal.diagnostics.advice import advise as advise
     from ceres_cal.diagnostics.diagnose import Diagnosis as Diagnosis
     from ceres_cal.diagnostics.diagnose import diagnose as diagnose
@@ -66,7 +66,7 @@ _HOME = {
     "RefitOptions": "moves.refit_plan",
     **dict.fromkeys(("check", "detect_board", "detect_field", "join", "refit"), "functions"),
     **dict.fromkeys(("Diagnosis", "diagnose"), "diagnostics.diagnose"),
-    "run": "cli.run",
+    "run": "cli.run_in_python",
     "audit": "moves.audits",
     "compare": "moves.comparisons",
     "score": "moves.scores",

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
-from ceres_cal.base.images import IMAGE_ENDINGS, Images, image_files, images_and_videos
-from ceres_cal.base.typed import checked
+from ceres_cal.base.images import IMAGE_ENDINGS, images_and_videos
 from ceres_cal.base.words import no_such, plural
 from ceres_cal.cli.arguments import (
     PriorNames,
@@ -31,10 +28,6 @@ from ceres_cal.cli.files import attempted, read_target
 from ceres_cal.cli.options import QuietArguments, argument, option
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
-from ceres_cal.scene.targets import Target
-
-if TYPE_CHECKING:
-    from ceres_cal.calibration import Calibration
 
 _SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
 _MOST_NAMES = 3
@@ -243,61 +236,3 @@ def _short(command: str) -> str:
     kept = [word for word in words if word not in images[1:]]
     place = kept.index(images[0])
     return f"{shlex.join(kept[: place + 1])} ... {shlex.join(kept[place + 1 :])}"
-
-
-# ---- from Python ----------------------------------------------------------------------------------------------------
-
-
-@checked
-def run(
-    images: Images,
-    output: str | PathLike[str],
-    *,
-    target: Target | str | None = None,
-    facing: Mapping[str, str] | None = None,
-    not_painted: Sequence[str] = (),
-    board: Target | str | None = None,
-    lens: str = "auto",
-    prior: Sequence[str] = (),
-    estimate: Sequence[str] = (),
-    camera: str = "camera",
-    to: Sequence[str] = (),
-    frames: int = 30,
-) -> Calibration:
-    """Calibrate a camera from photographs or a video in one call, as `ceres-cal run` does.
-
-    Args:
-        images: photographs of one camera, a folder of them, or a video. output: folder for everything that is made.
-        target: the field, such as `ssl_field("B")` or "ssl-b". board: a checkerboard, such as "9x6x25mm".
-        facing: which way round the field is, such as {"LeftGoalLine": "top"}. not_painted: lines that it lacks.
-        lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to solve for.
-        to: formats to export to. frames: how many photographs to take out of a video.
-
-    Raises:
-        InputError: an argument does not fit, or no photograph shows the target. SolutionError: no usable camera.
-    """
-    from ceres_cal.calibration import Calibration
-
-    given = RunArguments(
-        images=tuple(map(str, image_files(images))),
-        output=Path(output),
-        target=json.dumps(target.spec) if isinstance(target, Target) else target,
-        facing=tuple(f"{name}={side}" for name, side in (facing or {}).items()),
-        not_painted=",".join(not_painted),
-        board=_board_words(board) if isinstance(board, Target) else board,
-        lens=lens,
-        prior=tuple(prior),
-        estimate=tuple(estimate),
-        camera=camera,
-        to=tuple(to),
-        frames=frames,
-        quiet=True,
-    )
-    _run.run(given)
-    return Calibration.load(given.output / "calibration.json")
-
-
-def _board_words(board: Target) -> str:
-    if board.grid is None or not board.grid.checkered:
-        raise InputError(f"board must be a checkerboard, not of kind {board.kind!r}: use detect_board and calibrate")
-    return f"{board.grid.columns}x{board.grid.rows}x{1e3 * board.grid.spacing_m:.9g}mm"

@@ -1,0 +1,69 @@
+"""`ceres_cal.run`: the command as a function. By itself, since every `--help` reads the commands and needs no NumPy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.images import Images, image_files
+from ceres_cal.base.typed import checked
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli.command import COMMANDS
+from ceres_cal.cli.run import RunArguments
+from ceres_cal.scene.targets import Target
+
+
+@checked
+def run(
+    images: Images,
+    output: str | PathLike[str],
+    *,
+    target: Target | str | None = None,
+    facing: Mapping[str, str] | None = None,
+    not_painted: Sequence[str] = (),
+    board: Target | str | None = None,
+    lens: str = "auto",
+    prior: Sequence[str] = (),
+    estimate: Sequence[str] = (),
+    camera: str = "camera",
+    to: Sequence[str] = (),
+    frames: int = 30,
+) -> Calibration:
+    """Calibrate a camera from photographs or a video in one call, as `ceres-cal run` does.
+
+    Args:
+        images: photographs of one camera, a folder of them, or a video. output: folder for everything that is made.
+        target: the field, such as `ssl_field("B")` or "ssl-b". board: a checkerboard, such as "9x6x25mm".
+        facing: which way round the field is, such as {"LeftGoalLine": "top"}. not_painted: lines that it lacks.
+        lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to solve for.
+        to: formats to export to. frames: how many photographs to take out of a video.
+
+    Raises:
+        InputError: an argument does not fit, or no photograph shows the target. SolutionError: no usable camera.
+    """
+    given = RunArguments(
+        images=tuple(map(str, image_files(images))),
+        output=Path(output),
+        target=json.dumps(target.spec) if isinstance(target, Target) else target,
+        facing=tuple(f"{name}={side}" for name, side in (facing or {}).items()),
+        not_painted=",".join(not_painted),
+        board=_board_words(board) if isinstance(board, Target) else board,
+        lens=lens,
+        prior=tuple(prior),
+        estimate=tuple(estimate),
+        camera=camera,
+        to=tuple(to),
+        frames=frames,
+        quiet=True,
+    )
+    COMMANDS["run"].run(given)
+    return Calibration.load(given.output / "calibration.json")
+
+
+def _board_words(board: Target) -> str:
+    if board.grid is None or not board.grid.checkered:
+        raise InputError(f"board must be a checkerboard, not of kind {board.kind!r}: use detect_board and calibrate")
+    return f"{board.grid.columns}x{board.grid.rows}x{1e3 * board.grid.spacing_m:.9g}mm"
