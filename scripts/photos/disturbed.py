@@ -24,10 +24,10 @@ from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, custom, ssl_field
 from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
-from photos.outcomes import MOVED_MM, STATED, USUAL_MM, Outcome, outcome
+from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, outcome
 
 SIZE = (780, 580)
-WRONG, MOST_S = 4.0, 15.0
+MOST_S = 15.0
 AUTO = Auto((Facing("LeftGoalLine", "left"),))
 LENSES: dict[str, tuple[float, Lens]] = {
     "radial 2,3": (345.0, Radial((-1.1e-4, 1.6e-6), (2, 3))),
