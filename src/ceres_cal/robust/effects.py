@@ -17,7 +17,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
-from ceres_cal.effects.effect import Case, Effect, EffectEstimate
+from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
@@ -25,6 +25,8 @@ from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
@@ -38,15 +40,13 @@ class EffectsEnd:
 
     Attributes:
         problem: of all the observations, the effects' best amounts taken off. end: of its rounds.
-        estimates: of what was solved for. keys, shifts: shared numbers, and shifts of them whose products with
-            themselves, added up, are what the effects add to their covariance.
+        estimates: of what was solved for. shifts_at: what all of them add to the covariance of the shared numbers.
     """
 
     problem: Problem
     end: RobustSolution
-    estimates: tuple[EffectEstimate, ...] = ()
-    keys: Sequence[Key] = ()
-    shifts: Sequence[Array] = ()
+    estimates: tuple[EffectEstimate, ...]
+    shifts_at: ShiftsAt
 
 
 def solve_beside_effects(
@@ -58,7 +58,7 @@ def solve_beside_effects(
         problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
     """
     points, off = len(observations.points), np.zeros((len(observations.points) + len(observations.curves), 2))
-    amounts = _Amounts.of(part, observations, end, off)
+    displaced, amounts = part, _Amounts.of(part, observations, end, off)
     for _ in range(_MOST_ROUNDS):
         if not len(amounts.likely):
             break
@@ -69,11 +69,22 @@ def solve_beside_effects(
         before, amounts = amounts, _Amounts.of(displaced, observations, end, off)
         if amounts.stay(before):
             break
-    keys = free_keys(end.solution.estimate, part.layout, part.private)
+    last, solved = end, end.solution.estimate
+
+    def shifts_at(
+        there: Estimate, priors: Sequence[GaussianPrior] | None = None
+    ) -> tuple[Sequence[Key], Sequence[Array]]:
+        # Along a valley, and without what was stated, numbers go together differently.
+        own = amounts
+        if there is not solved or priors is not None:
+            under = displaced if priors is None else replace(displaced, priors=tuple(priors))
+            own = _Amounts.of(under, observations, last.moved_to(there, observations, under), off)
+        return free_keys(there, part.layout, part.private), list(own.shifts())
+
     if np.any(off):
         problem = replace(problem, sights=problem.sights.displaced(-off[:points], -off[points:]))
-        end = end.moved_to(end.solution.estimate, observations, problem)
-    return EffectsEnd(problem, end, tuple(amounts.estimates()), keys, list(amounts.shifts()))
+        end = end.moved_to(solved, observations, problem)
+    return EffectsEnd(problem, end, tuple(amounts.estimates()), shifts_at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +122,7 @@ class _Amounts:
         model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))
         case = Case(observations, problem, estimate, model)
         groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
-        for effect in estimated():
+        for effect in estimated(observations):
             for columns in effect.columns(case):
                 width, count = columns.columns.shape[1], len(columns.subjects)
                 scaled = columns.columns * model.weight[:, None]
@@ -123,7 +134,8 @@ class _Amounts:
         every = SparseColumns.side_by_side(parts, len(equations))
         repeated = RepeatedAmounts.of(model, every)
         numbers = {number: group.own for number, group in enumerate(groups)}
-        priors = {number: group.effect.prior for number, group in enumerate(groups) if group.effect.prior is not None}
+        each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
+        priors = {number: prior for number, prior in each if prior is not None}
         sizes = repeated.sizes(numbers, priors)
         taken = -model.root @ every.in_shared(model)
         return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers])
