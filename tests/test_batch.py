@@ -138,7 +138,7 @@ def test_a_failed_job_stops_nobody_whatever_the_executor(tmp_path: Path, kind: s
     def levels(executor: Executor | None) -> dict[str, str]:
         return {one.job: f"{one.level} {one.line}" for one, _ in run_jobs(jobs, squared, tmp_path, executor)}
 
-    expected = {"a": "good 14", "b": "failed unexpected ValueError: no numbers", "c": "good 14"}
+    expected = {"a": "good 14", "b": "failed unexpected ValueError: no numbers: please report it", "c": "good 14"}
     if kind == "none":
         assert levels(None) == expected
     elif kind == "threads":

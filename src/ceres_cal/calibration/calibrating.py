@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.typed import checked
@@ -168,12 +168,13 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         if chosen.choice.chosen != before.choice.chosen:
             calibration, chosen = chosen.first_solved(solved, papers(options), start)
     said = []
-    try:
-        while other := chosen.instead(*calibration.outlier_masks(observations)):
-            calibration, chosen = solved(other), other
-    except CalibrationError as error:
-        # reads: "another lens explains observations that were taken out, but makes no calibration of all: ..."
-        said.append(f"another lens explains observations that were taken out, but makes no calibration of all: {error}")
+    while other := chosen.instead(*calibration.outlier_masks(observations)):
+        found = attempt(partial(solved, other))  # reads: "another lens explains observations that were taken out, ..."
+        if isinstance(found, CalibrationError):
+            without = "but makes no calibration of all"
+            said.append(f"another lens explains observations that were taken out, {without}: {found}")
+            break
+        calibration, chosen = found, other
     if calibration.posterior is not None and (others := chosen.others) is not None:
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
@@ -206,14 +207,12 @@ def _of_lens(
     return solved_from(start, observations, problem, watched=watched)
 
 
+@or_none  # quiet: the caller raises the first failure
 def _without_priors(observations: Observations, options: Options) -> Calibration | None:
     """None where nothing was stated, or the observations make no calibration by themselves either."""
     if not (observations.priors or options.priors):
         return None
-    try:
-        return _calibrated(replace(observations, priors=()), replace(options, priors=()))
-    except CalibrationError:  # quiet: the caller raises the first failure
-        return None
+    return _calibrated(replace(observations, priors=()), replace(options, priors=()))
 
 
 def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:

@@ -9,7 +9,6 @@ lens predict the others no better: a criterion that counts observations would ta
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
@@ -18,7 +17,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
@@ -141,16 +140,16 @@ class Comparison:
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness:
             return found
-        try:
-            found = replace(found, near=self.seen.solved_near(self.chosen))
-        except CalibrationError as error:  # reads: "other lenses could not be compared, so the standard deviations ..."
-            return replace(found, failed=str(error))
+        near = attempt(lambda: self.seen.solved_near(self.chosen))  # reads: "other lenses could not be compared, ..."
+        if isinstance(near, CalibrationError):
+            return replace(found, failed=str(near))
+        found = replace(found, near=near)
         for one, likely in zip(self.tried, self.probabilities, strict=True):
             if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
                 continue
-            with suppress(CalibrationError):  # quiet: a lens that cannot be solved for says nothing of the numbers
-                others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
-                found = replace(found, others=others, weights=weights)
+            near = attempt(partial(self.seen.solved_near, one))  # quiet: what cannot be solved for says nothing
+            if not isinstance(near, CalibrationError):
+                found = replace(found, others=(*found.others, near), weights=(*found.weights, likely))
         # What they say by chance is less by as much as there are more observations than took part.
         share = max(self.share, _LEAST_SHARE)
         return replace(found, weights=tuple(share * one for one in found.weights))
@@ -182,15 +181,13 @@ class Comparison:
         found = self._excluding(lambda one: one.of is self.chosen.of, failure)
         return None if found is None else replace(found, passed=self.passed or self.chosen).outcome
 
+    @or_none  # quiet: the lens stays, or its own failure is told
     def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison | None:
         """Without some lenses, of which it is said why; None where no other one gives an answer."""
         known = {one.form.label for one in self.tried}
         every = [*self.tried, *(one for one in _shorter(self.tried, None) if one.form.label not in known)]
         others = [replace(one, squares=None, failed=one.failed or why) if is_out(one) else one for one in every]
-        try:
-            return _compared(self.seen, self.share, self.as_good, self.start, others)
-        except CalibrationError:  # quiet: the lens stays, or its own failure is told
-            return None
+        return _compared(self.seen, self.share, self.as_good, self.start, others)
 
 
 def choose_lens(observations: Observations, options: Options, start: Start, built: Structure = EXACT) -> Chosen:
@@ -206,12 +203,16 @@ def choose_lens(observations: Observations, options: Options, start: Start, buil
     by_themselves = replace(
         by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start))
     )
-    try:
+
+    def compared() -> Chosen:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built)
         return _among(seen, share, as_good, start, kinds).outcome
-    except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
-        failed = "" if isinstance(error, FewGroupsError) else str(error)
+
+    chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
+    if isinstance(chosen, CalibrationError):
+        failed = "" if isinstance(chosen, FewGroupsError) else str(chosen)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
+    return chosen
 
 
 def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:
@@ -243,11 +244,11 @@ def _among(seen: InlierRows, share: float, as_good: float, start: Start, kinds: 
     as the best of them are the shorter ones looked at.
     """
     tried = [one for kind in kinds for one in kind.candidates(first=True)]
-    found: Comparison | None = None
+    found: Comparison | CalibrationError | None = None
     if any(one.form.label == PAPER and one.squares is not None for one in tried):
-        with suppress(DegenerateError):  # quiet: all of these fold; the shorter ones that follow need not
-            found = _compared(seen, share, as_good, start, tried)
-    if found is None:
+        # quiet: all of these fold; the shorter ones that follow need not
+        found = attempt(lambda: _compared(seen, share, as_good, start, tried), DegenerateError)
+    if not isinstance(found, Comparison):
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])

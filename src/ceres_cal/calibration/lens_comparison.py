@@ -15,13 +15,13 @@ cells of the image and within them (analysis of variance).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
 from ceres_cal.calibration.lens_kinds import Candidate, Kind
@@ -64,17 +64,17 @@ def explained_by_another(
     for other in tried:
         if other is chosen or other.squares is None:
             continue
-        with suppress(CalibrationError):  # quiet: a lens that cannot be solved for explains nothing
-            explained = _explained(seen, seen.solved_near(other), out)
-            if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
-                return True
+        explained = _explained(seen, other, out) or 0
+        if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
+            return True
     return False
 
 
-def _explained(seen: InlierRows, there: Estimate, out: tuple[Mask, Mask]) -> int:
-    """How many equations of what is taken out are explained there, less those that would be taken out instead."""
+@or_none  # quiet: a lens that cannot be solved for explains nothing
+def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask]) -> int:
+    """How many equations of what is taken out a lens explains, less those that would be taken out instead."""
     farthest = seen.options.reject_sigma
-    points, curves = seen.in_sigmas(there)
+    points, curves = seen.in_sigmas(seen.solved_near(other))
     count = 0
     for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
         count += equations * int(np.count_nonzero(own & (off < _EXPLAINED)))
@@ -130,18 +130,20 @@ def _solved(
     """The robust solve with the first of these kinds that explains the observations, or with the one that does it best,
     up to where the noise is known well enough.
     """
+
+    def solved(own: Options, from_nothing: bool) -> RobustSolution:
+        near = initialise(observations, sights, own).estimate if from_nothing else start
+        near = seen_through(near, own, profiles_of(near, sights))
+        problem = problem_of(observations, sights, own, near)
+        return solve_robustly(problem, observations, near, most_rounds=MOST_ROUNDS if from_nothing else 1)
+
     failure: CalibrationError | None = None
     found: list[_Found] = []
     for forms, from_nothing in [(kinds[0], False), *((forms, True) for forms in kinds)]:
-        own = forms[0].of(options)
-        try:
-            near = initialise(observations, sights, own).estimate if from_nothing else start
-            near = seen_through(near, own, profiles_of(near, sights))
-            problem = problem_of(observations, sights, own, near)
-            most_rounds = MOST_ROUNDS if from_nothing else 1
-            end = solve_robustly(problem, observations, near, most_rounds=most_rounds)
-        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
-            failure = error
+        # quiet: the next lens is tried, and the failure raised where none is left
+        end = attempt(partial(solved, forms[0].of(options), from_nothing))
+        if isinstance(end, CalibrationError):
+            failure = end
             continue
         if _noise_px(end) < _SOUND_PX:
             return end, forms

@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, CLEARLY, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals
@@ -155,12 +155,11 @@ class Candidate:
     @cached_property
     def fault(self) -> str:
         """Why it cannot be used, "" where it can."""
-        try:
-            cameras = self.estimate.cameras
-        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
-            return str(error)
+        there = attempt(lambda: self.estimate)  # reads: "..." beside that lens, why it failed
+        if isinstance(there, CalibrationError):
+            return str(there)
         for name, reach_px in self.of.reach_px.items():
-            camera = cameras[name]
+            camera = there.cameras[name]
             if camera.folds and (not camera.lens.may_fold or camera.lens.monotone_radius(camera.phi) <= reach_px):
                 return "folds inside the image"
         return ""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.calibration.lens_forms import Form
 from ceres_cal.calibration.lens_kinds import Candidate, Kind
 from ceres_cal.effects.groups import group_normals
@@ -78,29 +77,31 @@ class InlierRows:
     def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
         """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
         options = forms[0].of(self.options, max_iterations=_MOST_STEPS)
-        estimate = self.end.solution.estimate
-        try:
-            problem = self._problem(options, estimate)
+        start = self.end.solution.estimate
+
+        def near_best() -> Kind:
+            problem, estimate = self._problem(options, start), start
             if not is_solved:
                 estimate = seen_through(estimate, options, self._profiles)
                 self._shown(estimate)
                 estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
             return self._near_best(forms, problem, estimate)
-        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
-            return Kind(forms, estimate, failed=str(error))
+
+        return _or_failed(near_best, forms, start)
 
     def solved(self, forms: tuple[Form, ...], near: Estimate) -> Kind:
         """A kind whose roughness the data tell, by all rounds of a robust solve from an estimate with another lens."""
         options = forms[0].of(self.options)
-        estimate = seen_through(near, options, profiles_of(near, self.sights))
-        try:
-            problem = problem_of(self.observations, self.every, options, estimate)
-            end = solve_robustly(problem, self.observations, estimate, most_rounds=MOST_ROUNDS)
+        start = seen_through(near, options, profiles_of(near, self.sights))
+
+        def near_best() -> Kind:
+            problem = problem_of(self.observations, self.every, options, start)
+            end = solve_robustly(problem, self.observations, start, most_rounds=MOST_ROUNDS)
             estimate = end.solution.estimate
             problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
             return self._near_best(forms, problem, estimate)
-        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
-            return Kind(forms, estimate, failed=str(error))
+
+        return _or_failed(near_best, forms, start)
 
     @property
     def splits_placements(self) -> bool:
@@ -117,17 +118,16 @@ class InlierRows:
         points = there.points[sights.point_rows] / (scales[0] * sights.sigma_px[:, None])
         return points, there.curves[sights.curve_rows] / (scales[1] * sights.curve_sigma_px)
 
+    @or_none  # quiet: the lens does not reach what was promised, and gives no answer
     def reached(self, candidate: Candidate) -> Estimate | None:
         """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
-        with suppress(CalibrationError):  # quiet: the lens does not reach what was promised, and gives no answer
-            points, curves = self.in_sigmas(candidate.estimate)
-            if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
-                return candidate.estimate
-            options = candidate.form.of(self.options, max_iterations=_MOST_STEPS)
-            problem = self._problem(options, candidate.estimate)
-            solution = solve(problem, candidate.estimate, precision=_PRECISION)
-            return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
-        return None
+        points, curves = self.in_sigmas(candidate.estimate)
+        if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
+            return candidate.estimate
+        options = candidate.form.of(self.options, max_iterations=_MOST_STEPS)
+        problem = self._problem(options, candidate.estimate)
+        solution = solve(problem, candidate.estimate, precision=_PRECISION)
+        return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
 
     def solved_near(self, candidate: Candidate) -> Estimate:
         """Where a lens is at its best, solved for from where the normal equations have it.
@@ -173,6 +173,12 @@ class InlierRows:
         if not (known[0].all() and known[1].all()):
             raise DegenerateError("cannot show all that another lens shows")
         return there
+
+
+def _or_failed(near_best: Callable[[], Kind], forms: tuple[Form, ...], start: Estimate) -> Kind:
+    """A kind near its best, or why it failed."""
+    found = attempt(near_best)  # reads: "..." beside that lens, why it failed
+    return Kind(forms, start, failed=str(found)) if isinstance(found, CalibrationError) else found
 
 
 def _placed(sights: Sights) -> Mask:

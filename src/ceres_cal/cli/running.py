@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, answer_or_reason, attempt
 from ceres_cal.cli.jobs import Job, Outcome, remember, remembered
 
 
@@ -28,10 +29,9 @@ def run_jobs(
     """
     known, todo = remembered(folder), []
     for job in jobs:
-        try:
-            key = job.key
-        except CalibrationError as error:  # reads: "failed ... NAME: ..." and the reason
-            yield failed(job, str(error)), False
+        key = attempt(partial(getattr, job, "key"))  # reads: "failed ... NAME: ..." and the reason
+        if isinstance(key, CalibrationError):
+            yield failed(job, str(key)), False
             continue
         old = known.get(job.name)
         if old is not None and old.key == key and old.level != "failed" and all(map(Path.exists, job.outputs)):
@@ -59,11 +59,8 @@ def _done(
 
 
 def _tried(work: Callable[[Job], Outcome], job: Job) -> Outcome:
-    try:
-        return work(job)
-    except Exception as error:  # reads: "failed ... NAME: ..." and the reason; the others go on
-        foreseen = isinstance(error, CalibrationError)
-        return failed(job, str(error) if foreseen else f"unexpected {type(error).__name__}: {error}")
+    outcome, why = answer_or_reason(lambda: work(job))  # reads: "failed ... NAME: ..." and the reason; the others go on
+    return outcome or failed(job, why)
 
 
 def failed(job: Job, why: str) -> Outcome:

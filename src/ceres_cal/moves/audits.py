@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.errors import CalibrationError, InputError, attempt
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
@@ -89,10 +90,11 @@ class _AuditCase:
         layout = Layout({owner: np.array(lens, dtype=np.int64)}, frozenset(stations), free.placements)
         if layout.size:
             problem = replace(self.problem, layout=layout)
-            try:
-                estimate = solve(problem, estimate, precision=1e-10, is_near=False).estimate
-            except CalibrationError:  # quiet: a change that cannot be solved for costs more than any other
+            # quiet: a change that cannot be solved for costs more than any other
+            solution = attempt(lambda: solve(problem, estimate, precision=1e-10, is_near=False))
+            if isinstance(solution, CalibrationError):
                 return np.inf, camera
+            estimate = solution.estimate
         return self._cost(estimate), estimate.camera_at(self.name)
 
     def _with(self, camera: Camera) -> Estimate:
@@ -160,16 +162,17 @@ def _case(observations: Observations, given: Camera) -> _AuditCase:
     found: list[tuple[float, Calibration]] = []
     failure: CalibrationError | None = None
     for kind, powers in dict.fromkeys([*_LENSES, (given.lens.kind, given.lens.powers or (2, 3))]):
-        try:
-            own = Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0, as_built="as drawn")
-            ours = calibrate(observations, own)  # as drawn, since other programs take targets so
-        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
-            failure = failure or error
+        # As drawn, since other programs take targets so.
+        own = Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0, as_built="as drawn")
+        # quiet: the next lens is tried, and the failure raised where none is left
+        tried = attempt(partial(calibrate, observations, own))
+        if isinstance(tried, CalibrationError):
+            failure = failure or tried
             continue
-        count = ours.fit.points * 2 + ours.fit.curves
-        outliers = len(ours.outliers)  # each of them as a residual of five sigmas
-        misfit = count * np.log(ours.fit.rms_px**2) + 25.0 * outliers
-        found.append((misfit + len(ours.station().lens.names) * np.log(count), ours))
+        fit, outliers = tried.fit, len(tried.outliers)  # each of them as a residual of five sigmas
+        count = fit.points * 2 + fit.curves
+        misfit = count * np.log(fit.rms_px**2) + 25.0 * outliers
+        found.append((misfit + len(tried.station().lens.names) * np.log(count), tried))
     if not found:
         raise failure or InputError("nothing was observed")
     ours = min(found, key=lambda one: one[0])[1]

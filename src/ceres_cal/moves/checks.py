@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.errors import InputError, or_none
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -128,14 +128,12 @@ class _CheckCase:
         weighting = Weighting(noise * points, noise * curves, "trivial")
         return Problem(used, layout, (self.prior.without(freed), *fresh), weighting, self.calibration.options)
 
+    @or_none  # reads: "check no ..." that nothing explains the observations
     def least(self, used: Sights, freed: Collection[Key], pose: Pose) -> tuple[float, Estimate] | None:
         """Twice the least cost, and where, from a pose; None where the solver does not get there."""
         station = replace(self.estimate.stations[self.name], cam_from_world=pose)
         start = replace(self.estimate, stations={self.name: station})
-        try:
-            solution = solve(self.problem(used, freed), start)
-        except CalibrationError:  # reads: "check no ..." that nothing explains the observations
-            return None
+        solution = solve(self.problem(used, freed), start)
         return None if solution.failed else (2.0 * solution.cost, solution.estimate)
 
     def known(

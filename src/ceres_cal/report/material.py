@@ -11,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis
@@ -99,10 +99,12 @@ class Material(Quality):
             return "these observations are others than those the calibration was made from"
         if not self.calibration.rounds:
             return "this calibration is the closed form itself"
-        try:
-            calibration = calibrate(self.observations, replace(self.calibration.options, closed_form_only=True))
-        except CalibrationError as error:  # reads: "..." in place of the paper's method
-            return str(error)
+        options = replace(self.calibration.options, closed_form_only=True)
+        calibration = attempt(
+            lambda: calibrate(self.observations, options)
+        )  # reads: "..." in place of the paper's method
+        if isinstance(calibration, CalibrationError):
+            return str(calibration)
         remaining = residuals(self.observations, gather_sights(self.observations), calibration.estimate)
         lengths = np.concatenate([np.linalg.norm(remaining.points, axis=1), np.abs(remaining.curves)])
         return ClosedForm(calibration, lengths)

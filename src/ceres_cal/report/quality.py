@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, Finding, diagnose
 from ceres_cal.observations import Observations
@@ -40,12 +40,13 @@ def quality_of(calibration: Calibration, observations: Observations, diagnosis: 
     observations = calibration.drawn_alike(observations)
     if not calibration.rounds:
         return Quality(calibration, observations, diagnosis)
-    try:
+    if diagnosis is None:
         few = thinned(observations, _DIAGNOSED)
-        diagnosis = diagnosis or diagnose(calibration, few, new_data=few is not observations)
-    except CalibrationError as error:
         # reads: "Its residuals could not be judged, so nothing says whether the model is right: ..."
-        return Quality(calibration, observations, None, str(error))
+        found = attempt(lambda: diagnose(calibration, few, new_data=few is not observations))
+        if isinstance(found, CalibrationError):
+            return Quality(calibration, observations, None, str(found))
+        diagnosis = found
     return Quality(calibration, observations, diagnosis)
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Indices, Mask, medians_known
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt, or_none
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.evidence import Offsets, measure_offsets
@@ -147,22 +147,22 @@ def _freed(every: Subproblem, solver: Solver) -> Subproblem:
     freed = without_suspicious(every.problem, every.observations, every.end)
     if freed is every.problem:
         return every
-    try:
-        end = solver(freed, every)
-    except CalibrationError:  # quiet: they are competed with as stated; what contradicts them is tested afterwards
+    # quiet: they are competed with as stated; what contradicts them is tested afterwards
+    end = attempt(lambda: solver(freed, every))
+    if isinstance(end, CalibrationError) or end.solution.failed:
         return every
-    return every if end.solution.failed else replace(every, problem=freed, end=end)
+    return replace(every, problem=freed, end=end)
 
 
 def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanation:
     """With the other estimate under all that is stated: what moves without that is no doubt about a group."""
     if not one.is_doubtful:
         return one
-    try:
-        other = part.end if one.is_taken else solver(part.without(one.rows), part)
-    except CalibrationError:  # quiet: without that solve the doubt stays as large as it was
+    # quiet: without that solve the doubt stays as large as it was
+    other = part.end if one.is_taken else attempt(lambda: solver(part.without(one.rows), part))
+    if isinstance(other, CalibrationError) or other.solution.failed:
         return one
-    return one if other.solution.failed else replace(one, other=other.solution.estimate)
+    return replace(one, other=other.solution.estimate)
 
 
 _Suspects = tuple[ObservationGroups, tuple[int, ...]]
@@ -291,16 +291,14 @@ class _Competition:
         least = min(one.log_odds for one in explanations)
         return _Trial(suspects, without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
 
+    @or_none  # quiet: what determines nothing without the suspects is no explanation
     def _without(self, groups: ObservationGroups, numbers: tuple[int, ...]) -> RobustSolution | None:
         """The end of a solve without some groups; None where the others determine nothing."""
         gone = groups.among(np.array(numbers))
-        try:
-            end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
-            every = self._some.problem
-            there = residuals(self._some.observations, every.sights, end.solution.estimate)
-            require_fits(replace(end, residuals=there), every)
-        except CalibrationError:  # quiet: what determines nothing without the suspects is no explanation
-            return None
+        end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
+        every = self._some.problem
+        there = residuals(self._some.observations, every.sights, end.solution.estimate)
+        require_fits(replace(end, residuals=there), every)
         if isinstance(groups, FeatureGroups):
             return end
         alone = self._some.of_rows(gone).weighted(replace(end.problem.weighting, loss="cauchy"))

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt, or_none
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.dependence import measure_scatter, scattered
@@ -295,14 +295,12 @@ def _wrong(squared: float) -> float:
     return float(np.sum(others) / (right + np.sum(others)))
 
 
+@or_none  # quiet: the linear test decides, and the answer stays
 def _solved(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
 ) -> RobustSolution | None:
     """The problem solved from where another one ended; None where it cannot be."""
-    try:
-        after = solve_robustly(problem, observations, end.solution.estimate, usual)
-    except CalibrationError:  # quiet: the linear test decides, and the answer stays
-        return None
+    after = solve_robustly(problem, observations, end.solution.estimate, usual)
     return None if after.solution.failed else after
 
 
@@ -380,11 +378,11 @@ class _ForwardSelection:
         test = worst_test(statement, rest_at(statement, after, self.observations))
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
-        try:
-            least, most = solve(without, rest.estimate), solve(bound, self.end.solution.estimate)
-        except CalibrationError:  # quiet: the linear test decides
+        starts = (without, rest.estimate), (bound, self.end.solution.estimate)
+        ends = attempt(lambda: [solve(*start).cost for start in starts])  # quiet: the linear test decides
+        if isinstance(ends, CalibrationError):
             return test
-        rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
+        rise = max(2.0 * (ends[1] - ends[0]), 0.0)  # of exact observations it is rounding
         if rise >= alone.squared or len(statement.priors) > 1:
             return test
         share = rise / alone.squared

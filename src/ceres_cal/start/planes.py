@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
-from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.errors import or_none
 from ceres_cal.base.native import kept_signals
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.start.closed_forms import (
@@ -306,6 +306,7 @@ def _homographies_of_boards(board: Sights, data: PlaneData, profile: RadialProfi
     return homographies
 
 
+@or_none  # quiet: these points make no homography; the caller keeps the one of all
 def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array | None:
     """The homography that most points agree on within `limit_px`, by LO-RANSAC (pycolmap), or None.
 
@@ -322,7 +323,4 @@ def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array 
     if consensus is None:
         return None
     inliers = np.asarray(consensus["inlier_mask"], dtype=bool)
-    try:
-        return homography_from_points(plane[inliers], lifted[inliers])
-    except DegenerateError:  # quiet: these points make no homography; the caller keeps the one of all
-        return None
+    return homography_from_points(plane[inliers], lifted[inliers])

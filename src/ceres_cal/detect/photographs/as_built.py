@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects
@@ -118,9 +118,10 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
     free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
     problem, estimate = problem_of(camera, seen, free, priors)
-    try:
-        equations = write_equations(seen, problem.sights, estimate, residuals(seen, problem.sights, estimate))
-    except SolutionError:  # reads: "..." of `AsBuilt.words`: this is another field
+    left = residuals(seen, problem.sights, estimate)
+    # reads: "..." of `AsBuilt.words`: this is another field
+    equations = attempt(lambda: write_equations(seen, problem.sights, estimate, left), SolutionError)
+    if isinstance(equations, CalibrationError):
         return replace(AS_DRAWN, misfit=np.inf)
     every = np.ones(len(equations), dtype=bool)
     weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.base.arrays import Array32, Mask
-from ceres_cal.base.errors import InputError, NothingShownError, naming
+from ceres_cal.base.errors import InputError, NothingShownError, naming, or_none
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.base.words import frame_of
@@ -206,12 +206,10 @@ def _looked_for(
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 
 
+@or_none  # reads: "its lines were not found ..."
 def _is_worn(grey: Array32, followed: Followed) -> bool:
     """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
-    try:
-        return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
-    except InputError:  # reads: "its lines were not found ..."
-        return False
+    return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
 
 
 def _starts(
