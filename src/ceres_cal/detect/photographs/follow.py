@@ -203,7 +203,10 @@ class _Tracker:
         other = among_others(self.grey, tracker.target, camera, tracker.curves, self.free)
         if other is not None:
             tracker, camera = replace(tracker, target=other[1]), other[0]
-        there = tracker._reached_before(camera) or tracker.at_rest(camera, self.free.names)
+        there = tracker._reached_before(camera)
+        if there is None:
+            there = tracker.at_rest(camera, self.free.names)
+            there = tracker._reached_before(there.camera) or there
         self.reached.append(there)
         return there
 
