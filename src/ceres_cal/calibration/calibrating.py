@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration

@@ -16,8 +16,8 @@ from typing import TypeVar
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
@@ -30,8 +30,7 @@ from ceres_cal.calibration.lens_forms import (
     pseudo_bma,
     standard_errors,
 )
-from ceres_cal.calibration.lens_kinds import Candidate, Kind
-from ceres_cal.calibration.lens_seen import FewGroupsError, InlierRows
+from ceres_cal.calibration.lens_seen import Candidate, FewGroupsError, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options

@@ -24,10 +24,11 @@ from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
-from ceres_cal.calibration.lens_kinds import Candidate, Kind
 from ceres_cal.calibration.lens_seen import (
     MOST_ROUNDS,
+    Candidate,
     InlierRows,
+    Kind,
     profiles_of,
     require_groups,
     seen_through,

@@ -28,11 +28,11 @@ from ceres_cal.effects.evidence import AS_BUILT, LIKELY, RepeatedAmounts, agreem
 from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.equations import Equations, equations_of, whole_structure
 from ceres_cal.problem.parameters import Estimate, Options, unit_px
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
+from ceres_cal.problem.residuals import Equations, equations_of, whole_structure
 from ceres_cal.problem.structure import EXACT, Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn
 from ceres_cal.robust.competing import Explanation, Solver, compete
 from ceres_cal.robust.robust import RobustSolution, judge_at, solve_robustly
