@@ -75,7 +75,8 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
     # What is said of the observations is what they say by themselves, at their own noise: solved, not extrapolated.
     assert conflict.seen == pytest.approx(free.station().position[2], abs=1e-3)  # 2.5e-5 measured, of an sd of 0.06
     assert conflict.seen_sd == pytest.approx(
-        free.uncertainty.posterior.sd_of("station", "overhead", "height"), rel=0.05  # 0.032 measured
+        free.uncertainty.posterior.sd_of("station", "overhead", "height"),
+        rel=0.05,  # 0.032 measured
     )
     assert conflict.sigmas == pytest.approx((conflict.seen - 3.0) / np.hypot(0.005, conflict.seen_sd), rel=0.15)
     assert conflict.words in wrong().warnings

@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import did_you_mean, first_of
 from ceres_cal.base.written import noting
-from ceres_cal.cli import terminal
-from ceres_cal.cli.command import COMMANDS, Command, print_answer
-from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
+from ceres_cal.cli.command import COMMANDS, Command
+from ceres_cal.cli.terminal import TERMINATED, Terminated, as_a_program, ended, error, in_colour, print_answer
 
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _FORESEEN = (CalibrationError, KeyboardInterrupt, MemoryError, OSError)
@@ -75,7 +74,7 @@ def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
 def _fail(message: str, exit_code: int, as_json: bool) -> int:
     line = " ".join(message.splitlines())
     said = f"ceres-cal: {line}"
-    print(terminal.error(said) if terminal.in_colour(sys.stderr) else said, file=sys.stderr)
+    print(error(said) if in_colour(sys.stderr) else said, file=sys.stderr)
     if as_json:
         import json
 

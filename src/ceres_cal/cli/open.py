@@ -12,9 +12,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option, parse_board, prior_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, switch
 from ceres_cal.cli.files import json_object, read_target
-from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from ceres_cal.cli.arguments import (
     station_option,
     timeout_option,
 )
+from ceres_cal.cli.command import Arguments, QuietArguments, argument, option
 from ceres_cal.cli.files import finishing, require_different, require_output
-from ceres_cal.cli.options import Arguments, QuietArguments, argument, option
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
 

@@ -20,9 +20,8 @@ from ceres_cal.cli.arguments import (
     parse_lengths,
     station_option,
 )
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import QuietArguments, argument, command, given_of, option, switch
 from ceres_cal.cli.files import finishing, read_calibration
-from ceres_cal.cli.options import QuietArguments, argument, given_of, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -202,7 +201,7 @@ _PictureMaker = tuple[Callable[[Path], tuple["Image", dict[str, Any], str]], Map
 
 
 def _read(path: Path, camera: Camera, name: str) -> Image:
-    from ceres_cal.report.pictures.files import read_photograph
+    from ceres_cal.report.pictures.frames import read_photograph
 
     return read_photograph(path, camera.image_size, name)
 

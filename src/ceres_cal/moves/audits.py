@@ -15,12 +15,12 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.errors import CalibrationError, InputError, attempt
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
+from ceres_cal.base.words import at_height
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids
@@ -32,7 +32,6 @@ from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import at_height
 
 # How often a sound calibration is said to be at fault.
 _FALSE_ALARMS = 0.005

@@ -10,16 +10,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.words import counted, first_of, mm, sentence, short
+from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
-from ceres_cal.report.faults import FaultyMap
-from ceres_cal.report.quality import Quality
+from ceres_cal.report.quality import FaultyMap, Quality
 from ceres_cal.robust.as_built import words_of
-from ceres_cal.scene.heights import HEIGHTS_M
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with

@@ -10,8 +10,7 @@ from ceres_cal.base.words import counted, first_of, fixed
 from ceres_cal.calibration import Calibration
 from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
-from ceres_cal.report.pictures.files import jpeg_of_at_most, read_photograph
-from ceres_cal.report.pictures.frames import Frame, frames_of, marks_of, model_of
+from ceres_cal.report.pictures.frames import Frame, frames_of, jpeg_of_at_most, marks_of, model_of, read_photograph
 from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 
 MOST_PHOTOGRAPHS = 4

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.words import mm, sentence, short
+from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, image_grid
 from ceres_cal.report import canvas
@@ -18,7 +18,6 @@ from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
-from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

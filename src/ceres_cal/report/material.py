@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError, attempt
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis

@@ -11,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.paper import Disc, Paper
+from ceres_cal.scene.targets.target import Disc, Paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

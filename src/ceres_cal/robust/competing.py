@@ -24,10 +24,9 @@ from ceres_cal.effects.evidence import Offsets, measure_offsets
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.conflicts import without_suspicious
 from ceres_cal.robust.groups import (
     FEWEST,

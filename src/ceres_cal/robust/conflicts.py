@@ -21,9 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.errors import CalibrationError, attempt, or_none
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt

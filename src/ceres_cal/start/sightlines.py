@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 
 _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
