@@ -40,6 +40,7 @@ from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.residuals import residuals, write_equations
+from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
@@ -150,10 +151,12 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
     gone = {"kannala-brandt"}
 
-    def broken(start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+    def broken(
+        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
+    ) -> Calibration:
         if options.lens in gone:
             raise SolutionError("no camera")
-        return of_lens(start, seen, sights, options, watched)
+        return of_lens(start, seen, sights, options, watched, built)
 
     monkeypatch.setattr(calibrating, "_of_lens", broken)
     calibration = calibrate(seen)
@@ -187,7 +190,9 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     """After every other kind; what it says is said."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
-    def broken(start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+    def broken(
+        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
+    ) -> Calibration:
         asked.append(label_of(options))
         raise SolutionError(f"no camera with {asked[-1]}")
 

@@ -34,7 +34,7 @@ from ceres_cal.calibration.lens_seen import Candidate, FewGroupsError, InlierRow
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options
-from ceres_cal.problem.structure import EXACT, Structure
+from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
 
 _T = TypeVar("_T")
@@ -81,6 +81,11 @@ class Chosen:
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
+
+    @property
+    def built(self) -> Built:
+        """How targets seemed to be built when lenses were compared."""
+        return AS_DRAWN if self.among is None else self.among.seen.built
 
     @property
     def others(self) -> OtherLenses | None:
@@ -189,12 +194,12 @@ class Comparison:
         return _compared(self.seen, self.share, self.as_good, self.start, others)
 
 
-def choose_lens(observations: Observations, options: Options, start: Start, built: Structure = EXACT) -> Chosen:
+def choose_lens(observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN) -> Chosen:
     """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
 
     Args:
         options: their lens is not looked at. start: of everything, with whatever lens.
-        built: how the targets are taken to be built.
+        built: how targets were found to be built; where nothing is given that is found, too.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))

@@ -39,7 +39,8 @@ from ceres_cal.observations.thinning import thinned
 from ceres_cal.posterior.other_lenses import cells_of
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import problem_of
-from ceres_cal.problem.structure import EXACT, Structure
+from ceres_cal.problem.structure import EXACT
+from ceres_cal.robust.as_built import AS_DRAWN, Built, estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
@@ -91,13 +92,13 @@ _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong va
 
 
 def compared_kinds(
-    observations: Observations, options: Options, start: Estimate, built: Structure = EXACT
+    observations: Observations, options: Options, start: Estimate, built: Built = AS_DRAWN
 ) -> tuple[InlierRows, list[Kind], float]:
     """The observations that take part, each kind near its best over them, at the noise of the one that explains the
     most, and their share of all.
 
     Args:
-        built: how the targets are taken to be built.
+        built: how targets were found to be built; where nothing is given that is found, too.
 
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
@@ -106,14 +107,19 @@ def compared_kinds(
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
     few = thinned(observations, max(least_rows, int(share * total)), fewest_frames)
-    sights = built.built_into(gather_sights(few))
+    sights = built.held(gather_sights(few), few)
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
     tried = every
     while True:
         end, used = _solved(few, options, sights, start, tried)
-        seen = InlierRows(few, end, options, sights)
+        if options.as_built == "estimate" and not built.every:
+            built = estimate_as_built(end.problem, few, end)
+            if built.every:
+                sights = built.held(sights, few)
+                end, used = _solved(few, options, sights, replace(end.solution.estimate, structure=EXACT), [used])
+        seen = InlierRows(few, end, options, sights, built)
         compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)

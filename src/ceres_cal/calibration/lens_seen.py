@@ -24,6 +24,7 @@ from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.quantities import moved, values_of
 from ceres_cal.problem.residuals import Residuals, residuals
+from ceres_cal.robust.as_built import Built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.closed_forms import LensProfile, edge_over
 
@@ -209,13 +210,14 @@ class InlierRows:
     """The inliers of a solve.
 
     Attributes:
-        every: sights of all the observations.
+        every: sights of all the observations, of targets as they are `built`.
     """
 
     observations: Observations
     end: RobustSolution
     options: Options
     every: Sights
+    built: Built
 
     @property
     def sights(self) -> Sights:
