@@ -31,7 +31,6 @@ FLOORS = {
     "diagnostics": 9,
     "detect": 10,
     "report": 11,
-    "page": 12,
     "functions": 12,
     "cli": 13,
 }
@@ -45,7 +44,7 @@ DOORS = {
     "google": {"formats"},  # protobuf
     "yaml": {"formats"},
     "distributed": {"cli"},
-    "aiohttp": {"cli", "page"},
+    "aiohttp": {"cli"},
     "scipy": set(),  # for the tests only
 }
 
