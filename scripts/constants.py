@@ -85,7 +85,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.usable", "_NO_FIT", "calibrate"),
     *_of("calibration.lens_forms", "AS_GOOD ALIKE CLEARLY", "lens"),
     *_of("calibration.lens_comparison", "_QUIETER _SOUND_PX", "lens"),
-    *_of("calibration.lens_kinds", "_REFUTED _UNSEEN_GROUPS", "lens"),
+    *_of("calibration.lens_seen", "_REFUTED _UNSEEN_GROUPS", "lens"),
     *_of("calibration.lens_seen", "_KEPT", "lens"),
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),
     *_of("posterior.other_lenses", "AGREES", "lens"),

@@ -12,16 +12,13 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option, parse_board, prior_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, switch
 from ceres_cal.cli.files import json_object, read_target
-from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.page.session import Session
     from ceres_cal.page.state import Sitting, State
-
-_MOST_CALIBRATIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,14 +77,15 @@ def _serve(session: Session, args: OpenArguments) -> None:
 
 def _sitting(args: OpenArguments) -> Sitting:
     """What was named, each file once: nothing else is read later."""
+    most_calibrations = 2
     from ceres_cal.detect.images import read_colour
     from ceres_cal.page.state import Sitting
 
     named = image_files(args.files)
     calibrations = [path for path in named if path.suffix.lower() == ".json"]
     photographs = tuple(dict.fromkeys(path for path in named if path not in calibrations))
-    if len(calibrations) > _MOST_CALIBRATIONS:
-        raise InputError(f"{calibrations[_MOST_CALIBRATIONS]}: at most two calibrations are looked at over one picture")
+    if len(calibrations) > most_calibrations:
+        raise InputError(f"{calibrations[most_calibrations]}: at most two calibrations are looked at over one picture")
     if not photographs:
         raise InputError(f"{calibrations[0]}: a calibration holds no picture: name a photograph, too")
     names = [path.name for path in photographs]

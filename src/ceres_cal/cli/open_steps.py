@@ -22,7 +22,6 @@ from ceres_cal.report.document import Document
 from ceres_cal.scene.targets import Target
 
 CAMERA = "camera"
-_BLACK, _WHITE = 0, 255
 
 
 @dataclass(frozen=True)
@@ -171,8 +170,9 @@ def _mask_name(path: Path) -> str:
 
 def _mask(regions: Sequence[Region], size: tuple[int, int]) -> bytes:
     """A picture, black where nothing of the field is."""
-    picture = np.full(size[::-1], _WHITE, np.uint8)
+    black, white = 0, 255
+    picture = np.full(size[::-1], white, np.uint8)
     for one in regions:
         x0, y0, x1, y1 = np.round(one.box).astype(int).tolist()
-        picture[max(min(y0, y1), 0) : max(y0, y1, 0) + 1, max(min(x0, x1), 0) : max(x0, x1, 0) + 1] = _BLACK
+        picture[max(min(y0, y1), 0) : max(y0, y1, 0) + 1, max(min(x0, x1), 0) : max(x0, x1, 0) + 1] = black
     return encoded(picture, ".png", 100)

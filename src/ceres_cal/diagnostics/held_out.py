@@ -27,10 +27,9 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import column_of, frames_of, thinned
 from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.parameters import Estimate, Layout, Options
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.problem.structure import make_structure
 
 if TYPE_CHECKING:

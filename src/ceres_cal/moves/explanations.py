@@ -16,9 +16,8 @@ from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
-from ceres_cal.moves.refit_plan import RefitPlan
+from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate

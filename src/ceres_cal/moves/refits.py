@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import DegenerateError, SolutionError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted

@@ -21,7 +21,7 @@ from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.detect.images import read_colour
 from ceres_cal.page.session import Session
 from ceres_cal.page.state import Change, Do, Drag, Message, read_message
-from ceres_cal.report.pictures.files import jpeg_of_at_most
+from ceres_cal.report.pictures.frames import jpeg_of_at_most
 
 HOST = "127.0.0.1"
 _MOST_BYTES = 1 << 18  # of a message: a state with all that a hand may show
