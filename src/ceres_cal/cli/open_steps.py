@@ -14,10 +14,10 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes, write_json
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.files import read_target
+from ceres_cal.cli.page.state import Made, Region, Sitting, State, target_words
 from ceres_cal.detect.images import encoded
 from ceres_cal.detect.photographs.clicks import FEWEST, FORMAT, VERSION
 from ceres_cal.formats import export_format
-from ceres_cal.page.state import Made, Region, Sitting, State, target_words
 from ceres_cal.report.document import Document
 from ceres_cal.scene.targets import Target
 
