@@ -138,6 +138,7 @@ class Target:
         dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
             spec its features lie elsewhere.
         optional: names of curves that go together and that a field may lack without being another one.
+        tolerance_m: by how much its lines may lie aside, where it says so; else as is usual of its size.
     """
 
     spec: Mapping[str, Any]
@@ -150,6 +151,7 @@ class Target:
     mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     dimensions: Mapping[str, float] = field(default_factory=dict)
     optional: tuple[tuple[str, ...], ...] = ()
+    tolerance_m: float | None = None
 
     def __post_init__(self) -> None:
         require_places(self.kind, self.points, self.curves)
