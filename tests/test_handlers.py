@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 SOURCES = Path(__file__).parents[1] / "src" / "ceres_cal"
@@ -13,9 +14,15 @@ MOST = 45  # there are so many; one more needs one less elsewhere
 GOES_ON = (ast.Return, ast.Continue, ast.Break)
 
 
+@cache
+def nodes(text: str) -> tuple[ast.AST, ...]:
+    """All of a module."""
+    return tuple(ast.walk(ast.parse(text)))
+
+
 def handlers(text: str) -> Iterator[ast.ExceptHandler | ast.With]:
     """Those after which the work may go on, and each `with suppress(...)`."""
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes(text):
         if isinstance(node, ast.ExceptHandler):
             inside = [part for statement in node.body for part in ast.walk(statement)]
             if not isinstance(node.body[-1], ast.Raise) or any(isinstance(part, GOES_ON) for part in inside):
@@ -31,7 +38,7 @@ def comments_of(lines: list[str], node: ast.ExceptHandler | ast.With) -> str:
 
 def attempts(text: str) -> Iterator[ast.Call | ast.Name]:
     """Calls of `attempt`, and functions that are `or_none`: one handler each serves all of them."""
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes(text):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "attempt":
             yield node
         elif isinstance(node, ast.FunctionDef):

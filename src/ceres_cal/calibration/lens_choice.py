@@ -40,11 +40,9 @@ from ceres_cal.start.initialise import Start
 _T = TypeVar("_T")
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
-_LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less make no difference
 # Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
 # of a valley along phi that frontal views leave open.
 _VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
-_LEAST_SHARE = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +139,8 @@ class Comparison:
     @cached_property
     def others(self) -> OtherLenses:
         """What other lenses would say; nothing beside one without a formula."""
+        least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
+        least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness:
             return found
@@ -149,13 +149,13 @@ class Comparison:
             return replace(found, failed=str(near))
         found = replace(found, near=near)
         for one, likely in zip(self.tried, self.probabilities, strict=True):
-            if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
+            if one is self.chosen or likely < least_probability or one.form.blank.roughness or one.fault:
                 continue
             near = attempt(partial(self.seen.solved_near, one))  # quiet: what cannot be solved for says nothing
             if not isinstance(near, CalibrationError):
                 found = replace(found, others=(*found.others, near), weights=(*found.weights, likely))
         # What they say by chance is less by as much as there are more observations than took part.
-        share = max(self.share, _LEAST_SHARE)
+        share = max(self.share, least_share)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
     @property

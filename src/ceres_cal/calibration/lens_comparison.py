@@ -44,8 +44,6 @@ from ceres_cal.robust.as_built import AS_DRAWN, Built, estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
-# Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
-_EXPLAINED = 3.0
 # Twice the log-odds of an observation that is taken out: one of a hundred is bad, somewhere within twenty sigmas.
 _PRICE = 13.0
 
@@ -75,16 +73,17 @@ def explained_by_another(
 @or_none  # quiet: a lens that cannot be solved for explains nothing
 def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask]) -> int:
     """How many equations of what is taken out a lens explains, less those that would be taken out instead."""
+    # Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
+    explained = 3.0
     farthest = seen.options.reject_sigma
     points, curves = seen.in_sigmas(seen.solved_near(other))
     count = 0
     for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
-        count += equations * int(np.count_nonzero(own & (off < _EXPLAINED)))
+        count += equations * int(np.count_nonzero(own & (off < explained)))
         count -= equations * int(np.count_nonzero(~own & (off > farthest)))
     return count
 
 
-_LEAST_ROWS, _SHARE, _FEWEST_FRAMES = 1_000, 0.025, 24  # of the observations, how many take part
 # What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
 _WIDEST = "kannala-brandt"
 # Share of its squares: a kind that leaves less is solved instead, for it may have other inliers.
@@ -104,9 +103,10 @@ def compared_kinds(
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
     """
+    least_rows, share, fewest_frames = 1_000, 0.025, 24  # of the observations, how many take part
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
-    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
+    few = thinned(observations, max(least_rows, int(share * total)), fewest_frames)
     sights = built.held(gather_sights(few), few)
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))

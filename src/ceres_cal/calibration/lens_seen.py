@@ -32,7 +32,6 @@ from ceres_cal.start.closed_forms import LensProfile, edge_over
 # the paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could
 # swell, halves of real sets took a lens too simple.
 _REFUTED = 0.003
-_NO_NOISE = 1e-12  # mean square that rounding leaves of exact observations, or less
 _UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
 
 
@@ -87,10 +86,11 @@ class Kind:
         """Mean square of what it leaves, over the stated noise: 1 at most, for a first solve with another lens may have
         left more.
         """
+        no_noise = 1e-12  # mean square that rounding leaves of exact observations, or less
         if self.normals is None:
             return 1.0
         spare = float(self.normals.counts.sum() - len(self.normals.keys))
-        return min(1.0, max(self.least / max(spare, 1.0), _NO_NOISE))
+        return min(1.0, max(self.least / max(spare, 1.0), no_noise))
 
     @cached_property
     def scatter(self) -> float:
@@ -177,11 +177,9 @@ class Candidate:
 
 
 MOST_ROUNDS = 8  # of a robust solve
-_FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
 _KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
-_FEWEST_PLACEMENTS = 8  # with fewer the features of each are held out one by one
 
 
 class FewGroupsError(DegenerateError):
@@ -338,15 +336,17 @@ def _or_failed(near_best: Callable[[], Kind], forms: tuple[Form, ...], start: Es
 
 def _placed(sights: Sights) -> Mask:
     """(S,) which sights are held out whole: those of placements, where there are enough of them."""
+    fewest_placements = 8  # with fewer the features of each are held out one by one
     placed = np.array([key.placement is not None for key in sights.keys])
-    return placed & (np.count_nonzero(placed) >= _FEWEST_PLACEMENTS)
+    return placed & (np.count_nonzero(placed) >= fewest_placements)
 
 
 def require_groups(sights: Sights) -> None:
     """Raise FewGroupsError where there is too little to hold out."""
+    fewest_groups = 8  # with fewer nothing tells lenses apart
     placed = _placed(sights)
     count = int(np.count_nonzero(placed))
     for own in (sights[int(number)] for number in np.flatnonzero(~placed)):
         count += len(distinct(own.point_index)) + len(distinct(own.track_index))
-    if count < _FEWEST_GROUPS:
+    if count < fewest_groups:
         raise FewGroupsError("too few views or features to tell lenses apart")

@@ -194,10 +194,11 @@ def _of_targets(
     is_asked = problem.options.as_built == "estimate"
     if is_asked:
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved, built)
-    if is_asked and watched.settle is None and estimated(observations):
+    if is_asked and estimated(observations):
         from ceres_cal.robust.effects import solve_beside_effects
 
-        beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
+        part, is_all = taking_part(problem, observations, explanations), watched.settle is None
+        beside = solve_beside_effects(problem, part, observations, end, solves=is_all)
         problem, end = beside.problem, beside.end
     others: tuple[Solution, ...] = ()
     if end.problem.sights.equations == problem.sights.equations:

@@ -18,8 +18,6 @@ from ceres_cal.cli.terminal import TERMINATED, Terminated, as_a_program, ended, 
 
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _FORESEEN = (CalibrationError, KeyboardInterrupt, MemoryError, OSError)
-_MOST_LETTERS = 200  # of an error that nobody wrote for people
-_INTERRUPTED = 130  # what a shell reports of a program that SIGINT ended
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,18 +54,20 @@ def _answer(arguments: list[str]) -> int:
 
 def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
     """What is said of an error, and the exit code."""
+    interrupted = 130  # what a shell reports of a program that SIGINT ended
+    most_letters = 200  # of an error that nobody wrote for people
     match error:
         case CalibrationError():
             return str(error), error.exit_code
         case KeyboardInterrupt():
-            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
+            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", interrupted)
             return f"{how}: {f'written were {first_of(files)}' if files else 'nothing was written'}", code
         case MemoryError():
             return "out of memory: give fewer observations or images at a time", InputError.exit_code
         case OSError():
             parts = (error.filename, error.strerror or error)
             return ": ".join(str(part) for part in parts if part), InputError.exit_code
-    what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
+    what = f"{type(error).__name__}: {error}"[:most_letters]
     return f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)", SolutionError.exit_code
 
 

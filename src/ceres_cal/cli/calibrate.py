@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 
 _AUTO = "auto"
-_PATIENCE_S = 5.0  # with a scheduler
 _CAMERA, _SOLVE = "the camera", "the solve"
 
 
@@ -112,9 +111,8 @@ class CalibrateArguments(ReportArguments):
         group=_CAMERA,
     )
     as_drawn: bool = switch(
-        "take targets without a tolerance as drawn (default: corners, bows and lines whose residuals repeat over the "
-        "views are solved for, with a sigma from the data), and floors as flat and square (default: 2 mm of 9 m off, "
-        "on one in five)",
+        "take targets without a tolerance as drawn, and floors as flat and square. Default: corners, bows and lines whose "
+        "residuals repeat over the views are solved for; one floor in five is 2 mm of 9 m off",
         group=_CAMERA,
     )
     as_built: bool = switch("the contrary of --as-drawn, which is the default", group=_CAMERA)
@@ -179,6 +177,7 @@ def _run(args: CalibrateArguments) -> Document:
 
 def _client(address: str | None) -> AbstractContextManager[Any]:
     """Of the scheduler there, whose answer is awaited for some seconds; nothing without an address."""
+    patience_s = 5.0  # with a scheduler
     if address is None:
         return nullcontext()
     try:
@@ -186,7 +185,7 @@ def _client(address: str | None) -> AbstractContextManager[Any]:
     except ImportError:
         raise InputError("--scheduler needs Dask: pip install 'ceres-cal[dask]'") from None
     try:
-        client: AbstractContextManager[Any] = Client(address, timeout=_PATIENCE_S)
+        client: AbstractContextManager[Any] = Client(address, timeout=patience_s)
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no scheduler answers there ({str(error).splitlines()[0]})") from None
     return client

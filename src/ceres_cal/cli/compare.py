@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.moves.agreement import Agreement
 
-_TABLE_SIZE = 9, 7
-
 
 @dataclass(frozen=True, kw_only=True)
 class CompareArguments(Arguments):
@@ -112,9 +110,10 @@ def _camera(one: Agreement) -> Iterator[Section]:
 
 
 def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
+    table_size = 9, 7
     from ceres_cal.report.maps import grid_table
 
-    table = grid_table(head, values, x, y, place, _TABLE_SIZE, partial(fixed, places=2))
+    table = grid_table(head, values, x, y, place, table_size, partial(fixed, places=2))
     return Section("", table.lines(), pieces=(table,))
 
 

@@ -124,10 +124,8 @@ def _document(detections: BoardDetections, output: Path) -> Document:
     )
 
 
-_MOST_RINGS = 10_000
-
-
 def _radii(text: str) -> tuple[float, ...]:
+    most_rings = 10_000
     where = f"--radii {text!r}"
     if ":" not in text:
         return parse_lengths(text, where)
@@ -135,7 +133,7 @@ def _radii(text: str) -> tuple[float, ...]:
     if len(parts) != 3:
         raise InputError(f"{where}: write FROM:TO:STEP, such as 0.01:0.36:0.01, or the radii between commas")
     first, last, step = (parse_length(part, where) for part in parts)
-    if not (0.0 < first <= last and step > 0.0 and (last - first) / step < _MOST_RINGS):
+    if not (0.0 < first <= last and step > 0.0 and (last - first) / step < most_rings):
         raise InputError(f"{where}: FROM must be above 0, TO not below it, and STEP above 0")
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 

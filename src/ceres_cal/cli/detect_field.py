@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 _CORNER = "TopLeftCorner=102,88"
 _FACING = "LeftGoalLine=top"
-_SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +244,8 @@ def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
 
 def _stretched(camera: Camera) -> bool:
     """Whether its pixels are farther from square than those of cameras."""
-    return abs(camera.aspect - 1.0) > _SQUARE
+    square = 0.005  # of fy / fx: those of cameras are nearer to 1
+    return abs(camera.aspect - 1.0) > square
 
 
 def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:

@@ -25,9 +25,6 @@ from ceres_cal.cli.command import QuietArguments
 from ceres_cal.report.document import Document
 
 _BOLD, _RED, _GREEN, _YELLOW, _PLAIN = "\x1b[1m", "\x1b[31m", "\x1b[32m", "\x1b[33m", "\x1b[0m"
-_REDRAW_S = 0.1
-_FIRST_LINE_S = 3.0  # where there is no terminal; each further line waits twice as long
-_BAR_COLUMNS = 24
 _CLEAR = "\r\x1b[K"
 _TITLE = re.compile(r"^([a-z][a-z ]{0,8})(?=[ ]*(?<=^.{10})\S)", re.MULTILINE)
 _DOUBTFUL = {"warning", "weak", "unknown", "widened"}
@@ -81,10 +78,12 @@ class ProgressBar:
     def __init__(
         self, *, silent: bool, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        first_line_s = 3.0  # where there is no terminal; each further line waits twice as long
+        redraw_s = 0.1
         self._stream = sys.stderr if stream is None else stream
         self._silent, self._clock = silent, clock
         self._terminal = self._stream.isatty() and os.environ.get("TERM") != "dumb"
-        self._wait = _REDRAW_S if self._terminal else _FIRST_LINE_S
+        self._wait = redraw_s if self._terminal else first_line_s
         self._due = clock() + (0.0 if self._terminal else self._wait)
 
     def __enter__(self) -> ProgressBar:
@@ -122,11 +121,11 @@ class ProgressBar:
 
 
 def _bar(done: int, total: int) -> str:
-    full = _BAR_COLUMNS * done // total
-    return f"[{'#' * full}{'.' * (_BAR_COLUMNS - full)}] {100 * done // total:3} %"
+    bar_columns = 24
+    full = bar_columns * done // total
+    return f"[{'#' * full}{'.' * (bar_columns - full)}] {100 * done // total:3} %"
 
 
-_OBJECTS = 50_000  # between collections: what is imported is no garbage, and to look it through takes time
 TERMINATED = 143
 """What a shell reports of a program that SIGTERM ended."""
 
@@ -158,8 +157,9 @@ def as_a_program() -> None:
     """Take SIGTERM like Ctrl-C, print whatever a name holds wherever it goes, and let nobody but us write on standard
     error.
     """
+    objects = 50_000  # between collections: what is imported is no garbage, and to look it through takes time
     signal.signal(signal.SIGTERM, _terminate)
-    gc.set_threshold(_OBJECTS)
+    gc.set_threshold(objects)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time
     _open_what_is_closed()
     error = 2

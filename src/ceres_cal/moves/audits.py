@@ -35,8 +35,6 @@ from ceres_cal.scene.camera import Camera
 
 # How often a sound calibration is said to be at fault.
 _FALSE_ALARMS = 0.005
-_FAR = 1e3  # sigmas, of what a camera does not show at all
-_LENSES = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (2, 3)), ("kannala-brandt", (2, 3)))
 _SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 
 
@@ -103,13 +101,14 @@ class _AuditCase:
         return replace(old, cameras={owner: camera.at(Pose.identity())}, stations={self.name: station})
 
     def _cost(self, estimate: Estimate) -> float:
+        far = 1e3  # sigmas, of what a camera does not show at all
         there = residuals(self.observations, self.problem.sights, estimate)
         total = 0.0
         columns: tuple[Columns, ...] = (self.observations.points, self.observations.curves)
         masks, scales = self.ours.inlier_masks(self.observations), self.ours.fit.scales
         for lengths, column, mask, scale in zip(there.lengths, columns, masks, scales, strict=True):
             sigmas = (lengths / (scale * column.sigma_px))[mask] if len(column) else np.empty(0)
-            total += float(np.sum(np.minimum(np.nan_to_num(sigmas, nan=_FAR), _FAR) ** 2))
+            total += float(np.sum(np.minimum(np.nan_to_num(sigmas, nan=far), far) ** 2))
         return total
 
 
@@ -158,9 +157,10 @@ def excess_px(one: Agreement) -> tuple[float, float]:
 
 def _case(observations: Observations, given: Camera) -> _AuditCase:
     """Ours, with the lens that explains the observations best for the number of its coefficients."""
+    lenses = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (2, 3)), ("kannala-brandt", (2, 3)))
     found: list[tuple[float, Calibration]] = []
     failure: CalibrationError | None = None
-    for kind, powers in dict.fromkeys([*_LENSES, (given.lens.kind, given.lens.powers or (2, 3))]):
+    for kind, powers in dict.fromkeys([*lenses, (given.lens.kind, given.lens.powers or (2, 3))]):
         # As drawn, since other programs take targets so.
         own = Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0, as_built="as drawn")
         # quiet: the next lens is tried, and the failure raised where none is left

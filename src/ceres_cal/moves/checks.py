@@ -50,7 +50,6 @@ from ceres_cal.problem.structure import make_structure
 _INLIER_SIGMA = 3.5
 # Of observations that fit somewhere; with fewer than half nothing is understood. Nothing changes from 0.33 to 0.67.
 _LEAST_SHARE = 0.5
-_MANY_OUTLIERS = 0.25
 # Fall of twice the cost that a phi at its place exceeds one time in a thousand. Nothing changes from half to double.
 _WILL_DO = 10.8
 # Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
@@ -242,6 +241,7 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
 
 
 def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -> str:
+    many_outliers = 0.25
     worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
     if holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
@@ -251,6 +251,6 @@ def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -
         moved = f"moved by about {change.moved_mm:.1f} mm and {change.turned_deg:.3f} deg{shifts}"
         words = f"no longer holds: {moved} (probability {probability:.1g})"
     count = misfit.points + misfit.curves + misfit.outliers
-    if misfit.outliers > _MANY_OUTLIERS * count:
+    if misfit.outliers > many_outliers * count:
         words += f"; but {misfit.outliers} of {count} observations fit nowhere: check labels"
     return words

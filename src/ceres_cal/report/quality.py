@@ -28,8 +28,6 @@ from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import OF_PIXELS
 from ceres_cal.scene.targets import Target
 
-_WITHIN = 2.0  # times its root mean square, how far what a fault leaves reaches
-
 
 @dataclass(frozen=True, eq=False)
 class FaultyMap:
@@ -46,7 +44,8 @@ class FaultyMap:
     @property
     def radius_95_mm(self) -> Array:
         """(Y, X) with the faults counted."""
-        return np.asarray(np.sqrt(self.of.radius_95_mm**2 + self.moved_mm**2 + (_WITHIN * self.left_mm) ** 2))
+        within = 2.0  # times its root mean square, how far what a fault leaves reaches
+        return np.asarray(np.sqrt(self.of.radius_95_mm**2 + self.moved_mm**2 + (within * self.left_mm) ** 2))
 
     @property
     def sigmas(self) -> float:
@@ -87,9 +86,6 @@ def _step(fault: Finding, keys: Sequence[Key]) -> Array:
     return np.array([moves.get(key, 0.0) for key in keys])
 
 
-_DIAGNOSED = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
-
-
 class Seam(Struct, frozen=True, eq=False):
     """What two stations disagree about: predicted at HEIGHTS_M, and measured in what both observed."""
 
@@ -102,11 +98,12 @@ def quality_of(calibration: Calibration, observations: Observations, diagnosis: 
     """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised. Where
     that fails, the verdict says so.
     """
+    diagnosed = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
     observations = calibration.drawn_alike(observations)
     if not calibration.rounds:
         return Quality(calibration, observations, diagnosis)
     if diagnosis is None:
-        few = thinned(observations, _DIAGNOSED)
+        few = thinned(observations, diagnosed)
         # reads: "Its residuals could not be judged, so nothing says whether the model is right: ..."
         found = attempt(lambda: diagnose(calibration, few, new_data=few is not observations))
         if isinstance(found, CalibrationError):

@@ -100,9 +100,6 @@ class Explanation:
         )
 
 
-# Log Bayes factor, by the linear model, from which on a group is looked at by a solve without it: one in thirty sound
-# scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above -4.7.
-_SUSPECT = -4.4
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
@@ -245,6 +242,10 @@ class _Competition:
 
     def _by_offsets(self, end: RobustSolution, groups: ObservationGroups) -> Iterator[tuple[int, ...]]:
         """Those that the offsets speak against: single ones, and the pair of most evidence."""
+        # Log Bayes factor, by the linear model, from which on a group is looked at by a solve without it: one in thirty
+        # sound scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above
+        # -4.7.
+        suspect = -4.4
         if isinstance(groups, ViewGroups):
             above = excess(self._some.observations, groups, end, self._taking_part)
             if np.max(above) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(above)), 1))):
@@ -255,7 +256,7 @@ class _Competition:
         none, each = offsets.log_evidence(), offsets.log_evidence_with_each()
         first = int(np.argmax(each))
         for number in np.argsort(-each)[:2]:
-            if each[number] - none > _SUSPECT + np.log(1.0 - offsets.prior.absent):
+            if each[number] - none > suspect + np.log(1.0 - offsets.prior.absent):
                 yield (int(chosen[number]),)
         both = offsets.log_evidence_with_each((first,))
         second = int(np.argmax(both))

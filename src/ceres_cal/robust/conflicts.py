@@ -175,7 +175,6 @@ def log_probability(squared: float, rest: Rest) -> float:
 
 # Probability of a linear picture from which on it is worth another solve: 2.2 sigma, where one in twenty is wrong.
 _SUSPICIOUS = 0.028
-_DOUBTFUL = 0.05  # probability that a statement is wrong, from which on both explanations are named
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
@@ -329,6 +328,7 @@ class _ForwardSelection:
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
+        doubtful = 0.05  # probability that a statement is wrong, from which on both explanations are named
         tests = [worst_test(one, linear_rest(one, self.end)) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
         if number < 0 or tests[number].log_p > np.log(_SUSPICIOUS):
@@ -343,7 +343,7 @@ class _ForwardSelection:
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
             likely = _wrong(test.squared)
-            if after is not None and suspect.kind == "prior" and likely > _DOUBTFUL:
+            if after is not None and suspect.kind == "prior" and likely > doubtful:
                 shift = difference(after.solution.estimate, self.end.solution.estimate, self._first.shared.keys)
                 words = doubted(suspect, test, len(self.every) == 1, likely)
                 self.doubts.append(Doubt(suspect.keys, likely, shift, words))

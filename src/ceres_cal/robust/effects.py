@@ -50,15 +50,20 @@ class EffectsEnd:
 
 
 def solve_beside_effects(
-    problem: Problem, part: Problem, observations: Observations, end: RobustSolution
+    problem: Problem, part: Problem, observations: Observations, end: RobustSolution, *, solves: bool = True
 ) -> EffectsEnd:
     """The end with everything solved for that likely displaces the observations.
 
     Args:
         problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
+        solves: whether likely effects are; where the observations are a part of those that count, they only widen.
     """
     points, off = len(observations.points), np.zeros((len(observations.points) + len(observations.curves), 2))
-    displaced, amounts = part, _Amounts.of(part, observations, end, off)
+
+    def amounts_at(under: Problem, end: RobustSolution) -> _Amounts:
+        return _Amounts.of(under, observations, end, off, solves)
+
+    displaced, amounts = part, amounts_at(part, end)
     for _ in range(_MOST_ROUNDS):
         if not len(amounts.likely):
             break
@@ -66,7 +71,7 @@ def solve_beside_effects(
         shifts = -off[:points], -off[points:]
         displaced = replace(part, sights=part.sights.displaced(*shifts))
         end = solve_robustly(displaced, observations, end.solution.estimate, is_near=True)
-        before, amounts = amounts, _Amounts.of(displaced, observations, end, off)
+        before, amounts = amounts, amounts_at(displaced, end)
         if amounts.stay(before):
             break
     last, solved = end, end.solution.estimate
@@ -78,7 +83,7 @@ def solve_beside_effects(
         own = amounts
         if there is not solved or priors is not None:
             under = displaced if priors is None else replace(displaced, priors=tuple(priors))
-            own = _Amounts.of(under, observations, last.moved_to(there, observations, under), off)
+            own = amounts_at(under, last.moved_to(there, observations, under))
         return free_keys(there, part.layout, part.private), list(own.shifts())
 
     if np.any(off):
@@ -103,7 +108,7 @@ class _Amounts:
 
     Attributes:
         taken: (K, Q) how the shared numbers move with each amount. groups: by number. sizes: of each group, its sigma
-            and probability.
+            and probability. solves: whether those are solved for that are likely.
     """
 
     case: Case
@@ -111,9 +116,12 @@ class _Amounts:
     taken: Array
     groups: Sequence[_EffectGroup]
     sizes: Sequence[tuple[float, float]]
+    solves: bool
 
     @classmethod
-    def of(cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array) -> _Amounts:
+    def of(
+        cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array, solves: bool
+    ) -> _Amounts:
         """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
         estimate = end.solution.estimate
         equations = write_equations(observations, problem.sights, estimate, end.residuals)
@@ -138,12 +146,12 @@ class _Amounts:
         priors = {number: prior for number, prior in each if prior is not None}
         sizes = repeated.sizes(numbers, priors)
         taken = -model.root @ every.in_shared(model)
-        return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers])
+        return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers], solves)
 
     @cached_property
     def likely(self) -> list[int]:
         """Numbers of the groups that are solved for."""
-        return [number for number, (_, probability) in enumerate(self.sizes) if probability > LIKELY]
+        return [number for number, (_, likely) in enumerate(self.sizes) if self.solves and likely > LIKELY]
 
     @cached_property
     def _best(self) -> tuple[Array, Array]:
@@ -193,7 +201,7 @@ class _Amounts:
         yield from shifts_by(self.taken, covariance)
         for number, group in enumerate(self.groups):
             (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
-            if probability > LIKELY:
+            if number in self.likely:
                 yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
             elif probability > negligible:
                 alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))

@@ -28,8 +28,6 @@ from ceres_cal.start.closed_forms import (
     ring_profile,
 )
 
-_MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
-_GOLDEN = 0.6180339887498949
 # A median beyond it may be no fit at all, however even: corners are detected to a tenth of it. Nothing changes from
 # half to double.
 _ROUGH_PX = 1.0
@@ -76,14 +74,15 @@ class PlaneSight:
 
 def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
     """The observations on a plane, by default the one that holds most of them; thinned where there are very many."""
+    most = 1500  # observations of one kind in a sight beyond which a start learns nothing more
     starts, along = sight.tracks[:, 0], sight.tracks[:, 1]
     level = np.abs(along[:, 2]) < 1e-12
     height = _usual_height(sight, level) if height_m is None else height_m
     on = np.flatnonzero(np.abs(sight.points[:, 2] - height) < 1e-9)
-    on = on[:: max(1, len(on) // _MOST)]
+    on = on[:: max(1, len(on) // most)]
     usable = level & ~sight.is_arc & (np.abs(starts[:, 2] - height) < 1e-9)
     straight = np.flatnonzero(usable[sight.track_index])
-    straight = straight[:: max(1, len(straight) // _MOST)]
+    straight = straight[:: max(1, len(straight) // most)]
     c, a = starts[sight.track_index[straight], :2], along[sight.track_index[straight], :2]
     normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
     points = sight.points[on, :2]
@@ -217,9 +216,10 @@ def _spread_rows(bounds: Indices) -> Indices:
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
     """
+    golden = 0.6180339887498949
     enough_points = 40.0  # of a board
     sizes = np.diff(bounds)
-    order = (np.arange(sizes.max()) * _GOLDEN) % 1.0
+    order = (np.arange(sizes.max()) * golden) % 1.0
     place = np.arange(bounds[-1]) - np.repeat(bounds[:-1], sizes)
     return np.flatnonzero(order[place] < np.repeat(enough_points / sizes, sizes))
 

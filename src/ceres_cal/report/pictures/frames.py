@@ -119,9 +119,6 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     return tuple(one for one in marks if len(one.pixels))
 
 
-_QUALITIES = (90, 80, 70, 55, 40, 25)
-
-
 def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Image:
     """A camera's photograph as (height, width) or (height, width, 3), pixels as stored.
 
@@ -140,11 +137,12 @@ def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Ima
 
 def jpeg_of_at_most(picture: Image, widest_px: int, most_bytes: int) -> bytes:
     """A JPEG no wider than that, as good as the bytes allow."""
+    qualities = (90, 80, 70, 55, 40, 25)
     width, height = picture.shape[1], picture.shape[0]
     if width > widest_px:
         size = (widest_px, max(1, round(height * widest_px / width)))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    for quality in _QUALITIES:
+    for quality in qualities:
         content = encoded(in_8_bit_colour(picture), ".jpg", quality)
         if len(content) <= most_bytes:
             break

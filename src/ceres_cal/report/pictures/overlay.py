@@ -172,15 +172,13 @@ def draw_seen(photograph: Image, seen: Followed | None, target: Target) -> Image
     return draw_overlay(photograph, (), marks)
 
 
-_PIECES = 30
-
-
 def places_in_picture(
     measurement: Measurement, targets: Mapping[str, Target], camera: Camera
 ) -> Iterator[tuple[str, Array]]:
     """What is drawn, with a label, (N, 2) px each: the outline of a board, a pole from its foot to its top, a line, or
     the place beneath a camera whose height is to be measured.
     """
+    pieces = 30
     if measurement.kind == "tape":
         yield "measure the height here", camera.project((camera.position * (1.0, 1.0, 0.0))[None])
     for view in measurement.views:
@@ -194,4 +192,4 @@ def places_in_picture(
             yield "a pole here", camera.project(np.array([top * (1.0, 1.0, 0.0), top]))
         elif measurement.kind == "line":
             for name in view.curves or ():
-                yield "this line", camera.project(curve_points(target.curves[name], 0, _PIECES))
+                yield "this line", camera.project(curve_points(target.curves[name], 0, pieces))

@@ -82,13 +82,13 @@ MOST_FEATURES = 100_000
 """Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
 
 
-_ONCE_ROUND = 2.0 * np.pi * (1.0 + 1e-6)  # people round
 LARGEST_M = 1e7
 """Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
 
 
 def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
     """Raise InputError where a point or a curve of a target has numbers that cannot be."""
+    once_round = 2.0 * np.pi * (1.0 + 1e-6)  # people round
     for name, place in points.items():
         if not np.all(np.abs(place) < LARGEST_M):
             raise InputError(f"{kind}: point {name!r} must have three finite numbers of metres, not {place}")
@@ -98,7 +98,7 @@ def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Map
             raise InputError(f"{kind}: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
         if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
             raise InputError(f"{kind}: arc {name!r} must have a radius of more than half its width")
-        if isinstance(curve, Arc) and curve.to_rad - curve.from_rad > _ONCE_ROUND:
+        if isinstance(curve, Arc) and curve.to_rad - curve.from_rad > once_round:
             raise InputError(f"{kind}: arc {name!r} goes more than once round: its to_rad is too large")
 
 
@@ -138,6 +138,7 @@ class Target:
         dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
             spec its features lie elsewhere.
         optional: names of curves that go together and that a field may lack without being another one.
+        tolerance_m: by how much its lines may lie aside, where it says so; else as is usual of its size.
     """
 
     spec: Mapping[str, Any]
@@ -150,6 +151,7 @@ class Target:
     mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     dimensions: Mapping[str, float] = field(default_factory=dict)
     optional: tuple[tuple[str, ...], ...] = ()
+    tolerance_m: float | None = None
 
     def __post_init__(self) -> None:
         require_places(self.kind, self.points, self.curves)
