@@ -31,7 +31,7 @@ _KEYS = {
     "photographs": ("set", "method"),
 }  # fmt: skip
 _QUICK_SETTINGS = ("default", "OPENCV", "audit")
-_QUICK_FAULTS = ("sound", "transposed label", "repeated picture")
+_QUICK_FAULTS = ("sound", "repeated picture")
 
 
 def measured(given: argparse.Namespace, peers: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
@@ -137,7 +137,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--timing", action="store_true", help="speed and memory, and no more")
     parser.add_argument("--sets", nargs="+", choices=list(SOURCES), help="real sets of boards (default: all at hand)")
     parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS), help="default: all")
-    parser.add_argument("--splits", type=int, default=4, help="random halves of each set (default %(default)s)")
+    parser.add_argument("--splits", type=int, default=3, help="random halves of each set (default %(default)s)")
     parser.add_argument("--runs", type=int, default=12, help="seeds of each field (default %(default)s)")
     parser.add_argument("--frames", type=int, default=400, help="of SoccerNet (default %(default)s)")
     parser.add_argument("--turns", type=int, default=5, help="of what is timed: the best counts (default %(default)s)")

@@ -37,10 +37,10 @@ _WIDE_STATED: Mapping[str, Sequence[str]] = {
 PREDICTING: Mapping[str, Sequence[str]] = {
     OURS: ("default", "as drawn", "brown", "kannala-brandt", "spline"),
     "opencv": ("default", "as ROS", "rational", "released", "fisheye, as Kalibr's equi"),
-    "mrcal": ("default", "OPENCV5", "splined, 11 knots", "splined, 30 knots"),
+    "mrcal": ("default", "OPENCV5", "splined, 11 knots"),
     "pycolmap": ("default", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "OPENCV, Cauchy"),
     "calibsense": ("default", "rational", "fisheye"),
-    "lensboy": ("default", "FULL_14", "spline 12x9", "spline 30x20"),
+    "lensboy": ("default", "FULL_14", "spline 12x9"),
 }
 _OTHERS = 3.0  # times the median of the best, up to which an answer has a say in which corners count
 _FAR = 6.0  # times its own median, from which on a corner is an outlier to an answer
@@ -57,10 +57,10 @@ class Task:
 
 
 def answers(tasks: Sequence[Task], jobs: int) -> list[dict[str, Any]]:
-    """Of each task; the tasks of a peer over a set go into one process."""
+    """Of each task; the tasks of a peer over a set go into one process, and all of a peer's where jobs is 1."""
     groups: dict[tuple[str, str], list[int]] = {}
     for number, task in enumerate(tasks):
-        groups.setdefault((task.peer, task.name), []).append(number)
+        groups.setdefault((task.peer, task.name if jobs > 1 else ""), []).append(number)
     found: list[dict[str, Any]] = [{} for _ in tasks]
     with ThreadPoolExecutor(max(jobs, 1)) as executor:
         run = executor.map(lambda own: ask(own[0][0], [tasks[k].job for k in own[1]]), groups.items())

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from accuracy.accuracy import map_errors_mm
 from accuracy.bound import make_trial
-from accuracy.scenes import SSL_NOISE, SSL_PROBLEMS, field_places
+from accuracy.scenes import SSL_NOISE, SSL_PROBLEMS, SSL_VISION_MM, field_places
 from accuracy.soccernet import Pitch, answer, rows
 from photos.real_data import real_place
 from runner import over
@@ -48,7 +48,17 @@ def ssl_rows(runs: int) -> list[dict[str, Any]]:
                 for name, values in zip(("floor_mm", "robot_mm"), np.nanmedian(some, axis=0).tolist(), strict=True):
                     row[name] = values
                 found.append(row)
-    return found
+    return [*found, *program_rows()]
+
+
+def program_rows() -> list[dict[str, Any]]:
+    """What ssl-vision's own program left, measured earlier and elsewhere (`accuracy.scenes`)."""
+    method = "ssl-vision's program, measured earlier"
+    noise = next(iter(NOISES))
+    return [
+        {"scene": scene, "noise": noise, "method": method, "runs": 20, "floor_mm": floor[0], "robot_mm": robot[0]}
+        for scene, (floor, robot) in SSL_VISION_MM.items()
+    ]
 
 
 def _trial(scene: str, noise: str, seed: int) -> dict[str, list[float]]:

@@ -62,6 +62,8 @@ class Fitted:
             with np.errstate(all="ignore"):
                 step = np.linalg.solve(np.nan_to_num(slopes) + 1e-9 * np.eye(2), there[:, :, None])[:, :, 0]
             turn = turn - np.clip(np.nan_to_num(step), -0.2, 0.2)
+            if np.max(np.abs(np.nan_to_num(step))) < 1e-10:
+                break
         rays = _of_turns(turn)
         rays[~(np.linalg.norm(self.seen(rays) - pixels, axis=1) < 1e-3)] = np.nan
         return rays

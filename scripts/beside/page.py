@@ -26,6 +26,8 @@ def _figure(value: float | None, digits: int = 3) -> str:
 
 
 def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    if not lines:
+        return ["Not in the stored run."]
     return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *lines)]
 
 

@@ -50,9 +50,18 @@ SOURCES: Mapping[str, Source] = {
         "BabelCalib's OV-Plane: 18 and 7 views of 484 corners to 93 degrees, 1280 x 800",
         "github.com/ylochman/babelcalib", "MIT",
     ),
-    "stereo left": Source("a public stereo set, left camera: corners of 29 views, 640 x 360", "corners only", "-"),
-    "squeezed": Source("a public stereo set, squeezed pictures: corners of 28 views, 270 x 180", "corners only", "-"),
-    "fisheye": Source("a public fisheye set: corners of 17 views, 640 x 720", "corners only", "-"),
+    "stereo left": Source(
+        "a public stereo set, left camera: corners of 29 views, 640 x 360",
+        "`cases/stereo_left.json` of the real data", "not stated"
+    ),
+    "squeezed": Source(
+        "a public stereo set, squeezed pictures: corners of 28 views, 270 x 180",
+        "`cases/squeezed.json` of the real data", "not stated"
+    ),
+    "fisheye": Source(
+        "a public fisheye set: corners of 17 views, 640 x 720",
+        "`cases/stray_corner.json` of the real data", "not stated"
+    ),
 }  # fmt: skip
 
 

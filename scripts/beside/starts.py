@@ -6,6 +6,8 @@ pinhole does, its focal length is handed to each peer that takes one, which help
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from benchmarks.peers import Array, Corners
@@ -15,7 +17,7 @@ _MOST = 1.4  # rad off the axis up to which a corner is used
 _LEAST = 8  # corners of a view
 
 
-def flat_of(pixels: Array, focal: float, middle: Array) -> Array:
+def flat_of(pixels: Array, focal: float, middle: Any) -> Array:
     """(N, 2) where the rays of pixels meet the plane at 1, by an equidistant lens; NaN far off the axis."""
     off = (pixels - middle) / focal
     angle = np.linalg.norm(off, axis=1)
