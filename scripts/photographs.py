@@ -21,7 +21,7 @@ from photos.straightness import all_straight_rows
 from photos.templates import template_rows
 from runner import Row, measured, parser
 
-SHARED = Path(os.environ.get("CERES_CAL_SHARED", Path(__file__).parents[2] / "shared")) / "photos"
+SHARED = sorted(Path(os.environ.get("CERES_CAL_SHARED", Path(__file__).parents[2] / "shared")).glob("photos*"))
 CASES = (
     *("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight", "shared"),
     *("disturbed", "wrong", "templates"),
@@ -44,7 +44,7 @@ def cases(real: Path | None, picture: Path | None) -> dict[str, Callable[[int], 
     if real is not None:
         own["real"] = lambda runs: real_rows(real, picture)
         own["straight"] = lambda runs: all_straight_rows(real)
-    if SHARED.is_dir():
+    if SHARED:
         own["shared"] = lambda runs: shared_rows(SHARED)
     return own
 
@@ -57,10 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     real = None if given.real is None else Path(given.real)
     if real is not None and not real.is_dir():
         raise SystemExit(f"{real}: there is no such folder of real images")
-    if not SHARED.is_dir() and "shared" in (given.case or ()):
-        raise SystemExit(
-            f"{SHARED}: the photographs of another renderer are not there: name their folder in CERES_CAL_SHARED"
-        )
+    if not SHARED and "shared" in (given.case or ()):
+        raise SystemExit("the photographs of another renderer are not there: name their folder in CERES_CAL_SHARED")
     if real is None and {"real", "straight"} & set(given.case or ()):
         real = real_folder()
     return measured(cases(real, given.picture), given)

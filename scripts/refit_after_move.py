@@ -35,12 +35,12 @@ from watching import Folder, Journal
 import ceres_cal as cc
 from ceres_cal.base.files import make_folder, read_bytes, write_bytes
 from ceres_cal.base.images import IMAGE_ENDINGS
+from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.photographs import check_photographs
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
 from ceres_cal.moves.refit_plan import WHAT
 from ceres_cal.moves.refits import movements
-from ceres_cal.scene.heights import ROBOT_TOP_M
 
 SUSPICIOUS = ("suspected", "refused")  # of a file that was checked
 

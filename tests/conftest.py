@@ -15,7 +15,7 @@ from hypothesis import settings
 from photos.real_data import real_place
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
-from ceres_cal.moves.labels import MIRRORED, relabelled
+from ceres_cal.moves.refit_plan import MIRRORED, relabelled
 from ceres_cal.scene.targets import checkerboard
 
 settings.register_profile("untimed", deadline=None)  # how long an example takes is no property of it

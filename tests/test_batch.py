@@ -19,16 +19,15 @@ from ceres_cal import Options, advise, calibrate
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each, processes
 from ceres_cal.base.threads import available
+from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.cli import main
 from ceres_cal.cli.batch import _of_calibration
 from ceres_cal.cli.files import finishing
-from ceres_cal.cli.jobs import RESULTS, Job, Outcome, remember, remembered
+from ceres_cal.cli.jobs import RESULTS, Job, Outcome, remember, remembered, run_jobs
 from ceres_cal.cli.plan import read_plan
-from ceres_cal.cli.running import run_jobs
 from ceres_cal.diagnostics.advice.ranking import _prepared
 from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations
-from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.simulate import built_in_scene, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -138,7 +137,7 @@ def test_a_failed_job_stops_nobody_whatever_the_executor(tmp_path: Path, kind: s
     def levels(executor: Executor | None) -> dict[str, str]:
         return {one.job: f"{one.level} {one.line}" for one, _ in run_jobs(jobs, squared, tmp_path, executor)}
 
-    expected = {"a": "good 14", "b": "failed unexpected ValueError: no numbers", "c": "good 14"}
+    expected = {"a": "good 14", "b": "failed unexpected ValueError: no numbers: please report it", "c": "good 14"}
     if kind == "none":
         assert levels(None) == expected
     elif kind == "threads":

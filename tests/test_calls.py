@@ -188,8 +188,8 @@ def test_a_wheel_in_a_clean_environment_calibrates(tmp_path: Path) -> None:
     site = next((clean / "lib").glob("python*/site-packages"))
     subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(wheel)], check=True, capture_output=True)
     assert not list(site.rglob("*.hpp"))
-    web = ROOT / "src/ceres_cal/page/web"
-    assert {path.name for path in (site / "ceres_cal/page/web").iterdir()} == {path.name for path in web.iterdir()}
+    web = ROOT / "src/ceres_cal/cli/page/web"
+    assert {path.name for path in (site / "ceres_cal/cli/page/web").iterdir()} == {path.name for path in web.iterdir()}
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))  # they are not what is tested here
     code = "import sys, ceres_cal; from ceres_cal.cli import main; print(ceres_cal.__file__); main(sys.argv[1:])"
     command = [str(clean / "bin" / "python"), "-c", code, "calibrate", str(SAMPLE), "--quiet"]

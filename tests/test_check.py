@@ -16,7 +16,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.check import _station
 from ceres_cal.moves.checks import check
-from ceres_cal.moves.labels import MIRRORED, relabelled
+from ceres_cal.moves.refit_plan import MIRRORED, relabelled
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance

@@ -16,7 +16,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.report.sheet import sheet_pdf
 from ceres_cal.scene.targets import Target, checkerboard, circle_grid, rings, ssl_field, target_from_spec
-from ceres_cal.scene.targets.paper import Disc, Footprints
+from ceres_cal.scene.targets.target import Disc, Footprints
 
 __all__ = ["say"]
 PLAIN = circle_grid(7, 5, 0.03, 0.02)

@@ -303,8 +303,6 @@ def test_profile_lifts_offsets() -> None:
 def test_radial_alignment_is_exact_on_exact_data() -> None:
     found = radial_alignment(aligned_data(), UNIT, terms=2, rounds=2)
     assert found.profile.coefficients == pytest.approx(PROFILE.coefficients, abs=1e-8)  # 2e-10 measured
-    for pose, homography in zip(VIEWS, found.homographies, strict=True):
-        assert same_up_to_scale(homography, PHI_DOWN @ homography_of(pose)) < 1e-10  # 1e-13 measured
     assert np.max(found.error_px) < 1e-6  # 1e-8 measured
 
 

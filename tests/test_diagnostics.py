@@ -25,9 +25,8 @@ from ceres_cal.diagnostics.held_out import choose, cross_validate
 from ceres_cal.effects.linearised import Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.problem.equations import Equations, whole_structure, write_equations
 from ceres_cal.problem.parameters import Options, intrinsics_vector, with_intrinsics
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import Equations, residuals, whole_structure, write_equations
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
 from ceres_cal.simulate import Disturbance, simulate

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ceres_cal.cli.command import print_answer
+from ceres_cal.cli.terminal import print_answer
 from ceres_cal.report.document import (
     BulletList,
     Card,

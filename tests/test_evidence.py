@@ -28,10 +28,9 @@ from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.effects.strands import decay, distances_of, families_of, views_or_placements
 from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.problem import Weighting
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.simulate import simulate
 
 SEEDS = st.integers(0, 10_000)

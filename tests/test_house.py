@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -31,7 +32,6 @@ FLOORS = {
     "diagnostics": 9,
     "detect": 10,
     "report": 11,
-    "page": 12,
     "functions": 12,
     "cli": 13,
 }
@@ -45,7 +45,7 @@ DOORS = {
     "google": {"formats"},  # protobuf
     "yaml": {"formats"},
     "distributed": {"cli"},
-    "aiohttp": {"cli", "page"},
+    "aiohttp": {"cli"},
     "scipy": set(),  # for the tests only
 }
 
@@ -61,8 +61,13 @@ def room(name: str) -> str:
     return (name + ".").split(".")[1]
 
 
-def imports(path: Path) -> Iterator[tuple[int, str]]:
+@cache
+def imports(path: Path) -> tuple[tuple[int, str], ...]:
     """Line and absolute dotted name of everything a module imports, wherever in the file it does so."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[int, str]]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)

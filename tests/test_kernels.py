@@ -340,8 +340,8 @@ def test_losses_are_those_of_ceres(loss: str, length: float, scale: float) -> No
 def test_losses_are_concave_enough_for_the_extra_row(loss: str, length: float, scale: float) -> None:
     """rho >= rho' s: without it the block's last row would be the root of a negative number (design, section 6)."""
     rho, weighted, s = loss_of(loss, scale, length)
-    assert rho >= weighted * (1.0 - 1e-14)
-    assert 0.0 <= weighted <= s * (1.0 + 1e-14)
+    assert rho >= weighted * (1.0 - 1e-13)  # 2e-14 measured where the compiler optimises little
+    assert 0.0 <= weighted <= s * (1.0 + 1e-13)
 
 
 def bent(loss: str, squared: float, scale: float) -> float:

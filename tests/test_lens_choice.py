@@ -26,7 +26,7 @@ from ceres_cal.calibration import lens_seen as seen
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
 from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
-from ceres_cal.calibration.lens_kinds import Candidate
+from ceres_cal.calibration.lens_seen import Candidate
 from ceres_cal.calibration.solving import Watched
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
@@ -37,10 +37,10 @@ from ceres_cal.effects.linearised import Linearised, equation_weights, make_line
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.problem.bundle import Solution, solve
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import AUTO, Options
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, write_equations
+from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
@@ -151,10 +151,12 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
     gone = {"kannala-brandt"}
 
-    def broken(start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+    def broken(
+        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
+    ) -> Calibration:
         if options.lens in gone:
             raise SolutionError("no camera")
-        return of_lens(start, seen, sights, options, watched)
+        return of_lens(start, seen, sights, options, watched, built)
 
     monkeypatch.setattr(calibrating, "_of_lens", broken)
     calibration = calibrate(seen)
@@ -188,7 +190,9 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     """After every other kind; what it says is said."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
-    def broken(start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+    def broken(
+        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
+    ) -> Calibration:
         asked.append(label_of(options))
         raise SolutionError(f"no camera with {asked[-1]}")
 

@@ -112,7 +112,7 @@ def test_a_name_is_given_once() -> None:
 
 def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:
     """What the solve differentiates, against differences of the residuals."""
-    from ceres_cal.problem.equations import write_equations
+    from ceres_cal.problem.residuals import write_equations
 
     observations, options = simulation.observations, Options(lens="division", fixed={"k": -2.4e-7})
     truth = calibrate(observations, options).estimate

@@ -14,8 +14,8 @@ import pytest
 import scenes
 from scenes import RADIAL
 
+from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior

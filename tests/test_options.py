@@ -11,10 +11,11 @@ import pytest
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import ReportArguments, length
 from ceres_cal.cli.calibrate import CalibrateArguments
-from ceres_cal.cli.command import COMMANDS, Parser
-from ceres_cal.cli.options import (
+from ceres_cal.cli.command import (
+    COMMANDS,
     REQUIRED,
     Arguments,
+    Parser,
     QuietArguments,
     add_options,
     argument,

@@ -27,11 +27,11 @@ from ceres_cal.base.files import write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.cli.open_steps import PageCommands
+from ceres_cal.cli.page.server import serve
+from ceres_cal.cli.page.session import KEPT, Session, opened
+from ceres_cal.cli.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
 from ceres_cal.detect.photographs import Clicks, by_hand, load_clicks
 from ceres_cal.detect.photographs.clicks import starts_from_clicks
-from ceres_cal.page.server import serve
-from ceres_cal.page.session import KEPT, Session, opened
-from ceres_cal.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import targets_by_name
 
@@ -422,7 +422,7 @@ _TEXTS = {".py", ".js", ".css", ".html", ".svg"}
 
 
 def test_the_room_is_small() -> None:
-    room = ROOT / "src/ceres_cal/page"
+    room = ROOT / "src/ceres_cal/cli/page"
     texts = [path for path in room.rglob("*") if path.suffix in _TEXTS]
     lines = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in texts}
     python = sum(count for path, count in lines.items() if path.suffix == ".py")

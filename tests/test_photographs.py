@@ -17,11 +17,11 @@ from scenes import LENSES, camera, lines
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
-from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (

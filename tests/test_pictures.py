@@ -24,8 +24,15 @@ from ceres_cal.detect.images import encoded, read_grey
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.parameters import Station as Posed
 from ceres_cal.problem.structure import Tolerance, make_structure
-from ceres_cal.report.pictures.files import jpeg_of_at_most
-from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of, photographs_by_frame
+from ceres_cal.report.pictures.frames import (
+    Frame,
+    frame_by_name,
+    frames_of,
+    jpeg_of_at_most,
+    marks_of,
+    model_of,
+    photographs_by_frame,
+)
 from ceres_cal.report.pictures.model import model_seen
 from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay
 from ceres_cal.report.pictures.straight import Straight, straighten

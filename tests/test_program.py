@@ -88,7 +88,7 @@ def test_a_camera_that_moved_is_1(files_of_a_move: Path) -> None:
 def test_what_is_opened_next_is_no_standard_stream(tmp_path: Path) -> None:
     """Where descriptor 2 is free, a file that is written would be what libraries print on."""
     program = (
-        "import os; from ceres_cal.cli.program import as_a_program; as_a_program()\n"
+        "import os; from ceres_cal.cli.terminal import as_a_program; as_a_program()\n"
         "number = os.open('file', os.O_WRONLY | os.O_CREAT); assert number > 2, number\n"
         "os.write(1, b'noise'); os.write(2, b'noise'); os.write(number, b'ours')"
     )

@@ -31,9 +31,8 @@ from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.file import PriorFile
-from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
-from ceres_cal.moves.refit_plan import RefitOptions, carried_prior, make_plan
+from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitOptions, carried_prior, make_plan, relabelled
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.bundle import _ParameterBlocks

@@ -21,8 +21,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.bent import Ends
-from ceres_cal.posterior.files import PosteriorFile
-from ceres_cal.posterior.files_before import BendsFile, ProfileFile, as_mixtures
+from ceres_cal.posterior.files import BendsFile, PosteriorFile, ProfileFile, as_mixtures
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information, Key, over

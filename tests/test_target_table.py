@@ -14,7 +14,7 @@ from ceres_cal.base.files import convert
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.diagnostics.advice import advise
-from ceres_cal.moves.labels import TURNED, mistaken_targets, relabelled
+from ceres_cal.moves.refit_plan import TURNED, mistaken_targets, relabelled
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.report.pictures.frames import frame_by_name
 from ceres_cal.scene.curves import Arc, Curve, Segment

@@ -29,6 +29,7 @@ from accuracy.scenes import (
     small_boards,
 )
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
@@ -39,7 +40,6 @@ from ceres_cal.problem.problem import Weighting
 from ceres_cal.problem.quantities import moved
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Arc, Target
 from ceres_cal.simulate import Disturbance, simulate
 

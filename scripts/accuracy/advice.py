@@ -21,12 +21,12 @@ from accuracy.bound import attempts
 from accuracy.scenes import CLEAN_NOISE, FIELD, Problem, tilted
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics.advice import Measurement, Promise, advise, promised
 from ceres_cal.observations import Observations, combine
 from ceres_cal.problem.parameters import Options, Station
-from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import custom
 from ceres_cal.simulate import Scene, field_scene, overhead_pose, simulate
 

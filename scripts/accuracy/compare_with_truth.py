@@ -16,11 +16,11 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.files import read_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.files import TRUTH_FORMAT, TRUTH_VERSION

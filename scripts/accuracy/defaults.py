@@ -20,6 +20,7 @@ from runner import Row, mean_and_error, over, script, share_error
 from accuracy.odd_scenes import farthest
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior
@@ -27,7 +28,6 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import (

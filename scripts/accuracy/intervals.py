@@ -20,12 +20,12 @@ from accuracy.dependent_errors import SIGMA_PX, Errors, along_lines, in_rows, li
 from accuracy.scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, RADIAL, SSL_PROBLEMS, Problem, boards, tilted
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.posterior.maps import visible_pixels
 from ceres_cal.problem.information import pose_keys
 from ceres_cal.problem.quantities import difference
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.simulate import Disturbance
 
 WEAKLY, BADLY = frozenset({"weak"}), frozenset({"unknown"})

@@ -27,6 +27,7 @@ from accuracy.scenes import FIELD, field_places
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
@@ -42,7 +43,6 @@ from ceres_cal.problem.quantities import difference
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import (

@@ -22,6 +22,7 @@ from accuracy.scenes import FIELD, Problem
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
@@ -29,7 +30,6 @@ from ceres_cal.posterior.maps import visible_pixels
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import (

@@ -13,21 +13,29 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from msgspec import structs
 from rendering.photograph import photograph
 from runner import Row, over
 
 from ceres_cal.base.arrays import Image8
 from ceres_cal.detect.photographs import Auto, Facing
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.scene.targets import Target, custom, ssl_field
+from ceres_cal.scene.targets import Target, custom, ssl_field, targets_by_name
 from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
-from photos.outcomes import MOVED_MM, STATED, USUAL_MM, Outcome, outcome
+from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, outcome
+from photos.painters import (
+    Painter,
+    as_farmers_do,
+    askew,
+    with_another_sport,
+    with_boundary,
+    with_cables,
+    with_old_field,
+    worn,
+)
 
 SIZE = (780, 580)
-WRONG, MOST_S = 4.0, 15.0
+MOST_S = 15.0
 AUTO = Auto((Facing("LeftGoalLine", "left"),))
 LENSES: dict[str, tuple[float, Lens]] = {
     "radial 2,3": (345.0, Radial((-1.1e-4, 1.6e-6), (2, 3))),
@@ -47,85 +55,43 @@ class Taken:
     image: Image8
 
 
-# ---- what is painted ------------------------------------------------------------------------------------------------
-
-
-def with_boundary(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """A line around the field."""
-    length, width = field.dimensions["field_length_m"], field.dimensions["field_width_m"]
-    x, y = np.array([length, width]) / 2.0 + rng.uniform(0.15, 0.4)
-    corners: list[tuple[float, float, float]] = [(-x, -y, 0.0), (x, -y, 0.0), (x, y, 0.0), (-x, y, 0.0)]
-    sides = zip(corners, [*corners[1:], corners[0]], strict=True)
-    return curves | {f"boundary {n}": Segment(a, b, rng.uniform(0.015, 0.025)) for n, (a, b) in enumerate(sides)}
-
-
-def with_cables(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """White cables across the field: straight ones, and arcs of large circles."""
-    cables: dict[str, Curve] = {}
-    for number in range(int(rng.integers(2, 5))):
-        middle, direction = rng.uniform((-3.5, -2.2), (3.5, 2.2)), rng.uniform(0.0, np.pi)
-        way = np.array([np.cos(direction), np.sin(direction)])
-        half = rng.uniform(1.5, 4.0)
-        if number % 2:
-            a, b = middle - half * way, middle + half * way
-            cables[f"cable {number}"] = Segment((a[0], a[1], 0.0), (b[0], b[1], 0.0), 0.012)
-        else:
-            radius = rng.uniform(6.0, 20.0)
-            centre = middle + radius * np.array([-way[1], way[0]])
-            turn, span = float(np.arctan2(-way[0], way[1])), half / radius
-            here = (float(centre[0]), float(centre[1]), 0.0)
-            cables[f"cable {number}"] = Arc(here, radius, turn - span, turn + span, 0.012)
-    return curves | cables
-
-
-def worn(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """A third to a half of every line is gone, piece by piece."""
-    kept: dict[str, Curve] = {}
-    share = rng.uniform(0.5, 0.7)
-    for name, curve in curves.items():
-        at, number = 0.0, 0
-        low, high = curve.parameter_range
-        while at < 1.0:
-            on, off = rng.exponential(0.35 * share, 2) * (1.0, (1.0 - share) / share) / curve.length_m + 0.02
-            first, last = low + (high - low) * np.array([at, min(at + on, 1.0)])
-            kept[f"{name} {number}"] = _part(curve, float(first), float(last))
-            at, number = at + on + off, number + 1
-    return kept
-
-
-def _part(curve: Curve, first: float, last: float) -> Curve:
-    if isinstance(curve, Arc):
-        return structs.replace(curve, from_rad=first, to_rad=last)
-    a, b = np.array(curve.start), np.array(curve.end)
-    start, end = a + first * (b - a), a + last * (b - a)
-    return structs.replace(curve, start=tuple(start.tolist()), end=tuple(end.tolist()))
-
-
-def askew(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """Three lines 15 to 30 mm aside."""
-    moved = dict(curves)
-    names = [name for name, curve in curves.items() if isinstance(curve, Segment)]
-    for name in rng.choice(names, 3, replace=False):
-        line = curves[name]
-        assert isinstance(line, Segment)
-        along = np.subtract(line.end, line.start) / line.length_m
-        off = rng.choice([-1.0, 1.0]) * rng.uniform(0.015, 0.03) * np.array([-along[1], along[0], 0.0])
-        start, end = (tuple((np.array(one) + off).tolist()) for one in (line.start, line.end))
-        moved[str(name)] = structs.replace(line, start=start, end=end)
-    return moved
-
-
-Painter = Callable[[dict[str, Curve], Target, np.random.Generator], dict[str, Curve]]
-
-
 @dataclass(frozen=True)
 class Kind:
-    """What is painted besides or otherwise, how it is taken, and by which lenses; `most_mm` of mean error."""
+    """What is painted besides or otherwise, how it is taken, and by which lenses; `most_mm` of mean error, on which
+    field; by what else than the camera above it, and by how much coma at the rim.
+    """
 
     painter: Painter | None = None
     how: Callable[[Photography, np.random.Generator], Photography] = lambda how, rng: how
     most_mm: float = USUAL_MM
     lenses: tuple[str, ...] = tuple(LENSES)[:4]
+    field: str = "ssl-b"
+    camera: Callable[[Camera, np.random.Generator], Camera] = lambda camera, rng: camera
+    coma_px: float = 0.0
+
+
+def cropped(camera: Camera, rng: np.random.Generator) -> Camera:
+    """A part of a larger sensor, away from the middle of its lens."""
+    away = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.15, 0.3, 2) * np.array(SIZE)
+    x, y = np.array(camera.principal_point) + away
+    return replace(camera, principal_point=(float(x), float(y)))
+
+
+def with_coma(image: Image8, camera: Camera, rim_px: float) -> Image8:
+    """A picture whose light is drawn out away from the middle of its lens, ever less of it the farther, about where its
+    mean stays; in proportion to how far from the middle it is, as of a lens that has coma.
+    """
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    dx, dy = x - np.float32(camera.principal_point[0]), y - np.float32(camera.principal_point[1])
+    share = np.linspace(0.0, 1.0, 13)
+    weights = 1.0 - share
+    share -= np.average(share, weights=weights)
+    total = np.zeros(image.shape, np.float32)
+    for part, weight in zip(share * rim_px / camera.corner_radius, weights / weights.sum(), strict=True):
+        there = 1.0 / (1.0 + np.float32(part))
+        places = (x - dx * (1.0 - there), y - dy * (1.0 - there))
+        total += np.float32(weight) * cv2.remap(image.astype(np.float32), *places, cv2.INTER_LINEAR)
+    return np.asarray(np.round(total), np.uint8)
 
 
 KINDS: dict[str, Kind] = {
@@ -141,6 +107,13 @@ KINDS: dict[str, Kind] = {
     "sharp": Kind(how=lambda how, rng: replace(how, blur_px=0.0)),
     "fisheye": Kind(lenses=("fisheye",)),
     "shadows": Kind(how=lambda how, rng: replace(how, shadows=4, unevenness=0.3, wear=0.1)),
+    "another sport": Kind(with_another_sport),
+    "an old field": Kind(with_old_field),
+    "large": Kind(as_farmers_do, field="football", most_mm=60.0, how=lambda how, rng: replace(how, robots=0, balls=0)),
+    "cropped": Kind(camera=cropped, most_mm=MOVED_MM),
+    "stretched": Kind(camera=lambda camera, rng: replace(camera, aspect=rng.uniform(0.93, 1.07))),
+    "dark": Kind(how=lambda how, rng: replace(how, carpet=rng.uniform(0.45, 0.65), paint=rng.uniform(0.08, 0.2))),
+    "coma": Kind(coma_px=6.0, most_mm=MOVED_MM),
 }
 
 
@@ -150,11 +123,12 @@ def taken(name: str, seed: int, field: Target) -> Taken:
     rng = np.random.default_rng([23, seed, *name.encode()])
     phi, lens = LENSES[kind.lenses[seed % len(kind.lenses)]]
     middle = 0.5 * (np.array(SIZE) - 1.0) + rng.normal(0.0, 5.0, 2)
-    size = field.dimensions["field_length_m"] / 9.0
-    x, y, height = rng.normal(0.0, 0.2), rng.normal(0.0, 0.2), size * rng.uniform(4.7, 5.6)
+    size = max(field.dimensions["field_length_m"] / 9.0, field.dimensions["field_width_m"] / 6.0)
+    x, y, height = *(size * rng.normal(0.0, 0.2, 2)), size * rng.uniform(4.7, 5.6)
     tilt_x, tilt_y, yaw = rng.uniform(-8.0, 8.0, 3)
     pose = overhead_pose(x, y, height, tilt_x, tilt_y, yaw)
     camera = Camera(SIZE, phi * rng.uniform(0.97, 1.03), (float(middle[0]), float(middle[1])), lens, 1.0, pose)
+    camera = kind.camera(camera, rng)
     how = Photography(
         blur_px=float(rng.uniform(0.0, 0.7)),
         unevenness=float(rng.uniform(0.0, 0.2)),
@@ -169,7 +143,8 @@ def taken(name: str, seed: int, field: Target) -> Taken:
     curves = dict(field.curves)
     painted = custom(curves=curves if kind.painter is None else kind.painter(curves, field, rng))
     scene = field_scene(painted, {"overhead": camera}, {"overhead": Station("overhead", pose)})
-    return Taken(camera, painted, photograph(scene, "overhead", "0001", how, seed).image)
+    image = photograph(scene, "overhead", "0001", how, seed).image
+    return Taken(camera, painted, with_coma(image, camera, kind.coma_px) if kind.coma_px else image)
 
 
 # ---- what comes of it -----------------------------------------------------------------------------------------------
@@ -200,7 +175,8 @@ def disturbed_rows(runs: int) -> Iterator[Row]:
 
 
 def _disturbed(name: str, seed: int) -> Outcome:
-    return came_of(taken(name, seed, ssl_field("B")), ssl_field("B"))
+    field = targets_by_name()[KINDS[name].field]
+    return came_of(taken(name, seed, field), field)
 
 
 def _rows(name: str, every: Sequence[Outcome], most_mm: float) -> Iterator[Row]:
@@ -219,6 +195,7 @@ def _rows(name: str, every: Sequence[Outcome], most_mm: float) -> Iterator[Row]:
     note = f"{len(ratios) - len(known)} without a statement"
     yield Row(name, "rms error over stated", ratio, 0.0, 1.0 / STATED, STATED, note)
     yield Row(name, "wrong without saying so", int(np.sum(ratios > WRONG)), most=0.0)
+    yield Row(name, "share trusted for something", float(np.mean([one.trusted for one in found])))
 
 
 # ---- other fields ---------------------------------------------------------------------------------------------------

@@ -13,16 +13,21 @@ from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.photographs import Auto, Clicks, detect_field
 from ceres_cal.problem.parameters import Options
+from ceres_cal.report.grounds import judge_quality, promises
+from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.targets import Target
 
 USUAL_MM, MOVED_MM = 1.5, 3.0  # mean error of a map, as small pictures allow; of several disturbances, or motion
 STATED = 1.6  # of errors over what is stated, either way
+WRONG = 4.0  # of the same, from which on a calibration is wrong without saying so
+BEYOND, MOST_BEYOND = 1.5, 0.02  # times the 95 % radius, and the share of places that may lie farther off
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Seconds of the detection; mean, median and rms error of the map over the field, mm, and the stated one; the lens
-    that was chosen; or why there is none.
+    """Seconds of the detection; mean, median and rms error of the map over the field, mm, and the stated one; the share
+    of its places far beyond their 95 % radius; the lens that was chosen, the verdict on the calibration and whether it
+    states an accuracy; or why there is none.
     """
 
     seconds: float
@@ -30,13 +35,21 @@ class Outcome:
     median_mm: float = np.nan
     rms_mm: float = np.nan
     stated_mm: float = np.nan
+    beyond: float = np.nan
     lens: str = ""
+    verdict: str = ""
+    trusted: bool = False
     why: str = ""
 
     @property
     def over_stated(self) -> float:
         """Rms error over the stated one."""
         return self.rms_mm / self.stated_mm
+
+    @property
+    def certified(self) -> bool:
+        """Whether it is trusted though it is wrong."""
+        return self.trusted and (self.over_stated > WRONG or self.beyond > MOST_BEYOND)
 
 
 def outcome(path: Path, asked: Target, start: Auto | Clicks, truth: tuple[Array, Array], lens: str = "auto") -> Outcome:
@@ -54,6 +67,10 @@ def outcome(path: Path, asked: Target, start: Auto | Clicks, truth: tuple[Array,
         return Outcome(time.perf_counter() - began, why=str(refusal).partition(": ")[2] or str(refusal))
     pixels, places = truth
     error = 1e3 * np.linalg.norm(calibration.station().locate(pixels) - places, axis=1)
-    sd = 1e3 * calibration.uncertainty.located(pixels).sd_m
-    rms, stated = (float(np.sqrt(np.mean(one**2))) for one in (error, sd))
-    return Outcome(seconds, float(np.mean(error)), float(np.median(error)), rms, stated, calibration.options.lens)
+    located = calibration.uncertainty.located(pixels)
+    rms, stated = (float(np.sqrt(np.mean(one**2))) for one in (error, 1e3 * located.sd_m))
+    beyond = float(np.mean(error > BEYOND * 1e3 * located.radius_95_m))
+    quality = quality_of(calibration, found.observations)
+    said, trusted = judge_quality(quality).headline, promises(quality)
+    mean, median = float(np.mean(error)), float(np.median(error))
+    return Outcome(seconds, mean, median, rms, stated, beyond, calibration.options.lens, said, trusted)

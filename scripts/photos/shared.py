@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from runner import Row, over
+from scipy.interpolate import griddata
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.detect.photographs import Auto, Clicks, Facing
 from ceres_cal.scene.targets import targets_by_name
-from photos.outcomes import MOVED_MM, STATED, USUAL_MM, Outcome, outcome
+from photos.outcomes import MOST_BEYOND, MOVED_MM, STATED, USUAL_MM, Outcome, outcome
 
 CLICK_PX = 8.0
-CORNERS = (
+_CORNERS = (
     *("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner"),
     *("BottomHalfwayCrossing", "TopHalfwayCrossing"),
 )
+_LEAST_AREA = 0.01  # of the picture, of the triangle of any three places that are clicked
+_SOUND = 0.9  # of sound pictures, the share that is trusted for something
 ALLOWED_MM = {"combo": MOVED_MM, "camera": MOVED_MM}  # by kind
 
 
@@ -40,28 +44,50 @@ class Known:
     @property
     def is_wrong(self) -> bool:
         """Whether it shows another field than the one that is asked for."""
-        return self.name.startswith("wrong")
+        return bool(self.truth["kind"].startswith("wrong"))
+
+    @property
+    def ways(self) -> tuple[str, ...]:
+        """How it may be started from: a mirrored picture shows by corners that it is; where few places are in the
+        picture that have a name, nobody can click them.
+        """
+        mirrored = "mirrored" in self.truth.get("what", "")
+        return (*(() if mirrored else ("auto",)), *(("clicks",) if self._shown else ()))
 
     def floor(self, height: str = "field_m_at_0_mm") -> tuple[Array, Array]:
         """Pixels (N, 2) that show the field, and where on it they lie, m."""
-        rows = [
-            (pixel, place)
-            for pixel, place in zip(self.truth["pixels"], self.truth[height], strict=True)
-            if place is not None
-        ]
-        pixels, places = (np.array(one, dtype=float) for one in zip(*rows, strict=True))
+        pixels, places = (np.array(one, dtype=float) for one in self._seen(height))
         painted = self.truth["field_as_painted"]
         inside = np.all(np.abs(places) <= 0.5 * np.array([painted["L"], painted["W"]]), axis=1)
         return pixels[inside], places[inside]
 
+    def _seen(self, height: str) -> tuple[Any, ...]:
+        every = zip(self.truth["pixels"], self.truth[height], strict=True)
+        return tuple(zip(*((pixel, place) for pixel, place in every if place is not None), strict=True))
+
+    @cached_property
+    def _shown(self) -> tuple[str, ...]:
+        """Four corners or crossings, well apart; those of the outline where they are in the picture."""
+        corners, target = self.truth["corners_px"], targets_by_name()[self.truth["asked_as"]]
+        if sum(name in corners for name in _CORNERS) < 4:
+            pixels, places = (np.array(one) for one in self._seen("field_m_at_0_mm"))
+            there = griddata(places, pixels, target.point_array[:, :2])
+            corners |= {
+                name: pixel.tolist()
+                for name, pixel in zip(target.point_names, there, strict=True)
+                if np.all((pixel > 0.0) & (pixel < self.truth["image_size"]))
+            }
+        names = [name for name in _CORNERS if name in corners]
+        fours = list(combinations(names if len(names) >= 4 else corners, 4))
+        best = max(fours, key=lambda four: spread(corners, four), default=())
+        least = 2.0 * _LEAST_AREA * float(np.prod(self.truth["image_size"]))
+        return best if best and spread(corners, best) > least else ()
+
     def clicks(self) -> Clicks:
-        """Four corners, or crossings where those are not in the picture, clicked roughly."""
+        """These clicked roughly."""
         rng = np.random.default_rng([5, sum(map(ord, self.name))])
         corners = self.truth["corners_px"]
-        names = max(
-            combinations([name for name in CORNERS if name in corners], 4), key=lambda four: spread(corners, four)
-        )
-        return Clicks({name: tuple(np.array(corners[name]) + rng.normal(0.0, CLICK_PX, 2)) for name in names})
+        return Clicks({name: tuple(np.array(corners[name]) + rng.normal(0.0, CLICK_PX, 2)) for name in self._shown})
 
 
 def spread(corners: Mapping[str, Sequence[float]], names: Sequence[str]) -> float:
@@ -82,28 +108,46 @@ def known_photographs(folder: Path) -> list[Known]:
     return known
 
 
-def shared_rows(folder: Path) -> Iterator[Row]:
-    """Every photograph without a start and from four rough clicks; other fields must be refused."""
-    asked = [(shown, how) for shown in known_photographs(folder) for how in ("auto", "clicks")]
-    for (shown, how), came in zip(asked, over(_came_of, *zip(*asked, strict=True)), strict=True):
+def shared_rows(folders: Iterable[Path]) -> Iterator[Row]:
+    """Every photograph without a start and from four rough clicks; other fields must be refused, or not trusted."""
+    every = [shown for folder in folders for shown in known_photographs(folder)]
+    asked = [(shown, how) for shown in every for how in shown.ways]
+    found: dict[str, list[Outcome]] = {}
+    for (shown, how), came in zip(asked, over(came_of_known, *zip(*asked, strict=True)), strict=True):
         yield from _rows(shown, how, came)
+        if not shown.is_wrong:
+            found.setdefault(shown.name, []).append(came)
+    yield from _of_all(found)
 
 
-def _came_of(shown: Known, how: str) -> Outcome:
+def came_of_known(shown: Known, how: str) -> Outcome:
+    """What comes of one photograph, by "auto" or by "clicks"."""
     start = shown.clicks() if how == "clicks" else Auto((Facing(*shown.truth["facing"].split("=")),))
     return outcome(shown.path, targets_by_name()[shown.truth["asked_as"]], start, shown.floor())
 
 
 def _rows(shown: Known, how: str, came: Outcome) -> Iterator[Row]:
-    case, refused = f"{shown.name}, {how}", float(bool(came.why))
+    case = f"{shown.name}, {how}"
     note = f"{came.seconds:.1f} s, {came.lens}"
-    if came.why:
-        print(f"{case}: {came.why}", file=sys.stderr)
+    print(f"{case}: {came.why or came.verdict}", file=sys.stderr)
     if shown.is_wrong:
-        yield Row(case, "refused", refused, least=1.0, note=note)
+        yield Row(case, "refused or not trusted", float(not came.trusted), least=1.0, note=note)
         return
-    yield Row(case, "found", 1.0 - refused, least=1.0, note=note)
+    yield Row(case, "found", float(not came.why), least=1.0, note=note)
     if not came.why:
         most = ALLOWED_MM.get(shown.truth["kind"], USUAL_MM)
         yield Row(case, "mean error of the map, mm", came.mean_mm, most=most, note=f"median {came.median_mm:.2f} mm")
         yield Row(case, "rms error over stated", came.over_stated, least=1.0 / STATED, most=STATED)
+        note = "trusted" if came.trusted else "not trusted"
+        yield Row(case, "share far beyond its 95 % radius", came.beyond, most=MOST_BEYOND, note=note)
+
+
+def _of_all(found: Mapping[str, Sequence[Outcome]]) -> Iterator[Row]:
+    note = f"{len(found)} photographs"
+    both = float(np.mean([not any(one.why for one in ways) for ways in found.values()]))
+    yield Row("all that can be told", "share found in every way", both, least=0.95, note=note)
+    every = [one for ways in found.values() for one in ways if not one.why]
+    yield Row("all that can be told", "wrong, but trusted", sum(one.certified for one in every), most=0.0)
+    sound = [one for one in every if not one.beyond > MOST_BEYOND and one.mean_mm < MOVED_MM]
+    trusted = float(np.mean([one.trusted for one in sound]))
+    yield Row("sound", "share trusted for something", trusted, least=_SOUND, note=f"{len(sound)} calibrations")

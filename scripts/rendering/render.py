@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import Array, Array32, Image8, Indices
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Curve, Segment, curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.target import Footprints, Paper, share_inside
 
 Canvas = Array32
 """(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import ROBOT_TOP_M
 
 Colour = tuple[float, float, float]
 """Blue, green and red, as shares of white."""

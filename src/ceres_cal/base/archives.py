@@ -5,15 +5,17 @@ from __future__ import annotations
 import io
 import math
 import warnings
-import zipfile
 from collections.abc import Mapping
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
+
+if TYPE_CHECKING:
+    import zipfile
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -44,6 +46,8 @@ def read_foreign_npz(content: bytes, where: str) -> dict[str, AnyArray]:
 
 
 def _read(content: bytes, columns: Mapping[str, Column] | None, where: str) -> dict[str, AnyArray]:
+    import zipfile
+
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive, warnings.catch_warnings(action="ignore"):
             names = _names(archive, columns, where)

@@ -1,10 +1,18 @@
-"""Arrays by the kind of their numbers, once for the whole package. Shapes stand in the docstrings."""
+"""Arrays by the kind of their numbers, once for the whole package; what numbers make of a step that fails.
 
-from collections.abc import Hashable, Iterable
+Shapes stand in the docstrings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ceres_cal.base.errors import SolutionError
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -58,3 +66,19 @@ def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
     """Which of the known names each one is."""
     order = {name: number for number, name in enumerate(known)}
     return np.array([order[name] for name in names], dtype=np.int64)
+
+
+@contextmanager
+def numerical(step: str) -> Iterator[None]:
+    """While it lasts, and as a decorator: what fails on its numbers is a SolutionError that names the step.
+
+    NumPy's own warnings say nothing that a user could act on: what comes of a NaN or an infinity is judged where the
+    answer is (a failed factorisation here, a failed solve, an unknown number), not where it first appears.
+    """
+    with np.errstate(all="ignore"):
+        try:
+            yield
+        except (np.linalg.LinAlgError, ArithmeticError) as error:
+            raise SolutionError(
+                f"{step} failed numerically ({error}): check pixels, sigmas, labels and target dimensions"
+            ) from error

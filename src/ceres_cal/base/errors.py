@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from functools import partial, wraps
+from typing import ParamSpec, TypeVar
 
 _T = TypeVar("_T")
+_P = ParamSpec("_P")
 
 
 class CalibrationError(Exception):
@@ -53,6 +55,25 @@ def naming(where: object) -> Iterator[None]:
         text = str(error)
         begins_with_it = text.startswith((f"{where}: ", f"{where}.", f"{where}/"))
         raise InputError(text if begins_with_it else f"{where}: {text}") from None
+
+
+def attempt(work: Callable[[], _T], expected: type[CalibrationError] = CalibrationError) -> _T | CalibrationError:
+    """What work returns, or the failure that it ended with, as a value; a comment there says what the user reads."""
+    try:
+        return work()
+    except expected as error:  # quiet: whoever attempts it says what follows
+        return error
+
+
+def or_none(function: Callable[_P, _T | None]) -> Callable[_P, _T | None]:
+    """A function whose failure is the answer None; a comment beside it says what the user reads."""
+
+    @wraps(function)
+    def answer(*args: _P.args, **kwargs: _P.kwargs) -> _T | None:
+        found = attempt(partial(function, *args, **kwargs))
+        return None if isinstance(found, CalibrationError) else found
+
+    return answer
 
 
 def answer_or_reason(work: Callable[[], _T]) -> tuple[_T | None, str]:

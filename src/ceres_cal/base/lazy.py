@@ -1,11 +1,11 @@
-"""Names and rows of tables whose modules are imported when they are first asked for: a start with all takes longer."""
+"""What is computed, or imported, when it is first asked for: properties, names of a package, rows of tables."""
 
 from __future__ import annotations
 
 from collections import UserDict
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from ceres_cal.base.words import did_you_mean
 
@@ -37,3 +37,26 @@ class LazyTable(UserDict[str, _Row]):
         if isinstance(row, str):
             row = self.data[name] = self._found(import_module(f"{self._package}.{row}"), name)
         return cast("_Row", row)
+
+
+if TYPE_CHECKING:  # the same to a type checker
+    from functools import cached_property as cached_property
+else:
+
+    class cached_property:  # noqa: N801 as the standard library writes it
+        """functools.cached_property as it is from Python 3.12 on.
+
+        Before that it holds one lock for all instances while it computes: threads wait for each other, and a process
+        that is forked in the meantime waits for ever. Here two threads may both compute; both get the first value.
+        """
+
+        def __init__(self, function: Callable[[Any], Any]) -> None:
+            self.func, self.__doc__ = function, function.__doc__
+
+        def __set_name__(self, owner: type, name: str) -> None:
+            self._name = name
+
+        def __get__(self, instance: Any, owner: type | None = None) -> Any:
+            if instance is None:
+                return self
+            return instance.__dict__.setdefault(self._name, self.func(instance))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -47,13 +46,12 @@ def text_of(shown: Shown) -> str:
 
 def html_of(shown: Shown) -> str:
     """A table for a notebook; the first column names its row."""
-    title, rows = shown
-    return f"<table><caption>{escape(title)}</caption>{''.join(map(_html_row, rows))}</table>"
+    from html import escape
 
-
-def _html_row(row: Iterable[str]) -> str:
-    first, *rest = map(escape, row)
-    return f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in rest)}</tr>'
+    title, lines = escape(shown[0]), [[escape(cell) for cell in row] for row in shown[1]]
+    cells = [(first, "".join(f"<td>{cell}</td>" for cell in rest)) for first, *rest in lines]
+    rows = "".join(f'<tr><th scope="row">{first}</th>{rest}</tr>' for first, rest in cells)
+    return f"<table><caption>{title}</caption>{rows}</table>"
 
 
 def drawn(picture: str, thing: Any, ax: Any, **how: Any) -> Any:

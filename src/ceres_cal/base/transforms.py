@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import numbers_in
 
 _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding

@@ -1,4 +1,7 @@
-"""Numbers and names as people read them, in messages, answers and reports."""
+"""Numbers and names as people read them, in messages, answers and reports.
+
+The heights above the floor that matter: where a robot's cover and the ball are located.
+"""
 
 from __future__ import annotations
 
@@ -133,3 +136,14 @@ def printable(text: str) -> str:
 def frame_of(image: str | PurePath) -> str:
     """What the frame of an image is called: its name without folder and ending."""
     return printable(PurePath(image).stem)
+
+
+ROBOT_TOP_M = 0.15
+"""As high as the league lets robots be, and where vision looks for the markers on their covers."""
+HEIGHTS_M = (0.0, ROBOT_TOP_M)
+"""At which maps, errors and movements are stated: what holds at both holds between them."""
+
+
+def at_height(height_m: float) -> str:
+    """How people say it: "on the floor", "at 150 mm"."""
+    return "on the floor" if height_m == 0.0 else f"at {1e3 * height_m:.0f} mm"

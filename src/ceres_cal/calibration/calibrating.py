@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
-from ceres_cal.base.numerical import numerical
+from ceres_cal.base.arrays import numerical
+from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
@@ -30,7 +30,7 @@ from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import problem_of
 from ceres_cal.problem.ranges import require_possible_numbers
 from ceres_cal.problem.structure import EXACT, make_structure
-from ceres_cal.robust.as_built import free_dimensions
+from ceres_cal.robust.as_built import AS_DRAWN, Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
@@ -156,24 +156,25 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     def solved(one: Chosen) -> Calibration:
         named = replace(one.options, priors=options.priors)  # which lenses were compared without
-        return _of_lens(one.start, observations, sights, named, watched)
+        return _of_lens(one.start, observations, sights, named, watched, one.built)
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)
-    if calibration.as_built:
+    if calibration.as_built and not chosen.built.every:
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone.
         near = replace(calibration.estimate, structure=EXACT)
         before, anew = chosen, replace(start, estimate=near)
-        chosen = choose_lens(observations, options, anew, calibration.estimate.structure)
+        chosen = choose_lens(observations, options, anew, Built(calibration.as_built, calibration.estimate.structure))
         if chosen.choice.chosen != before.choice.chosen:
             calibration, chosen = chosen.first_solved(solved, papers(options), start)
     said = []
-    try:
-        while other := chosen.instead(*calibration.outlier_masks(observations)):
-            calibration, chosen = solved(other), other
-    except CalibrationError as error:
-        # reads: "another lens explains observations that were taken out, but makes no calibration of all: ..."
-        said.append(f"another lens explains observations that were taken out, but makes no calibration of all: {error}")
+    while other := chosen.instead(*calibration.outlier_masks(observations)):
+        found = attempt(partial(solved, other))  # reads: "another lens explains observations that were taken out, ..."
+        if isinstance(found, CalibrationError):
+            without = "but makes no calibration of all"
+            said.append(f"another lens explains observations that were taken out, {without}: {found}")
+            break
+        calibration, chosen = found, other
     if calibration.posterior is not None and (others := chosen.others) is not None:
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
@@ -196,24 +197,27 @@ def _part(bulk: Bulk, options: Options) -> Subset:
 
 
 def _of_lens(
-    start: Start, observations: Observations, sights: Sights, options: Options, watched: Watched
+    start: Start,
+    observations: Observations,
+    sights: Sights,
+    options: Options,
+    watched: Watched,
+    built: Built = AS_DRAWN,
 ) -> Calibration:
     """With a lens that is named."""
     options = options.with_first_power(len(sights))
     problem = problem_of(observations, sights, options, start.estimate)
     if options.closed_form_only:
         return of_closed_form(start, observations, problem)
-    return solved_from(start, observations, problem, watched=watched)
+    return solved_from(start, observations, problem, watched=watched, built=built)
 
 
+@or_none  # quiet: the caller raises the first failure
 def _without_priors(observations: Observations, options: Options) -> Calibration | None:
     """None where nothing was stated, or the observations make no calibration by themselves either."""
     if not (observations.priors or options.priors):
         return None
-    try:
-        return _calibrated(replace(observations, priors=()), replace(options, priors=()))
-    except CalibrationError:  # quiet: the caller raises the first failure
-        return None
+    return _calibrated(replace(observations, priors=()), replace(options, priors=()))
 
 
 def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:

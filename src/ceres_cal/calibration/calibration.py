@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
@@ -270,7 +270,7 @@ class Calibration:
         known, told = every_key(estimate), data.posterior
         posterior = None if told is None else told.posterior(known)
         if told is not None and posterior is not None and (told.profiles or told.bends):
-            from ceres_cal.posterior.files_before import as_mixtures
+            from ceres_cal.posterior.files import as_mixtures
 
             posterior = as_mixtures(told, posterior)
         return cls(

@@ -9,7 +9,6 @@ lens predict the others no better: a criterion that counts observations would ta
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
@@ -17,8 +16,8 @@ from typing import TypeVar
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
@@ -31,22 +30,19 @@ from ceres_cal.calibration.lens_forms import (
     pseudo_bma,
     standard_errors,
 )
-from ceres_cal.calibration.lens_kinds import Candidate, Kind
-from ceres_cal.calibration.lens_seen import FewGroupsError, InlierRows
+from ceres_cal.calibration.lens_seen import Candidate, FewGroupsError, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options
-from ceres_cal.problem.structure import EXACT, Structure
+from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
 
 _T = TypeVar("_T")
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
-_LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less make no difference
 # Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
 # of a valley along phi that frontal views leave open.
 _VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
-_LEAST_SHARE = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +81,11 @@ class Chosen:
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
+
+    @property
+    def built(self) -> Built:
+        """How targets seemed to be built when lenses were compared."""
+        return AS_DRAWN if self.among is None else self.among.seen.built
 
     @property
     def others(self) -> OtherLenses | None:
@@ -138,21 +139,23 @@ class Comparison:
     @cached_property
     def others(self) -> OtherLenses:
         """What other lenses would say; nothing beside one without a formula."""
+        least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
+        least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness:
             return found
-        try:
-            found = replace(found, near=self.seen.solved_near(self.chosen))
-        except CalibrationError as error:  # reads: "other lenses could not be compared, so the standard deviations ..."
-            return replace(found, failed=str(error))
+        near = attempt(lambda: self.seen.solved_near(self.chosen))  # reads: "other lenses could not be compared, ..."
+        if isinstance(near, CalibrationError):
+            return replace(found, failed=str(near))
+        found = replace(found, near=near)
         for one, likely in zip(self.tried, self.probabilities, strict=True):
-            if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
+            if one is self.chosen or likely < least_probability or one.form.blank.roughness or one.fault:
                 continue
-            with suppress(CalibrationError):  # quiet: a lens that cannot be solved for says nothing of the numbers
-                others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
-                found = replace(found, others=others, weights=weights)
+            near = attempt(partial(self.seen.solved_near, one))  # quiet: what cannot be solved for says nothing
+            if not isinstance(near, CalibrationError):
+                found = replace(found, others=(*found.others, near), weights=(*found.weights, likely))
         # What they say by chance is less by as much as there are more observations than took part.
-        share = max(self.share, _LEAST_SHARE)
+        share = max(self.share, least_share)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
     @property
@@ -182,23 +185,21 @@ class Comparison:
         found = self._excluding(lambda one: one.of is self.chosen.of, failure)
         return None if found is None else replace(found, passed=self.passed or self.chosen).outcome
 
+    @or_none  # quiet: the lens stays, or its own failure is told
     def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison | None:
         """Without some lenses, of which it is said why; None where no other one gives an answer."""
         known = {one.form.label for one in self.tried}
         every = [*self.tried, *(one for one in _shorter(self.tried, None) if one.form.label not in known)]
         others = [replace(one, squares=None, failed=one.failed or why) if is_out(one) else one for one in every]
-        try:
-            return _compared(self.seen, self.share, self.as_good, self.start, others)
-        except CalibrationError:  # quiet: the lens stays, or its own failure is told
-            return None
+        return _compared(self.seen, self.share, self.as_good, self.start, others)
 
 
-def choose_lens(observations: Observations, options: Options, start: Start, built: Structure = EXACT) -> Chosen:
+def choose_lens(observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN) -> Chosen:
     """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
 
     Args:
         options: their lens is not looked at. start: of everything, with whatever lens.
-        built: how the targets are taken to be built.
+        built: how targets were found to be built; where nothing is given that is found, too.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
@@ -206,12 +207,16 @@ def choose_lens(observations: Observations, options: Options, start: Start, buil
     by_themselves = replace(
         by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start))
     )
-    try:
+
+    def compared() -> Chosen:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built)
         return _among(seen, share, as_good, start, kinds).outcome
-    except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
-        failed = "" if isinstance(error, FewGroupsError) else str(error)
+
+    chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
+    if isinstance(chosen, CalibrationError):
+        failed = "" if isinstance(chosen, FewGroupsError) else str(chosen)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
+    return chosen
 
 
 def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:
@@ -243,11 +248,11 @@ def _among(seen: InlierRows, share: float, as_good: float, start: Start, kinds: 
     as the best of them are the shorter ones looked at.
     """
     tried = [one for kind in kinds for one in kind.candidates(first=True)]
-    found: Comparison | None = None
+    found: Comparison | CalibrationError | None = None
     if any(one.form.label == PAPER and one.squares is not None for one in tried):
-        with suppress(DegenerateError):  # quiet: all of these fold; the shorter ones that follow need not
-            found = _compared(seen, share, as_good, start, tried)
-    if found is None:
+        # quiet: all of these fold; the shorter ones that follow need not
+        found = attempt(lambda: _compared(seen, share, as_good, start, tried), DegenerateError)
+    if not isinstance(found, Comparison):
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])

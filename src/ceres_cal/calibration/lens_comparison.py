@@ -15,19 +15,20 @@ cells of the image and within them (analysis of variance).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
-from ceres_cal.calibration.lens_kinds import Candidate, Kind
 from ceres_cal.calibration.lens_seen import (
     MOST_ROUNDS,
+    Candidate,
     InlierRows,
+    Kind,
     profiles_of,
     require_groups,
     seen_through,
@@ -38,12 +39,11 @@ from ceres_cal.observations.thinning import thinned
 from ceres_cal.posterior.other_lenses import cells_of
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import problem_of
-from ceres_cal.problem.structure import EXACT, Structure
+from ceres_cal.problem.structure import EXACT
+from ceres_cal.robust.as_built import AS_DRAWN, Built, estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
-# Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
-_EXPLAINED = 3.0
 # Twice the log-odds of an observation that is taken out: one of a hundred is bad, somewhere within twenty sigmas.
 _PRICE = 13.0
 
@@ -64,25 +64,26 @@ def explained_by_another(
     for other in tried:
         if other is chosen or other.squares is None:
             continue
-        with suppress(CalibrationError):  # quiet: a lens that cannot be solved for explains nothing
-            explained = _explained(seen, seen.solved_near(other), out)
-            if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
-                return True
+        explained = _explained(seen, other, out) or 0
+        if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
+            return True
     return False
 
 
-def _explained(seen: InlierRows, there: Estimate, out: tuple[Mask, Mask]) -> int:
-    """How many equations of what is taken out are explained there, less those that would be taken out instead."""
+@or_none  # quiet: a lens that cannot be solved for explains nothing
+def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask]) -> int:
+    """How many equations of what is taken out a lens explains, less those that would be taken out instead."""
+    # Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
+    explained = 3.0
     farthest = seen.options.reject_sigma
-    points, curves = seen.in_sigmas(there)
+    points, curves = seen.in_sigmas(seen.solved_near(other))
     count = 0
     for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
-        count += equations * int(np.count_nonzero(own & (off < _EXPLAINED)))
+        count += equations * int(np.count_nonzero(own & (off < explained)))
         count -= equations * int(np.count_nonzero(~own & (off > farthest)))
     return count
 
 
-_LEAST_ROWS, _SHARE, _FEWEST_FRAMES = 1_000, 0.025, 24  # of the observations, how many take part
 # What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
 _WIDEST = "kannala-brandt"
 # Share of its squares: a kind that leaves less is solved instead, for it may have other inliers.
@@ -91,28 +92,34 @@ _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong va
 
 
 def compared_kinds(
-    observations: Observations, options: Options, start: Estimate, built: Structure = EXACT
+    observations: Observations, options: Options, start: Estimate, built: Built = AS_DRAWN
 ) -> tuple[InlierRows, list[Kind], float]:
     """The observations that take part, each kind near its best over them, at the noise of the one that explains the
     most, and their share of all.
 
     Args:
-        built: how the targets are taken to be built.
+        built: how targets were found to be built; where nothing is given that is found, too.
 
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
     """
+    least_rows, share, fewest_frames = 1_000, 0.025, 24  # of the observations, how many take part
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
-    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
-    sights = built.built_into(gather_sights(few))
+    few = thinned(observations, max(least_rows, int(share * total)), fewest_frames)
+    sights = built.held(gather_sights(few), few)
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
     tried = every
     while True:
         end, used = _solved(few, options, sights, start, tried)
-        seen = InlierRows(few, end, options, sights)
+        if options.as_built == "estimate" and not built.every:
+            built = estimate_as_built(end.problem, few, end)
+            if built.every:
+                sights = built.held(sights, few)
+                end, used = _solved(few, options, sights, replace(end.solution.estimate, structure=EXACT), [used])
+        seen = InlierRows(few, end, options, sights, built)
         compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)
@@ -130,18 +137,20 @@ def _solved(
     """The robust solve with the first of these kinds that explains the observations, or with the one that does it best,
     up to where the noise is known well enough.
     """
+
+    def solved(own: Options, from_nothing: bool) -> RobustSolution:
+        near = initialise(observations, sights, own).estimate if from_nothing else start
+        near = seen_through(near, own, profiles_of(near, sights))
+        problem = problem_of(observations, sights, own, near)
+        return solve_robustly(problem, observations, near, most_rounds=MOST_ROUNDS if from_nothing else 1)
+
     failure: CalibrationError | None = None
     found: list[_Found] = []
     for forms, from_nothing in [(kinds[0], False), *((forms, True) for forms in kinds)]:
-        own = forms[0].of(options)
-        try:
-            near = initialise(observations, sights, own).estimate if from_nothing else start
-            near = seen_through(near, own, profiles_of(near, sights))
-            problem = problem_of(observations, sights, own, near)
-            most_rounds = MOST_ROUNDS if from_nothing else 1
-            end = solve_robustly(problem, observations, near, most_rounds=most_rounds)
-        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
-            failure = error
+        # quiet: the next lens is tried, and the failure raised where none is left
+        end = attempt(partial(solved, forms[0].of(options), from_nothing))
+        if isinstance(end, CalibrationError):
+            failure = end
             continue
         if _noise_px(end) < _SOUND_PX:
             return end, forms

@@ -20,8 +20,6 @@ from ceres_cal.scene.lens import LENSES, Lens, make_lens
 TANGENTIAL = "tangential"  # the terms that displace so
 PAPER = "radial 2,3"
 """The lens that wins ties."""
-_ANY_PHI = 100.0
-_PROJECTION = 2  # coefficients that a projection of its own is worth
 
 
 def papers(options: Options) -> Options:
@@ -69,9 +67,11 @@ def size_of(options: Options) -> int:
     """How much a lens may follow: its free coefficients, and two more where it is no pinhole without any: its series in
     the tangent has its first two coefficients chosen.
     """
+    projection = 2  # coefficients that a projection of its own is worth
+    any_phi = 100.0
     blank = make_lens(options.lens, options.blank_lens.powers)
-    is_pinhole = np.isclose(blank.distort([[1.0, 0.0, 1.0]], _ANY_PHI)[0, 0], _ANY_PHI)
-    return coefficients_of(options) + (0 if is_pinhole else _PROJECTION)
+    is_pinhole = np.isclose(blank.distort([[1.0, 0.0, 1.0]], any_phi)[0, 0], any_phi)
+    return coefficients_of(options) + (0 if is_pinhole else projection)
 
 
 def is_usual(label: str) -> bool:

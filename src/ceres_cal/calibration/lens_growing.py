@@ -7,10 +7,9 @@ the lens leaves something behind.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import attempt
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.other_lenses import AGREES, agreement
 from ceres_cal.problem.bundle import Progress
@@ -39,12 +38,12 @@ def grown(
     longer = replace(options, terms=tuple(options.blank_lens.more_terms))
     may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
     if may_grow and agreement(end, observations.cameras) > AGREES:
-        with suppress(CalibrationError):  # quiet: the lens without these terms stays; what it leaves is diagnosed
-            near = _seen_longer(end.solution.estimate, longer)
-            try_of = problem_of(observations, problem.sights, longer, near)
-            found = solve_robustly(try_of, observations, near, progress=progress)
-            if _shows_all(found):
-                problem, end = _named(try_of), replace(found, problem=_named(found.problem))
+        near = _seen_longer(end.solution.estimate, longer)
+        try_of = problem_of(observations, problem.sights, longer, near)
+        # quiet: the lens without these terms stays; what it leaves is diagnosed
+        found = attempt(lambda: solve_robustly(try_of, observations, near, progress=progress))
+        if isinstance(found, RobustSolution) and _shows_all(found):
+            problem, end = _named(try_of), replace(found, problem=_named(found.problem))
     return problem, replace(start, estimate=_seen_longer(start.estimate, problem.options)), end
 
 

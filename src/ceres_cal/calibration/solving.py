@@ -26,7 +26,7 @@ from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.robust.as_built import require_measured, solve_as_built, taking_part, tolerances_of
+from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.groups import Subproblem
@@ -71,9 +71,17 @@ class Watched:
 
 
 def solved_from(
-    start: Start, observations: Observations, problem: Problem, again: Again | None = None, watched: Watched = Watched()
+    start: Start,
+    observations: Observations,
+    problem: Problem,
+    again: Again | None = None,
+    watched: Watched = Watched(),
+    built: Built = AS_DRAWN,
 ) -> Calibration:
     """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.
+
+    Args:
+        built: how targets seemed to be built before.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -81,7 +89,7 @@ def solved_from(
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
-    seen = _explained(start, observations, problem, again, watched)
+    seen = _explained(start, observations, problem, again, watched, built)
     conflicts, assessed = Conflicts(), again is None or again.assessed
     if assessed:
         part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
@@ -145,10 +153,11 @@ class _Explained:
 
 
 def _explained(
-    start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched
+    start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched, built: Built
 ) -> _Explained:
     """Solve, reject, solve, let explanations compete; solve for targets as built and for effects."""
-    usual = again.scales if again else None
+    usual, drawn = again.scales if again else None, problem.sights
+    problem = replace(problem, sights=built.held(drawn, observations))
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
         problem, start, end = _as_long_as_asked(problem, observations, start, end, watched)
@@ -158,9 +167,9 @@ def _explained(
         return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
 
     end, explanations = compete(problem, observations, end, solved)
-    seen = _Explained(problem, start, end, explanations)
+    seen = _Explained(replace(problem, sights=drawn), start, end, explanations)
     if again is None:
-        seen = _of_targets(seen, observations, solved, watched)
+        seen = _of_targets(seen, observations, solved, watched, built)
     require_fits(seen.end, seen.problem)
     require_possible(observations, seen.problem.sights, seen.end.solution.estimate, seen.end.residuals)
     return seen
@@ -171,11 +180,12 @@ def _of_targets(
     observations: Observations,
     solved: Callable[[Problem, Subproblem], RobustSolution],
     watched: Watched,
+    built: Built,
 ) -> _Explained:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
     if problem.options.as_built == "estimate":
-        end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
+        end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved, built)
     if watched.settle is None and estimated():
         from ceres_cal.robust.effects import solve_beside_effects
 

@@ -13,14 +13,11 @@ from collections.abc import Sequence
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import did_you_mean, first_of
 from ceres_cal.base.written import noting
-from ceres_cal.cli import terminal
-from ceres_cal.cli.command import COMMANDS, Command, print_answer
-from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
+from ceres_cal.cli.command import COMMANDS, Command
+from ceres_cal.cli.terminal import TERMINATED, Terminated, as_a_program, ended, error, in_colour, print_answer
 
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _FORESEEN = (CalibrationError, KeyboardInterrupt, MemoryError, OSError)
-_MOST_LETTERS = 200  # of an error that nobody wrote for people
-_INTERRUPTED = 130  # what a shell reports of a program that SIGINT ended
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,25 +54,27 @@ def _answer(arguments: list[str]) -> int:
 
 def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
     """What is said of an error, and the exit code."""
+    interrupted = 130  # what a shell reports of a program that SIGINT ended
+    most_letters = 200  # of an error that nobody wrote for people
     match error:
         case CalibrationError():
             return str(error), error.exit_code
         case KeyboardInterrupt():
-            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
+            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", interrupted)
             return f"{how}: {f'written were {first_of(files)}' if files else 'nothing was written'}", code
         case MemoryError():
             return "out of memory: give fewer observations or images at a time", InputError.exit_code
         case OSError():
             parts = (error.filename, error.strerror or error)
             return ": ".join(str(part) for part in parts if part), InputError.exit_code
-    what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
+    what = f"{type(error).__name__}: {error}"[:most_letters]
     return f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)", SolutionError.exit_code
 
 
 def _fail(message: str, exit_code: int, as_json: bool) -> int:
     line = " ".join(message.splitlines())
     said = f"ceres-cal: {line}"
-    print(terminal.error(said) if terminal.in_colour(sys.stderr) else said, file=sys.stderr)
+    print(error(said) if in_colour(sys.stderr) else said, file=sys.stderr)
     if as_json:
         import json
 

@@ -16,9 +16,8 @@ from ceres_cal.cli.arguments import (
     parse_board,
     station_option,
 )
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import QuietArguments, command, option
 from ceres_cal.cli.files import read_calibration, station_of
-from ceres_cal.cli.options import QuietArguments, option
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section, wrapped
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import did_you_mean
-from ceres_cal.cli.options import REQUIRED, QuietArguments, argument, option
+from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations, Prior

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, option, options_of
 from ceres_cal.cli.export import format_options, import_forms
 from ceres_cal.cli.files import read_observations
-from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options_of
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural, printable
 from ceres_cal.cli.arguments import jobs_option, output_option
-from ceres_cal.cli.command import COMMANDS, command
-from ceres_cal.cli.options import QuietArguments, argument, option, switch
+from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def _run(args: BatchArguments) -> Document:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
     from ceres_cal.cli.batch_page import summary_page
-    from ceres_cal.cli.running import run_jobs
+    from ceres_cal.cli.jobs import run_jobs
 
     jobs = plan_jobs(args.plan, args.output, args.options, reports=args.reports)
     make_folder(args.output)

@@ -10,7 +10,6 @@ from ceres_cal.cli.jobs import LEVELS, Outcome
 from ceres_cal.report.document import Card, Chapter, Piece, Table, Text, Tile, Tiles
 from ceres_cal.report.page import page
 
-_MOST_CARDS = 40
 _WORDS = {"failed": "failed", "no": "not to be trusted, or moved", "care": "usable with limits", "good": "good"}
 _LEVELS = {"failed": "no"}
 """What the page colours otherwise."""
@@ -22,6 +21,7 @@ def summary_page(title: str, outcomes: Sequence[Outcome], links: dict[str, str])
     Args:
         links: a job's name -> file beside the page to look at.
     """
+    most_cards = 40
     ranked = sorted(outcomes, key=lambda one: one.order)
     attention = [one for one in ranked if one.level != "good"]
     count = Counter(one.level for one in outcomes)
@@ -30,9 +30,9 @@ def summary_page(title: str, outcomes: Sequence[Outcome], links: dict[str, str])
     tiles = Tiles(tuple(Tile(_WORDS[name], str(count[name]), "", "", _LEVELS.get(name, name)) for name in LEVELS))
     chapters = [Chapter("verdict", f"{how}.", (tiles,), level)]
     if attention:
-        cards: list[Piece] = [_card(one, links.get(one.job, "")) for one in attention[:_MOST_CARDS]]
-        if len(attention) > _MOST_CARDS:
-            cards.append(Text(f"And {len(attention) - _MOST_CARDS} more, in the table."))
+        cards: list[Piece] = [_card(one, links.get(one.job, "")) for one in attention[:most_cards]]
+        if len(attention) > most_cards:
+            cards.append(Text(f"And {len(attention) - most_cards} more, in the table."))
         chapters.append(Chapter("attention", "What needs attention, the worst first", tuple(cards)))
     rows = tuple(
         (one.job, one.command, one.level, DASH if one.worst_mm is None else mm(one.worst_mm), one.line)

@@ -23,7 +23,7 @@ from ceres_cal.cli.arguments import (
     parse_prior,
     prior_option,
 )
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import (
     read_observations,
     report_page,
@@ -32,7 +32,6 @@ from ceres_cal.cli.files import (
     require_outputs,
     write_results,
 )
-from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.terminal import ProgressBar, progress_bar
 from ceres_cal.report.document import Document
 
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
 
 
 _AUTO = "auto"
-_PATIENCE_S = 5.0  # with a scheduler
 _CAMERA, _SOLVE = "the camera", "the solve"
 
 
@@ -179,6 +177,7 @@ def _run(args: CalibrateArguments) -> Document:
 
 def _client(address: str | None) -> AbstractContextManager[Any]:
     """Of the scheduler there, whose answer is awaited for some seconds; nothing without an address."""
+    patience_s = 5.0  # with a scheduler
     if address is None:
         return nullcontext()
     try:
@@ -186,7 +185,7 @@ def _client(address: str | None) -> AbstractContextManager[Any]:
     except ImportError:
         raise InputError("--scheduler needs Dask: pip install 'ceres-cal[dask]'") from None
     try:
-        client: AbstractContextManager[Any] = Client(address, timeout=_PATIENCE_S)
+        client: AbstractContextManager[Any] = Client(address, timeout=patience_s)
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no scheduler answers there ({str(error).splitlines()[0]})") from None
     return client

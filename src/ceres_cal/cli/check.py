@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import HEIGHTS_M, at_height
 from ceres_cal.cli.arguments import parse_names, parse_number
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import command, option
 from ceres_cal.cli.files import read_calibration, read_observations
-from ceres_cal.cli.options import option
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
-from ceres_cal.scene.heights import HEIGHTS_M, at_height
 
 if TYPE_CHECKING:
     from ceres_cal.detect.photographs import KnownDetections

@@ -1,20 +1,193 @@
-"""What every command has: a name, arguments, and a document that it answers, for people or for scripts."""
+"""What every command has: a name, arguments, and a document that it answers, for people or for scripts.
+
+The options of a command: fields of a frozen dataclass, each with its help, from which the parser is made.
+
+A field is made by `option`, `switch` or `argument`; its type says the rest: an argument that is a tuple takes any
+number, of a Literal one is chosen, and Path, int and float are read as such.
+"""
 
 from __future__ import annotations
 
 import argparse
 import re
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NoReturn, get_type_hints
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields
+from types import NoneType
+from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.lazy import LazyTable
 from ceres_cal.base.words import did_you_mean, sentence
-from ceres_cal.cli.options import Arguments, add_options, filled
-from ceres_cal.cli.terminal import coloured, in_colour
 from ceres_cal.report.document import Document
+
+_T = TypeVar("_T")
+_FORM = "option "  # before the names of a format's options: theirs may be those of the command's own arguments
+REQUIRED: Any = MISSING
+"""The default of an option that must be given."""
+
+
+def option(
+    help: str | Callable[[], str] = "",
+    metavar: str | None = None,
+    default: Any = None,
+    *,
+    flags: tuple[str, ...] = (),
+    read: Callable[[str], Any] | None = None,
+    repeatable: bool = False,
+    group: str = "",
+    alone: str = "",
+) -> Any:
+    """A field that is an option, --like-this where its name is like_this.
+
+    Args:
+        help: what it does; a function where that takes an import. Its default, where it has one, is added.
+        flags: how it is typed, where otherwise. read: a value from its text, where its type does not say it.
+        repeatable: whether it may be given again and again; the field is a tuple.
+        group: title in the help. alone: of options of the same word one may be given.
+    """
+    given = {"flags": flags, "read": read, "repeatable": repeatable, "group": group, "alone": alone}
+    about = {"help": help, "metavar": metavar, **given}
+    return field(default=() if repeatable and default is None else default, metadata=about)
+
+
+def switch(
+    help: str, default: bool | None = False, *, flags: tuple[str, ...] = (), group: str = "", alone: str = ""
+) -> Any:
+    """A field that is an option without a value, which makes it the contrary of its default."""
+    return option(help, default=default, flags=flags, group=group, alone=alone)
+
+
+def argument(metavar: str, help: str | Callable[[], str], default: Any = REQUIRED) -> Any:
+    """A field that is typed without a name before it."""
+    return field(default=default, metadata={"help": help, "metavar": metavar})
+
+
+def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
+    """A field (Mapping[str, str]) of what is given of the options of formats, as typed; what they are, formats say."""
+    return field(default_factory=dict, metadata={"forms": forms})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """What every command takes."""
+
+    json: bool = switch("print one JSON object")
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuietArguments(Arguments):
+    """Of a command that shows how far it is."""
+
+    quiet: bool = switch("no progress")
+
+
+def add_options(parser: argparse.ArgumentParser, kind: type[Arguments]) -> None:
+    """Add everything that a command takes to a parser."""
+    types, places = get_type_hints(kind), {"": parser}
+    common = {one.name for one in fields(QuietArguments)}
+    for one in sorted(fields(kind), key=lambda one: one.name in common):
+        about = one.metadata
+        if "forms" in about:
+            for name, helps in _of_forms(about["forms"]()).items():
+                parser.add_argument(flag(name), dest=_FORM + name, metavar="VALUE", help=_escaped("; ".join(helps)))
+            continue
+        place: Any = parser
+        if title := about.get("group"):
+            place = places.get(title) or places.setdefault(title, parser.add_argument_group(title))  # type: ignore[arg-type]
+        if word := about.get("alone"):
+            place = places.get(word) or places.setdefault(word, place.add_mutually_exclusive_group())
+        names, how = _settings(one, types[one.name])
+        place.add_argument(*names, **how)
+
+
+def filled(kind: type[_T], given: argparse.Namespace) -> _T:
+    """The dataclass of what was typed."""
+    values = vars(given)
+    typed = {name.removeprefix(_FORM): text for name, text in values.items() if name.startswith(_FORM)}
+    every = fields(kind)  # type: ignore[arg-type]
+    of_forms = {one.name: typed for one in every if "forms" in one.metadata}
+    own = {one.name: _frozen(values[one.name]) for one in every if one.name not in of_forms}
+    given_of = {
+        name: {key: text for key, text in texts.items() if text is not None} for name, texts in of_forms.items()
+    }
+    return kind(**own, **given_of)
+
+
+def flag(name: str) -> str:
+    """How an option is typed: --error-mm of error_mm."""
+    return f"--{name.replace('_', '-')}"
+
+
+def given_of(args: Arguments, group: str) -> list[str]:
+    """The options of a group that were given, as they are typed."""
+    return [
+        flag(one.name)
+        for one in fields(args)
+        if one.metadata.get("group") == group and getattr(args, one.name) != one.default
+    ]
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Names and settings of an argparse argument."""
+    about, item = one.metadata, _item(kind)
+    how: dict[str, Any] = {"help": _help(one), "metavar": about["metavar"]}
+    if get_origin(item) is Literal:
+        how |= {"choices": get_args(item), "metavar": None}
+    elif (read := about.get("read") or item) is not str:
+        how["type"] = read
+    if "flags" not in about:
+        if get_origin(kind) is tuple:
+            how["nargs"] = "+" if one.default is MISSING else "*"
+        elif one.default is not MISSING:
+            how["nargs"] = "?"
+        return (one.name,), how if one.default is MISSING else {**how, "default": one.default}
+    names = about["flags"] or (flag(one.name),)
+    how |= {"dest": one.name, "default": one.default}
+    if item is bool:
+        action = f"store_{not one.default}".lower()
+        return names, {"action": action, "help": how["help"], "dest": one.name, "default": one.default}
+    if one.default is MISSING:
+        how |= {"required": True, "default": None}
+    if about["repeatable"]:
+        how |= {"action": "append", "default": None if one.default is MISSING else list(one.default)}
+    return names, how
+
+
+def _item(kind: Any) -> Any:
+    """Path, of Path | None and of tuple[Path, ...]."""
+    inner = [one for one in get_args(kind) if one not in (NoneType, Ellipsis)]
+    return kind if get_origin(kind) is Literal or not inner else _item(inner[0])
+
+
+def _help(one: Field[Any]) -> str:
+    about = one.metadata
+    text: str = about["help"]() if callable(about["help"]) else about["help"]
+    more = ["repeatable"] if about.get("repeatable") and "repeatable" not in text else []
+    says_nothing = isinstance(one.default, bool) or one.default in (MISSING, None, "", ())
+    if not says_nothing and "default" not in text and "flags" in about:
+        more.append(f"default: {one.default:g}" if isinstance(one.default, float) else f"default: {one.default}")
+    return _escaped("; ".join(part for part in (text, *more) if part))
+
+
+def _escaped(text: str) -> str:
+    return text.replace("%", "%%")
+
+
+def _of_forms(forms: Iterable[Any]) -> Mapping[str, list[str]]:
+    """Every option of some formats, with what it means to each of them."""
+
+    def each() -> Iterator[tuple[str, str]]:
+        for form in forms:
+            yield from ((one.name, f"{form.name}: {one.metadata.get('help', '')}") for one in fields(form.options))
+
+    every: dict[str, list[str]] = {}
+    for name, text in each():
+        every.setdefault(name, []).append(text)
+    return every
 
 
 class Parser(argparse.ArgumentParser):
@@ -82,19 +255,6 @@ def command(name: str, summary: str, *examples: str) -> Callable[[Callable[[Any]
     return lambda run: Command(name, summary, run, examples)
 
 
-def print_answer(answer: Document, *, as_json: bool, quiet: bool = False) -> None:
-    """Print an answer; with --quiet its one line."""
-    if quiet and not as_json:
-        print(answer.one_line)
-    elif as_json:
-        from ceres_cal.base.files import json_text
-
-        print(json_text(answer.data))
-    else:
-        text = answer.text()
-        print(coloured(text) if in_colour(sys.stdout) else text)
-
-
 # ---- the table ------------------------------------------------------------------------------------------------------
 
 
@@ -102,7 +262,7 @@ _MODULES = {
     "open": "open",
     "run": "run",
     "detect board": "detect",
-    "detect rings": "detect_rings",
+    "detect rings": "detect",
     "detect field": "detect_field",
     "join": "join",
     "calibrate": "calibrate",

@@ -11,17 +11,14 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import fixed
 from ceres_cal.cli.arguments import height_option, metres, station_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, switch
 from ceres_cal.cli.files import finishing, require_output
-from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
     from ceres_cal.calibration import Calibration
     from ceres_cal.moves.agreement import Agreement
-
-_TABLE_SIZE = 9, 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +110,10 @@ def _camera(one: Agreement) -> Iterator[Section]:
 
 
 def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
+    table_size = 9, 7
     from ceres_cal.report.maps import grid_table
 
-    table = grid_table(head, values, x, y, place, _TABLE_SIZE, partial(fixed, places=2))
+    table = grid_table(head, values, x, y, place, table_size, partial(fixed, places=2))
     return Section("", table.lines(), pieces=(table,))
 
 

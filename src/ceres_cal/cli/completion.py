@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import COMMANDS, Command, Parser, command
-from ceres_cal.cli.options import Arguments, argument
+from ceres_cal.cli.command import COMMANDS, Arguments, Command, Parser, argument, command
 from ceres_cal.report.document import Document, Section
 
 _FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}

@@ -21,9 +21,8 @@ from ceres_cal.cli.arguments import (
     station_option,
     timeout_option,
 )
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import QuietArguments, argument, command, option, switch
 from ceres_cal.cli.files import finishing, json_object, read_target, require_observations_output
-from ceres_cal.cli.options import QuietArguments, argument, option, switch
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 
 _CORNER = "TopLeftCorner=102,88"
 _FACING = "LeftGoalLine=top"
-_SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +140,7 @@ def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResu
         return None
     from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded, read_colour
-    from ceres_cal.report.pictures.refused import draw_seen
+    from ceres_cal.report.pictures.overlay import draw_seen
 
     drawn: list[Path] = []
 
@@ -246,7 +244,8 @@ def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
 
 def _stretched(camera: Camera) -> bool:
     """Whether its pixels are farther from square than those of cameras."""
-    return abs(camera.aspect - 1.0) > _SQUARE
+    square = 0.005  # of fy / fx: those of cameras are nearer to 1
+    return abs(camera.aspect - 1.0) > square
 
 
 def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:

@@ -13,7 +13,7 @@ from ceres_cal.cli.arguments import (
     number,
     output_option,
 )
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import (
     read_calibration,
     read_observations,
@@ -23,7 +23,6 @@ from ceres_cal.cli.files import (
     require_outputs,
     write_results,
 )
-from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document
 

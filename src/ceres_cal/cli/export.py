@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import REQUIRED, Arguments, command, flag, option, options_of
 from ceres_cal.cli.files import finishing, read_calibration, require_output
-from ceres_cal.cli.options import REQUIRED, Arguments, flag, option, options_of
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.errors import CalibrationError, InputError, attempt
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import ReportArguments
@@ -177,10 +177,10 @@ def attempted(what: str, make: Callable[[], T]) -> tuple[T | None, Section]:
 
     A command whose section is not empty ends with exit code 1.
     """
-    try:
-        return make(), Section()
-    except CalibrationError as error:  # reads: "error     no report: ..."
-        return None, Section("error", [f"no {what}: {error}"], {"not_made": {what: str(error)}})
+    made = attempt(make)  # reads: "error     no report: ..."
+    if isinstance(made, CalibrationError):
+        return None, Section("error", [f"no {what}: {made}"], {"not_made": {what: str(made)}})
+    return made, Section()
 
 
 # ---- the report -----------------------------------------------------------------------------------------------------

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, options_of, switch
 from ceres_cal.cli.export import format_options, import_forms, listed, losses
 from ceres_cal.cli.files import finishing, read_calibration, require_output
-from ceres_cal.cli.options import Arguments, argument, option, options_of, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

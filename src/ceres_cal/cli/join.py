@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option
 from ceres_cal.cli.files import finishing, read_observations, require_different, require_observations_output
-from ceres_cal.cli.options import Arguments, argument, option
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:

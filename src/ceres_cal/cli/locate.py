@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, height_option, metres, parse_number, station_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option
 from ceres_cal.cli.files import read_calibration, station_of
-from ceres_cal.cli.options import Arguments, argument, option
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

@@ -12,16 +12,13 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option, parse_board, prior_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, switch
 from ceres_cal.cli.files import json_object, read_target
-from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.page.session import Session
-    from ceres_cal.page.state import Sitting, State
-
-_MOST_CALIBRATIONS = 2
+    from ceres_cal.cli.page.session import Session
+    from ceres_cal.cli.page.state import Sitting, State
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +48,13 @@ class OpenArguments(Arguments):
 )
 def _run(args: OpenArguments) -> Document:
     try:
-        import aiohttp  # noqa: F401 what `ceres_cal.page.server` serves with
+        import aiohttp  # noqa: F401 what `ceres_cal.cli.page.server` serves with
     except ImportError:
         raise InputError("open needs aiohttp: pip install 'ceres-cal[page]'") from None
     sitting = _sitting(args)
     state = _state(args, sitting)
     from ceres_cal.cli.open_steps import PageCommands
-    from ceres_cal.page.session import opened
+    from ceres_cal.cli.page.session import opened
 
     session = opened(sitting, PageCommands(sitting), state)
     _serve(session, args)
@@ -68,7 +65,7 @@ def _serve(session: Session, args: OpenArguments) -> None:
     import asyncio
     import webbrowser
 
-    from ceres_cal.page.server import serve
+    from ceres_cal.cli.page.server import serve
 
     def show(address: str) -> None:
         print(f"{address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
@@ -80,14 +77,15 @@ def _serve(session: Session, args: OpenArguments) -> None:
 
 def _sitting(args: OpenArguments) -> Sitting:
     """What was named, each file once: nothing else is read later."""
+    most_calibrations = 2
+    from ceres_cal.cli.page.state import Sitting
     from ceres_cal.detect.images import read_colour
-    from ceres_cal.page.state import Sitting
 
     named = image_files(args.files)
     calibrations = [path for path in named if path.suffix.lower() == ".json"]
     photographs = tuple(dict.fromkeys(path for path in named if path not in calibrations))
-    if len(calibrations) > _MOST_CALIBRATIONS:
-        raise InputError(f"{calibrations[_MOST_CALIBRATIONS]}: at most two calibrations are looked at over one picture")
+    if len(calibrations) > most_calibrations:
+        raise InputError(f"{calibrations[most_calibrations]}: at most two calibrations are looked at over one picture")
     if not photographs:
         raise InputError(f"{calibrations[0]}: a calibration holds no picture: name a photograph, too")
     names = [path.name for path in photographs]
@@ -101,7 +99,7 @@ def _sitting(args: OpenArguments) -> Sitting:
 
 
 def _state(args: OpenArguments, sitting: Sitting) -> State:
-    from ceres_cal.page.state import State
+    from ceres_cal.cli.page.state import State
 
     if args.board is not None:
         parse_board(args.board)

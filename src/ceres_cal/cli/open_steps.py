@@ -14,15 +14,14 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes, write_json
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.files import read_target
+from ceres_cal.cli.page.state import Made, Region, Sitting, State, target_words
 from ceres_cal.detect.images import encoded
 from ceres_cal.detect.photographs.clicks import FEWEST, FORMAT, VERSION
 from ceres_cal.formats import export_format
-from ceres_cal.page.state import Made, Region, Sitting, State, target_words
 from ceres_cal.report.document import Document
 from ceres_cal.scene.targets import Target
 
 CAMERA = "camera"
-_BLACK, _WHITE = 0, 255
 
 
 @dataclass(frozen=True)
@@ -171,8 +170,9 @@ def _mask_name(path: Path) -> str:
 
 def _mask(regions: Sequence[Region], size: tuple[int, int]) -> bytes:
     """A picture, black where nothing of the field is."""
-    picture = np.full(size[::-1], _WHITE, np.uint8)
+    black, white = 0, 255
+    picture = np.full(size[::-1], white, np.uint8)
     for one in regions:
         x0, y0, x1, y1 = np.round(one.box).astype(int).tolist()
-        picture[max(min(y0, y1), 0) : max(y0, y1, 0) + 1, max(min(x0, x1), 0) : max(x0, x1, 0) + 1] = _BLACK
+        picture[max(min(y0, y1), 0) : max(y0, y1, 0) + 1, max(min(x0, x1), 0) : max(x0, x1, 0) + 1] = black
     return encoded(picture, ".png", 100)

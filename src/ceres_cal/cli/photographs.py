@@ -18,8 +18,8 @@ from ceres_cal.cli.arguments import (
     station_option,
     timeout_option,
 )
+from ceres_cal.cli.command import Arguments, QuietArguments, argument, option
 from ceres_cal.cli.files import finishing, require_different, require_output
-from ceres_cal.cli.options import Arguments, QuietArguments, argument, option
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 _OBSERVATIONS = (".json", ".npz")
-_MOST_NAMED = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,12 +148,13 @@ def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) 
 
 def median_text(data: dict[str, Any]) -> str:
     """What became of the pictures, in one line."""
+    most_named = 3
     used, left_out = len(data["used"]), data["left_out"]
     reasons: dict[str, list[str]] = {}
     for one in left_out:
         reasons.setdefault(one["reason"], []).append(one["image"])
     said = [
-        f"{len(names)} left out, {reason} ({', '.join(names[:_MOST_NAMED])}{', ...' if names[_MOST_NAMED:] else ''})"
+        f"{len(names)} left out, {reason} ({', '.join(names[:most_named])}{', ...' if names[most_named:] else ''})"
         for reason, names in reasons.items()
     ]
     return "; ".join([f"{data['picture']}: the median of {plural(used, 'picture')} of {used + len(left_out)}", *said])

@@ -21,7 +21,6 @@ from ceres_cal.observations import FORMAT
 
 _ENDINGS = (".jsonl", ".csv", ".toml")
 _OBSERVATIONS = (".json", ".npz")
-_FIRST = 1000  # bytes
 _NAME = re.compile(r"[\w][\w .+-]*")
 
 
@@ -65,10 +64,11 @@ def _of_folder(folder: Path) -> Iterator[Planned]:
 
 def _holds_observations(file: Path) -> bool:
     """By its ending, and of JSON by its first letters: calibrations and truths lie beside."""
+    first = 1000  # bytes
     if file.suffix not in _OBSERVATIONS or not file.is_file():
         return False
     with file.open("rb") as stream:
-        return file.suffix == ".npz" or FORMAT.encode() in stream.read(_FIRST)
+        return file.suffix == ".npz" or FORMAT.encode() in stream.read(first)
 
 
 def _of_table(path: Path) -> Iterator[Planned]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ceres_cal.cli.arguments import PriorNames, ReportArguments, output_option, parse_names, parse_prior, prior_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import command, option, switch
 from ceres_cal.cli.files import (
     read_calibration,
     read_observations,
@@ -16,7 +16,6 @@ from ceres_cal.cli.files import (
     require_outputs,
     write_results,
 )
-from ceres_cal.cli.options import option, switch
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section

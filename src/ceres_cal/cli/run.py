@@ -23,9 +23,8 @@ from ceres_cal.cli.arguments import (
     prior_option,
     prior_parts,
 )
-from ceres_cal.cli.command import COMMANDS, command
+from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
 from ceres_cal.cli.files import attempted, read_target
-from ceres_cal.cli.options import QuietArguments, argument, option
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 

@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.arguments import Loss, calibration_argument
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, switch
 from ceres_cal.cli.files import read_calibration, read_observations, require_different
-from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.moves.agreement import Agreement, Agreements
-
-_MOST_VIEWS = 3  # shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +53,7 @@ def _run(args: ScoreArguments) -> Document:
 
 
 def _document(answer: Agreements, before: Calibration) -> Document:
+    most_views = 3  # shown
     cameras = list(answer.values())
     views = sorted((view for one in cameras for view in one.views), key=lambda view: -view.misfit.all_rms_px)
     posed = cameras[0].solution
@@ -68,7 +66,7 @@ def _document(answer: Agreements, before: Calibration) -> Document:
         "calibration_rms_px": before.fit.rms_px,
         "noise_ratios": ratios,
     }
-    worst = [f"{one.name}: {_left(one)}" for one in views[:_MOST_VIEWS]]
+    worst = [f"{one.name}: {_left(one)}" for one in views[:most_views]]
     parts = {"cameras": list(map(_data, cameras)), "views": list(map(_data, views))}
     return Document(
         (

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option, switch
 from ceres_cal.cli.files import finishing
-from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

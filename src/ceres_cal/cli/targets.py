@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import output_option, parse_board
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import Arguments, argument, command, option
 from ceres_cal.cli.files import finishing, require_ending, require_output, spelled_target
-from ceres_cal.cli.options import Arguments, argument, option
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

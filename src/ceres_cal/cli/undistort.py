@@ -20,9 +20,8 @@ from ceres_cal.cli.arguments import (
     parse_lengths,
     station_option,
 )
-from ceres_cal.cli.command import command
+from ceres_cal.cli.command import QuietArguments, argument, command, given_of, option, switch
 from ceres_cal.cli.files import finishing, read_calibration
-from ceres_cal.cli.options import QuietArguments, argument, given_of, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
     from ceres_cal.report.pictures.straight import Straight
     from ceres_cal.scene.camera import Camera
 
-_MARGIN_M = 0.3  # around the field in a top view
-_JPEG_QUALITY = 95
-_FORMAT, _VERSION = "ceres-cal/pictures", 1
 _STRAIGHT = "straight images (default)"
 _TOP = "the field from above"
 _OVERLAY = "the model in the photograph"
@@ -103,6 +99,7 @@ class UndistortArguments(QuietArguments):
     "calibration.json photographs/ -o look/ --overlay --before old.json",
 )
 def _run(args: UndistortArguments) -> Document:
+    format, version = "ceres-cal/pictures", 1
     require_fitting(args)
     images = image_files(args.images)
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
@@ -122,7 +119,7 @@ def _run(args: UndistortArguments) -> Document:
             lines.append(f"{output}: {line}")
             written.append({"image": str(path), "output": str(output), **own})
             bar.update(number, len(outputs), path.name)
-    data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **facts}
+    data = {"format": format, "version": version, "calibration": str(args.calibration), "kind": kind, **facts}
     with finishing():
         write_json(about, {**data, "pictures": written})
     said = {**data, "pictures": written, "output": str(about)}
@@ -202,17 +199,18 @@ _PictureMaker = tuple[Callable[[Path], tuple["Image", dict[str, Any], str]], Map
 
 
 def _read(path: Path, camera: Camera, name: str) -> Image:
-    from ceres_cal.report.pictures.files import read_photograph
+    from ceres_cal.report.pictures.frames import read_photograph
 
     return read_photograph(path, camera.image_size, name)
 
 
 def _write(path: Path, picture: Image) -> None:
+    jpeg_quality = 95
     from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded
     from ceres_cal.report.pictures.overlay import in_8_bit_colour
 
-    content = encoded(in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, _JPEG_QUALITY)
+    content = encoded(in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, jpeg_quality)
     with finishing():
         write_bytes(path, content)
 
@@ -298,13 +296,14 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
 
 
 def _field(calibration: Calibration) -> Area:
+    margin_m = 0.3  # around the field in a top view
     from ceres_cal.posterior.uncertainty import field_grid
 
     try:
         x, y = field_grid(calibration.targets)
     except InputError:
         raise InputError("the calibration has no field to be seen from above: say --area X0,Y0,X1,Y1") from None
-    ends = (x[0] - _MARGIN_M, y[0] - _MARGIN_M, x[-1] + _MARGIN_M, y[-1] + _MARGIN_M)
+    ends = (x[0] - margin_m, y[0] - margin_m, x[-1] + margin_m, y[-1] + margin_m)
     x0, y0, x1, y1 = (round(float(end), 9) for end in ends)
     return x0, y0, x1, y1
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -18,16 +18,14 @@ from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.threads import in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
-from ceres_cal.detect.april_grids import measured_april_grid
-from ceres_cal.detect.charuco import CharucoSpec, charuco_detector
-from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.markers import markers_finder, measured_markers
-from ceres_cal.detect.partly import part_of_board
 from ceres_cal.detect.saddles import REACH, Saddles, is_begun_dark, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
+
+if TYPE_CHECKING:
+    from ceres_cal.detect.charuco import CharucoSpec
 
 CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
@@ -163,10 +161,16 @@ def _find_all(
 
 def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
     if board.kind == "circle-grid":
+        from ceres_cal.detect.circles import measured_circles
+
         return lambda image: measured_circles(_as_8_bit(image), board)
     if board.kind == "april-grid":
+        from ceres_cal.detect.april_grids import measured_april_grid
+
         return lambda image: _placing(measured_april_grid(image, _as_8_bit(image), board))
     if board.kind == "markers":
+        from ceres_cal.detect.markers import markers_finder, measured_markers
+
         finder = markers_finder(board)
         return lambda image: measured_markers(image, _as_8_bit(image), board, finder)
     if board.grid is None or not board.grid.checkered:
@@ -183,6 +187,8 @@ def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
     if isinstance(corners, str):
         return lambda image: _measured_chessboard(image, columns, rows, corners)
+    from ceres_cal.detect.charuco import charuco_detector
+
     detector = charuco_detector(corners, columns, rows, square_m)
     margin = 0.5 * (1.0 - corners.marker_m / square_m)  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
@@ -198,6 +204,8 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
         if not np.isnan(found[-1][1].contrast).any():
             break
     if not found and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
+        from ceres_cal.detect.partly import part_of_board
+
         part = part_of_board(image, seed, columns, rows)
         return _placing(part)
     if not found:
@@ -227,7 +235,9 @@ def right_handed(grid: Array) -> Array:
 
 
 def _found_fast(image: Image8, columns: int, rows: int) -> Array | None:
-    """Roughly where the corners are, (rows, columns, 2) px, in a smaller picture: most boards that are seen whole."""
+    """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's fast finder in a smaller picture, else in the
+    whole one: most boards that are seen whole.
+    """
     scale = min(1.0, max(float(np.sqrt(_FAST_PX / image.size)), _FAST_SCALE))
     if scale * min(image.shape) < _LEAST_SIDE_PX:
         return None
@@ -235,6 +245,9 @@ def _found_fast(image: Image8, columns: int, rows: int) -> Array | None:
     # The check takes as long as the search where there is a board; where there is none, large pictures take seconds.
     flags = _ADAPTIVE | (cv2.CALIB_CB_FAST_CHECK if scaled.size > 1.1 * _FAST_PX else 0)
     shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=flags)
+    if not shown and scaled.size < image.size <= _LARGE_PX:  # a tenth of the time of the thorough search
+        scaled = image
+        shown, corners = cv2.findChessboardCorners(image, (columns, rows), flags=_ADAPTIVE | cv2.CALIB_CB_FAST_CHECK)
     return _places_in(image, scaled, corners).reshape(rows, columns, 2) if shown else None
 
 

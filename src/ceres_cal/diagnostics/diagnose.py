@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, numerical
 from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.shown import Shown, drawn, html_of, text_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -27,11 +26,10 @@ from ceres_cal.effects.score_tests import select
 from ceres_cal.effects.table import EFFECTS, columns_of_all
 from ceres_cal.effects.table.target import CurveAside, PointAside
 from ceres_cal.observations import Observations
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, judge, relative_lengths
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.residuals import Residuals, residuals
+from ceres_cal.problem.residuals import Residuals, residuals, write_equations
 from ceres_cal.robust.other_minima import with_lost_boards_posed
 from ceres_cal.robust.stated import Conflict
 

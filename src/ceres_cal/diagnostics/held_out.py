@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, attempt
 from ceres_cal.base.executing import each
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.transforms import Pose
@@ -27,10 +27,9 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import column_of, frames_of, thinned
 from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.parameters import Estimate, Layout, Options
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.problem.structure import make_structure
 
 if TYPE_CHECKING:
@@ -179,24 +178,22 @@ def choose(
     for number, (one, whole) in enumerate(zip(tried, wholes, strict=True)):
         if progress is not None:
             progress(number, len(tried), f"held out: {label_of(one)}")
-        if isinstance(whole, str):
-            errors.append(HeldOut(label_of(one), coefficients_of(one), failed=whole))
+        if isinstance(whole, CalibrationError):
+            errors.append(HeldOut(label_of(one), coefficients_of(one), failed=str(whole)))
             continue
-        try:
-            errors.append(cross_validate(few, one, k, calibration=whole, counted=counted, executor=executor))
-        except CalibrationError as error:  # reads: "..." in the row of that lens
-            errors.append(HeldOut(label_of(one), coefficients_of(one), failed=str(error)))
+        tell = partial(cross_validate, few, one, k, calibration=whole, counted=counted, executor=executor)
+        told = attempt(tell)  # reads: "..." in the row of that lens
+        if isinstance(told, CalibrationError):
+            told = HeldOut(label_of(one), coefficients_of(one), failed=str(told))
+        errors.append(told)
     best, chosen = _decide(errors, tried)
     share = (len(few.points) + len(few.curves)) / (len(observations.points) + len(observations.curves))
     current = next(i for i, one in enumerate(tried) if label_of(one) == label_of(options))
     return Choice(tuple(errors), tuple(tried), best, chosen, current, share)
 
 
-def _attempt(observations: Observations, options: Options) -> Calibration | str:
-    try:
-        return calibrate(observations, options)
-    except CalibrationError as error:  # reads: "..." in the row of that lens
-        return str(error)
+def _attempt(observations: Observations, options: Options) -> Calibration | CalibrationError:
+    return attempt(lambda: calibrate(observations, options))  # reads: "..." in the row of that lens
 
 
 def _decide(tried: Sequence[HeldOut], options: Sequence[Options]) -> tuple[int, int]:
@@ -215,10 +212,9 @@ def _without(
     observations: Observations, options: Options, whole: Calibration, kept: Mask, part: Mask
 ) -> Array | CalibrationError:
     """Errors (n, 2), px and mm, of a part's rows that count, by a calibration without it; or why there is none."""
-    try:
-        trained = calibrate(_part(observations, ~part), options)
-    except CalibrationError as error:  # reads: "..." in the row of that lens, where too many parts fail
-        return error
+    trained = _attempt(_part(observations, ~part), options)
+    if isinstance(trained, CalibrationError):
+        return trained
     held = part & kept
     return _predicted(observations, held, trained, whole)[held]
 

@@ -13,18 +13,18 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
-from ceres_cal.problem.equations import Equations, plane_shift, whole_structure
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
+from ceres_cal.problem.residuals import Equations, plane_shift, whole_structure
 from ceres_cal.problem.structure import Kind, Structure
 
 SMALL = 0.4

@@ -93,9 +93,6 @@ LIKELY = 0.5
 LEAST_PX = 1e-3
 """Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
-# The same of directions that tell a size. What is free besides takes up nearly all of those that are less determined,
-# and what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a lens had left over.
-_TELLS = 1e-3
 _Name = TypeVar("_Name", bound=Hashable)
 _NO_SCATTER = np.zeros(1)
 
@@ -280,12 +277,16 @@ class RepeatedAmounts:
 
     def size(self, numbers: Indices, others: Indices, sigmas: Array, prior: SizePrior) -> tuple[float, float]:
         """Sigma and probability of some numbers, with others scattering by sigmas (see `RandomEffects`)."""
+        # The same of directions that tell a size. What is free besides takes up nearly all of those that are less
+        # determined, and what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a
+        # lens had left over.
+        tells = 1e-3
         within, freedom = self._within(numbers)
         if freedom < _FEWEST:
             return 0.0, 0.0
         within = max(within, 1.0)
         score, information = self._beside(numbers, others, sigmas)
-        least = _TELLS * float(np.linalg.eigvalsh(information)[-1]) / within
+        least = tells * float(np.linalg.eigvalsh(information)[-1]) / within
         effects = RandomEffects.of(information / within, score / within, least, self.rest)
         effects = replace(effects, freedom=self.spare + len(effects.size))
         sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations

@@ -15,16 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import ranges
 from ceres_cal.problem.costs import robust_weights
-from ceres_cal.problem.equations import Equations, of_observations
 from ceres_cal.problem.information import Information, Key, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
-from ceres_cal.problem.residuals import Residuals
+from ceres_cal.problem.residuals import Equations, Residuals, of_observations
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""

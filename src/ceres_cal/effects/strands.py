@@ -13,15 +13,14 @@ from itertools import pairwise
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, median
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, bounds_of
-from ceres_cal.problem.equations import Equations, equations_of
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import ReducedInformation
-from ceres_cal.problem.residuals import Residuals
+from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 
 _MOST_ROWS = 1_500  # of a kind in a view
 

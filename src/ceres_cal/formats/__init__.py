@@ -17,10 +17,10 @@ from ceres_cal.formats.registry import import_calibration as import_calibration
 from ceres_cal.formats.registry import import_observations as import_observations
 from ceres_cal.formats.registry import prepare_export as prepare_export
 from ceres_cal.formats.registry import read_foreign as read_foreign
-from ceres_cal.formats.ssl_live import geometry_content as geometry_content
-from ceres_cal.formats.ssl_live import read_ssl_target as read_ssl_target
-from ceres_cal.formats.ssl_live import ssl_packet as ssl_packet
 from ceres_cal.formats.ssl_multicast import Group as Group
 from ceres_cal.formats.ssl_multicast import Heard as Heard
+from ceres_cal.formats.ssl_multicast import geometry_content as geometry_content
 from ceres_cal.formats.ssl_multicast import publish as publish
+from ceres_cal.formats.ssl_multicast import read_ssl_target as read_ssl_target
 from ceres_cal.formats.ssl_multicast import received_geometry as received_geometry
+from ceres_cal.formats.ssl_multicast import ssl_packet as ssl_packet

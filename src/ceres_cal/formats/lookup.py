@@ -19,9 +19,9 @@ from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
-from ceres_cal.scene.heights import HEIGHTS_M
 
 if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera

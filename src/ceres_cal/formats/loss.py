@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.words import HEIGHTS_M, at_height
 from ceres_cal.formats.export_format import ExportLoss
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid
-from ceres_cal.scene.heights import HEIGHTS_M, at_height
 
 if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera

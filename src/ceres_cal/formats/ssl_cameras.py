@@ -17,12 +17,12 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.export_format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.foreign import LARGEST
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Radial
 
 _QUATERNION, _SHIFT = ("q0", "q1", "q2", "q3"), ("tx", "ty", "tz")

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, attempt
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import field_box
@@ -126,11 +126,7 @@ def _recognises_yaml(content: bytes) -> bool:
 
 
 def _recognises_packet(content: bytes) -> bool:
-    try:
-        geometry_from_bytes(content)
-    except InputError:  # quiet: it is asked which format the file has
-        return False
-    return True
+    return isinstance(attempt(lambda: geometry_from_bytes(content)), dict)  # quiet: which format it is, is asked
 
 
 PACKET = ExportFormat(

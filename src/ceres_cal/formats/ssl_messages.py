@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, attempt
 
 _DEFINITION = """
 enum SSL_Source { SSL_SOURCE_UNKNOWN = 0; SSL_SOURCE_OTHER = 1; SSL_SOURCE_SSL_VISION = 2;
@@ -121,10 +121,10 @@ def geometry_from_bytes(content: bytes) -> dict[str, Any]:
     Raises:
         InputError: neither, or a packet without geometry.
     """
-    try:
-        return from_bytes("SSL_GeometryData", content)
-    except InputError:  # quiet: the other message is tried, whose failure is told
-        packet = from_bytes("SSL_WrapperPacket", content)
+    geometry = attempt(lambda: from_bytes("SSL_GeometryData", content))  # quiet: the other one's failure is told
+    if isinstance(geometry, dict):
+        return geometry
+    packet = from_bytes("SSL_WrapperPacket", content)
     if "geometry" not in packet:
         raise InputError("the packet holds no geometry")
     return dict(packet["geometry"])

@@ -1,4 +1,7 @@
-"""The league's geometry over UDP multicast: sent as ssl-vision and vision-processor do, and received."""
+"""The league's geometry over UDP multicast: sent as ssl-vision and vision-processor do, and received.
+
+What the commands need of the league's geometry: a packet to send, a field out of what came or lies in a file.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,27 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from select import select
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.files import read_bytes
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.base.written import note
+from ceres_cal.formats.export_format import Exported, ExportRequest
+from ceres_cal.formats.ssl_cameras import SslOptions
 from ceres_cal.formats.ssl_fields import target_of
+from ceres_cal.formats.ssl_geometry import geometry_of, read_geometry
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
+from ceres_cal.formats.ssl_settings import settings_field
+from ceres_cal.formats.yaml_files import yaml_text
 from ceres_cal.scene.targets import Target
+
+if TYPE_CHECKING:
+    from ceres_cal.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -129,3 +142,38 @@ def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
                     yield content, f"{sender[0]}:{sender[1]}"
     except OSError as error:
         raise InputError(f"{group.address}:{group.port}: cannot be listened to: {error.strerror or error}") from None
+
+
+def ssl_packet(
+    calibration: Calibration, stations: Sequence[str] | None = None, camera_id: str = "", before: bytes | None = None
+) -> tuple[bytes, Exported]:
+    """The wrapper packet of a calibration, and what it gets wrong.
+
+    Args:
+        before: a geometry.yml or a packet with the field and other cameras; by default the calibration's field.
+
+    Raises:
+        InputError: no such station, no field, or camera ids that do not fit.
+    """
+    names = tuple(calibration.stations if stations is None else stations)
+    for name in names:
+        calibration.station(name)
+    request = ExportRequest(calibration, names, "", SslOptions(camera_id))
+    data, exported = geometry_of(request, {} if before is None else read_geometry(before))
+    return wrapped(data), exported
+
+
+def geometry_content(geometry: Mapping[str, Any], ending: str) -> bytes:
+    """An SSL_GeometryData as plain data, as a file of it."""
+    return to_bytes("SSL_GeometryData", geometry) if ending == ".pb" else yaml_text(geometry).encode()
+
+
+def read_ssl_target(path: str | Path) -> Target:
+    """The field of a geometry.yml, a packet or ssl-vision's robocup-ssl.xml.
+
+    Raises:
+        InputError: naming the file; it is none of these, or has no field.
+    """
+    content = read_bytes(path)
+    with naming(path):
+        return settings_field(content) if b"<VarXML" in content else target_of(read_geometry(content)["field"])

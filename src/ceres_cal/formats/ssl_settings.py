@@ -24,7 +24,6 @@ from ceres_cal.scene.targets import Target
 
 _CAMERA, _PARAMETERS, _FIELD = "Camera Calibrator", "Camera Parameters", "Field Configuration"
 _INDEX, _OPENCV = "camera index", "use openCV camera model"
-_MOST_TZ_MM, _DISTORTION = 6500.0, (-1.0, 2.0)  # ssl-vision clamps to these when it reads
 _XML_NAMES = {name: name.replace("_", " ") if name[0] not in "qt" else name for name in NAMES}
 _SIZES = {  # of the message: of the settings
     "field_length": "Field Length",
@@ -155,12 +154,13 @@ def _export(request: ExportRequest) -> Exported:
 
 
 def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -> Iterator[tuple[_Var, str]]:
-    if not 0.0 <= entry["tz"] <= _MOST_TZ_MM:
+    most_tz_mm, distortion = 6500.0, (-1.0, 2.0)  # ssl-vision clamps to these when it reads
+    if not 0.0 <= entry["tz"] <= most_tz_mm:
         raise InputError(
-            f"camera {number}: its tz {entry['tz']:.0f} mm is not between 0 and {_MOST_TZ_MM:.0f}, to which ssl-vision "
+            f"camera {number}: its tz {entry['tz']:.0f} mm is not between 0 and {most_tz_mm:.0f}, to which ssl-vision "
             "clamps it: such a camera cannot be loaded"
         )
-    if not _DISTORTION[0] <= entry["distortion"] <= _DISTORTION[1]:
+    if not distortion[0] <= entry["distortion"] <= distortion[1]:
         raise InputError(f"camera {number}: ssl-vision clamps its distortion {entry['distortion']:.3g} to [-1, 2]")
     for name, label in _XML_NAMES.items():
         if label not in there:

@@ -14,8 +14,6 @@ from ceres_cal.kernels.arguments import (
     Unknowns,
 )
 from ceres_cal.kernels.calls import (
-    align_sights,
-    alignment_errors,
     cholesky,
     curve_residuals,
     curve_rows,
@@ -23,7 +21,6 @@ from ceres_cal.kernels.calls import (
     evaluate_block,
     fit_saddles,
     loss_weights,
-    normalised_planes,
     plane_homographies,
     point_residuals,
     point_rows,
@@ -42,8 +39,6 @@ __all__ = [
     "PointColumns",
     "Sweep",
     "Unknowns",
-    "align_sights",
-    "alignment_errors",
     "cholesky",
     "curve_residuals",
     "curve_rows",
@@ -51,7 +46,6 @@ __all__ = [
     "evaluate_block",
     "fit_saddles",
     "loss_weights",
-    "normalised_planes",
     "plane_homographies",
     "point_residuals",
     "point_rows",

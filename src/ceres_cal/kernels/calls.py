@@ -33,32 +33,6 @@ def core() -> Any:
 # ---- the start ------------------------------------------------------------------------------------------------------
 
 
-def normalised_planes(bounds: Indices, plane: Array, x: Array, lifts: Array) -> None:
-    """x (2, N): each sight's plane points (N, 2) with their centroid at 0 and unit spread; lifts (S, 3) these two.
-
-    Args:
-        bounds: (S + 1,) where each sight begins.
-    """
-    core().normalised_planes(bounds, plane, x, lifts)
-
-
-def align_sights(
-    bounds: Indices, x: Array, p: Array, weights: Array, h12: Array, shares: Array, reduced: Array
-) -> None:
-    """h1 and h2 (S, 6) of every sight, and the equations of the profile that are left, `reduced`, added up.
-
-    Args:
-        bounds: (S + 1,) where each sight begins. x: (2, N) plane points, p: (N, 2) offsets, of unit size each.
-        shares: (S, 3, terms + 1), filled: h3 is (shares @ (-c, 1)). reduced: (terms + 1,) squared, q's row last.
-    """
-    core().align_sights(bounds, x, p, weights, h12, shares, reduced)
-
-
-def alignment_errors(bounds: Indices, x: Array, p: Array, h12: Array, h3: Array, profile: Array, errors: Array) -> None:
-    """Distance (N,) of each point from where its sight's h12 (S, 6) and h3 (S, 3) send it under the profile c_k."""
-    core().alignment_errors(bounds, x, p, h12, h3, profile, errors)
-
-
 def plane_homographies(
     bounds: Indices, plane: Array, offsets: Array, profile: Array, unit: float, wrong: float, homographies: Array,
     errors: Array,

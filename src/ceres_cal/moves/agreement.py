@@ -14,6 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.shown import brief, text_of
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations
@@ -21,7 +22,6 @@ from ceres_cal.posterior.maps import ErrorMap, FieldGrid, visible_pixels
 from ceres_cal.posterior.uncertainty import field_grid
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Target
 
 # How often a calibration that holds is said not to, where nobody states another rate. At half of it nothing changes, at

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError, InputError
-from ceres_cal.base.numerical import numerical
+from ceres_cal.base.arrays import Array, numerical
+from ceres_cal.base.errors import CalibrationError, InputError, attempt
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
+from ceres_cal.base.words import at_height
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids
@@ -31,12 +32,9 @@ from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import at_height
 
 # How often a sound calibration is said to be at fault.
 _FALSE_ALARMS = 0.005
-_FAR = 1e3  # sigmas, of what a camera does not show at all
-_LENSES = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (2, 3)), ("kannala-brandt", (2, 3)))
 _SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 
 
@@ -89,10 +87,11 @@ class _AuditCase:
         layout = Layout({owner: np.array(lens, dtype=np.int64)}, frozenset(stations), free.placements)
         if layout.size:
             problem = replace(self.problem, layout=layout)
-            try:
-                estimate = solve(problem, estimate, precision=1e-10, is_near=False).estimate
-            except CalibrationError:  # quiet: a change that cannot be solved for costs more than any other
+            # quiet: a change that cannot be solved for costs more than any other
+            solution = attempt(lambda: solve(problem, estimate, precision=1e-10, is_near=False))
+            if isinstance(solution, CalibrationError):
                 return np.inf, camera
+            estimate = solution.estimate
         return self._cost(estimate), estimate.camera_at(self.name)
 
     def _with(self, camera: Camera) -> Estimate:
@@ -102,13 +101,14 @@ class _AuditCase:
         return replace(old, cameras={owner: camera.at(Pose.identity())}, stations={self.name: station})
 
     def _cost(self, estimate: Estimate) -> float:
+        far = 1e3  # sigmas, of what a camera does not show at all
         there = residuals(self.observations, self.problem.sights, estimate)
         total = 0.0
         columns: tuple[Columns, ...] = (self.observations.points, self.observations.curves)
         masks, scales = self.ours.inlier_masks(self.observations), self.ours.fit.scales
         for lengths, column, mask, scale in zip(there.lengths, columns, masks, scales, strict=True):
             sigmas = (lengths / (scale * column.sigma_px))[mask] if len(column) else np.empty(0)
-            total += float(np.sum(np.minimum(np.nan_to_num(sigmas, nan=_FAR), _FAR) ** 2))
+            total += float(np.sum(np.minimum(np.nan_to_num(sigmas, nan=far), far) ** 2))
         return total
 
 
@@ -157,19 +157,21 @@ def excess_px(one: Agreement) -> tuple[float, float]:
 
 def _case(observations: Observations, given: Camera) -> _AuditCase:
     """Ours, with the lens that explains the observations best for the number of its coefficients."""
+    lenses = (("radial", (2, 3)), ("radial", (3,)), ("radial", (3, 5)), ("brown", (2, 3)), ("kannala-brandt", (2, 3)))
     found: list[tuple[float, Calibration]] = []
     failure: CalibrationError | None = None
-    for kind, powers in dict.fromkeys([*_LENSES, (given.lens.kind, given.lens.powers or (2, 3))]):
-        try:
-            own = Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0, as_built="as drawn")
-            ours = calibrate(observations, own)  # as drawn, since other programs take targets so
-        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
-            failure = failure or error
+    for kind, powers in dict.fromkeys([*lenses, (given.lens.kind, given.lens.powers or (2, 3))]):
+        # As drawn, since other programs take targets so.
+        own = Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0, as_built="as drawn")
+        # quiet: the next lens is tried, and the failure raised where none is left
+        tried = attempt(partial(calibrate, observations, own))
+        if isinstance(tried, CalibrationError):
+            failure = failure or tried
             continue
-        count = ours.fit.points * 2 + ours.fit.curves
-        outliers = len(ours.outliers)  # each of them as a residual of five sigmas
-        misfit = count * np.log(ours.fit.rms_px**2) + 25.0 * outliers
-        found.append((misfit + len(ours.station().lens.names) * np.log(count), ours))
+        fit, outliers = tried.fit, len(tried.outliers)  # each of them as a residual of five sigmas
+        count = fit.points * 2 + fit.curves
+        misfit = count * np.log(fit.rms_px**2) + 25.0 * outliers
+        found.append((misfit + len(tried.station().lens.names) * np.log(count), tried))
     if not found:
         raise failure or InputError("nothing was observed")
     ours = min(found, key=lambda one: one[0])[1]

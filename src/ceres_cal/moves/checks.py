@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import CalibrationError, InputError
-from ceres_cal.base.numerical import numerical
+from ceres_cal.base.arrays import Array, Mask, numerical
+from ceres_cal.base.errors import InputError, or_none
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
@@ -51,7 +50,6 @@ from ceres_cal.problem.structure import make_structure
 _INLIER_SIGMA = 3.5
 # Of observations that fit somewhere; with fewer than half nothing is understood. Nothing changes from 0.33 to 0.67.
 _LEAST_SHARE = 0.5
-_MANY_OUTLIERS = 0.25
 # Fall of twice the cost that a phi at its place exceeds one time in a thousand. Nothing changes from half to double.
 _WILL_DO = 10.8
 # Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
@@ -128,14 +126,12 @@ class _CheckCase:
         weighting = Weighting(noise * points, noise * curves, "trivial")
         return Problem(used, layout, (self.prior.without(freed), *fresh), weighting, self.calibration.options)
 
+    @or_none  # reads: "check no ..." that nothing explains the observations
     def least(self, used: Sights, freed: Collection[Key], pose: Pose) -> tuple[float, Estimate] | None:
         """Twice the least cost, and where, from a pose; None where the solver does not get there."""
         station = replace(self.estimate.stations[self.name], cam_from_world=pose)
         start = replace(self.estimate, stations={self.name: station})
-        try:
-            solution = solve(self.problem(used, freed), start)
-        except CalibrationError:  # reads: "check no ..." that nothing explains the observations
-            return None
+        solution = solve(self.problem(used, freed), start)
         return None if solution.failed else (2.0 * solution.cost, solution.estimate)
 
     def known(
@@ -245,6 +241,7 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
 
 
 def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -> str:
+    many_outliers = 0.25
     worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
     if holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
@@ -254,6 +251,6 @@ def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -
         moved = f"moved by about {change.moved_mm:.1f} mm and {change.turned_deg:.3f} deg{shifts}"
         words = f"no longer holds: {moved} (probability {probability:.1g})"
     count = misfit.points + misfit.curves + misfit.outliers
-    if misfit.outliers > _MANY_OUTLIERS * count:
+    if misfit.outliers > many_outliers * count:
         words += f"; but {misfit.outliers} of {count} observations fit nowhere: check labels"
     return words

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, median
+from ceres_cal.base.arrays import Array, median, numerical
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
 from ceres_cal.base.typed import checked

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
 from ceres_cal.problem.information import Information, Key
 

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.errors import CalibrationError, SolutionError
+from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
-from ceres_cal.moves.refit_plan import RefitPlan
+from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate
@@ -126,9 +126,9 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
         phi = zoomed[0].camera.phi
         before = search.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
-    try:
-        fresh = calibrate(search.observations.of_station(search.sight.key.station), replace(plan.options, priors=()))
-    except CalibrationError:  # quiet: one hint less in a refusal
+    own = search.observations.of_station(search.sight.key.station)
+    fresh = attempt(lambda: calibrate(own, replace(plan.options, priors=())))  # quiet: one hint less in a refusal
+    if isinstance(fresh, CalibrationError):
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
     if noise < _NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
@@ -213,21 +213,20 @@ def require_supported(
     plan: RefitPlan,
     result: Calibration,
     searches: Sequence[PoseSearch],
-    attempt: Callable[[str, Estimate], Calibration],
+    solved_with: Callable[[str, Estimate], Calibration],
 ) -> bool:
     """Whether nothing fits; SolutionError where another explanation than the chosen one is supported.
 
     Args:
-        searches: of each station that moved. attempt: solves again with another freedom, from an estimate.
+        searches: of each station that moved. solved_with: solves again with another freedom, from an estimate.
     """
     doubtful = judged(plan, plan.what, result).doubtful
     results = {plan.what: result}
     for what in _WIDER[plan.what] if doubtful else _WIDER[plan.what][:2]:
-        try:
-            results[what] = attempt(what, result.estimate)
-        except CalibrationError:
-            # quiet: another freedom that is no explanation; what was asked for is judged by itself
-            continue
+        # quiet: another freedom that is no explanation; what was asked for is judged by itself
+        wider = attempt(partial(solved_with, what, result.estimate))
+        if isinstance(wider, Calibration):
+            results[what] = wider
     quiet = {w: r for w, r in results.items() if judged(plan, w, r).noise < _TOO_NOISY or w == plan.what}
     scores = _scores(plan, quiet)
     # Of explanations that are about as good the one that lets least go is taken.

@@ -27,7 +27,6 @@ from ceres_cal.start.planes import plane_sight
 # Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise. Nothing
 # changes from half to double.
 _WIDE = (60.0, 12.0)
-_TURNS = [(0.0, 0.0, angle) for angle in (np.pi, np.pi / 2, -np.pi / 2)]
 # Turns about each axis of the camera; neighbours' basins overlap.
 _GRID = list(product(np.deg2rad((-24.0, 0.0, 24.0)), repeat=3))
 # m and rad: candidates nearer than this end in one minimum. Nothing changes from half to double.
@@ -112,8 +111,9 @@ def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) 
         old: where the camera stood before. patience: 0 tries the old poses, their turns and the closed form alone; 1
             the grid around them as well, where none of those fits.
     """
+    turns = [(0.0, 0.0, angle) for angle in (np.pi, np.pi / 2, -np.pi / 2)]
     closed = closed_form(search)
-    seeds = [*old, *(pose.turned(turn) for pose in old for turn in _TURNS)]
+    seeds = [*old, *(pose.turned(turn) for pose in old for turn in turns)]
     unmoved = _refined(search, old, ())  # a wide loss leads away from a true pose where many labels are wrong
     candidates = _distinct([*unmoved, *_refined(search, [*seeds, *([closed] if closed is not None else [])])])
     if patience and not (candidates and candidates[0].fits):

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import DegenerateError, SolutionError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted
@@ -76,15 +76,15 @@ def refit(
     zoomed = plan.moved_cameras if what in ("zoom", "everything") else ()
     phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
 
-    def attempt(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
+    def solved_with(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
         problem, known = refit_problem(plan, what, start)
         again = Again(known, plan.scales, assessed)
         return solved_from(Start(start, phi_from), plan.observations, problem, again, Watched(progress))
 
-    result = attempt(what, estimate, assessed=True)
+    result = solved_with(what, estimate, assessed=True)
     try:
         searches = [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)]
-        if require_supported(plan, result, searches, attempt):
+        if require_supported(plan, result, searches, solved_with):
             raise why_nothing_fits(plan, searches)
     except SolutionError as error:
         stated = [conflict.words for conflict in result.conflicts if conflict.kind == "prior"]

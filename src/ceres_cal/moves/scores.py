@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, numerical
 from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
@@ -23,8 +22,8 @@ from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.problem.structure import EXACT, Structure, make_structure
-from ceres_cal.start.chaining import chained_poses
 from ceres_cal.start.initialise import Start
+from ceres_cal.start.world import chained_poses
 
 
 @checked

@@ -15,7 +15,6 @@ from ceres_cal.observations.files import Content
 _MARGIN_PX = 1.5
 # Of a camera's observations: more of them outside, and its image has another size.
 _FEW = 0.01
-_CORNER = 0.25  # of either side: a board that is always held so far from the middle of the image is rare
 _FAR = 10.0  # image diagonals: a pixel farther off was not measured, and its square swamps what was
 # The largest playing fields end at 60 m; the smallest board in millimetres reaches as far.
 _LARGE_M = 100.0
@@ -129,11 +128,12 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
 
 def unfilled(content: Content) -> Iterator[str]:
     """A line for each camera whose observations all lie in a small corner of its image."""
+    corner = 0.25  # of either side: a board that is always held so far from the middle of the image is rare
     owners = np.array([view.camera for view in content.views])
     for camera, size in content.cameras.items():
         own = owners == camera
         pixels = np.concatenate([column.pixels[own[column.view]] for column in (content.points, content.curves)])
-        if len(pixels) and np.all(pixels.max(axis=0) < _CORNER * np.array(size)):
+        if len(pixels) and np.all(pixels.max(axis=0) < corner * np.array(size)):
             reach = "{:.0f} x {:.0f}".format(*pixels.max(axis=0))
             yield (
                 f"camera {camera!r}: observations reach {reach} px of an image of {size[0]} x {size[1]}: is image_size "

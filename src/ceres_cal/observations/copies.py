@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import Indices, Mask
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block
 
 Hashes = NDArray[np.uint64]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.scene.camera import Camera

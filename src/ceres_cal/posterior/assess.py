@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.numerical import numerical
+from ceres_cal.base.arrays import numerical
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.bent import Node, ends_of, profile, valley

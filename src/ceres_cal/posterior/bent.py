@@ -15,13 +15,12 @@ where all directions are well known.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
+from ceres_cal.base.errors import SolutionError, or_none
 from ceres_cal.base.tails import normal_cdf
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.bundle import Solution, solve
@@ -109,17 +108,15 @@ def profile(
     return Mixture.along_phi(keys, phi, steps, rises, across, is_open)
 
 
+@or_none  # quiet: a smaller step is tried; a valley without an end stays open
 def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> Node | None:
     """The least cost with phi held where the start has it; None where the solver does not get there."""
-    try:
-        held = problem.holding(camera, 0)
-        solution = solve(held, start)
-        known = None if solution.failed else information(problem, solution.estimate).shared
-    except CalibrationError:  # quiet: a smaller step is tried; a valley without an end stays open
-        return None
-    if known is None:
+    held = problem.holding(camera, 0)
+    solution = solve(held, start)
+    if solution.failed:
         return None
     there = solution.estimate
+    known = information(problem, there).shared
     stated = sum(prior.cost(there) for prior in held.stated_at(there))
     cost = (2.0 * solution.cost - stated) / inflation + stated + _cost_of_phi(camera, problem, there)
     return Node(there, cost, known)
@@ -329,18 +326,18 @@ class _End:
     cost: float
 
 
+@or_none  # quiet: no camera there; the end counts as far away as any
 def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Array) -> _End | None:
     """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
     sizes = natural_sizes(estimate, keys)
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
-    with suppress(InputError):  # quiet: no camera there; the end counts as far away as any
-        held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
-        solution = solved_soon(replace(problem, priors=(*problem.priors, held)), estimate)
-        if solution is not None:
-            pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
-            off = difference(solution.estimate, estimate, keys) / sizes
-            return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
-    return None
+    held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
+    solution = solved_soon(replace(problem, priors=(*problem.priors, held)), estimate)
+    if solution is None:
+        return None
+    pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
+    off = difference(solution.estimate, estimate, keys) / sizes
+    return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
 
 
 def _reach(end: _End, least: float, rise: float) -> float:

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief, drawn
 from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior
@@ -209,7 +209,6 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     return FieldMap(grid.height_m, grid.x_m, grid.y_m, station, *values)
 
 
-_EXACT_PX = 1e-6  # places that are known better tell a turn alike
 _STEPS = 32  # along the longer side
 
 
@@ -297,6 +296,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     Raises:
         InputError: no such camera.
     """
+    exact_px = 1e-6  # places that are known better tell a turn alike
     if camera not in estimate.cameras:
         raise InputError(f"there is no camera {camera!r}: it is one of {', '.join(estimate.cameras)}")
     own = estimate.cameras[camera].at(Pose.identity())
@@ -312,7 +312,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
 
     picture = Picture(own, pixels, 0.0)
     with_turns = known(picture).sd
-    picture = replace(picture, weights=1.0 / np.maximum(with_turns, _EXACT_PX))
+    picture = replace(picture, weights=1.0 / np.maximum(with_turns, exact_px))
     radius = known(picture).radius_95
     return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
 

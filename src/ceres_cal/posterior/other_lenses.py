@@ -25,8 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.effects.evidence import agreement as agreement_of
 from ceres_cal.effects.evidence import shifts_by
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
@@ -34,14 +35,13 @@ from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.maps import Picture, locate_slopes, picture_slopes
-from ceres_cal.problem.equations import Equations, equations_of
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.problem.residuals import Equations, equations_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.heights import HEIGHTS_M
 
 _PLACES = 12  # along each side of the picture
 # How closely the heights of HEIGHTS_M are followed. Above the floor phi tells, and the quadratic picture bends:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, median
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import Shown, html_of, text_of
 from ceres_cal.base.spread import are_known
 from ceres_cal.base.typed import rows

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import Spread, known_inverses, without
 
 _TURNS = ("turn_x", "turn_y", "turn_z")

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.base.typed import checked_fields, take_types

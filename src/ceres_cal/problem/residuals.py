@@ -1,21 +1,33 @@
-"""What the observations and an estimate disagree about, in measured pixels, one by one."""
+"""What the observations and an estimate disagree about, in measured pixels, one by one.
+
+Every observation that an estimate can show, as scalar equations with all their derivatives, in px.
+
+A point gives two equations, one for each image axis, a curve observation one, along the image normal at its foot. Any
+alternative to the model is a column over these equations: what it moves in the image goes in by `direction`, what it
+moves on a target by `built`, the camera by `pose`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.observations import Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.problem.parameters import Estimate, intrinsics_vector, unit_px
-from ceres_cal.problem.structure import Structure
+from ceres_cal.problem.structure import Structure, Tolerance, bends_of, make_structure
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import LENSES
+from ceres_cal.scene.targets import Target
 
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
 # scripts/accuracy/moves.py. Nothing changes from half to double.
@@ -168,3 +180,191 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
     seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
     nearest = [nearest_feet(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
     return np.concatenate(nearest)
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """E scalar equations, sight after sight.
+
+    Attributes:
+        sights: what can be shown, S of them; none is empty. poses: (S, 3, 4) cam_from_frame. bounds: (S + 1,) where
+            each sight's equations begin. sight: (E,).
+        observation: (E,) number of the observation: points by row, then curves by row. view: (E,) of the observation.
+        is_curve: (E,). feature: (E,) its `point_index` or, of a curve, its `track_index` (see `Sights`).
+        residual: (E,) px. direction: (E, 2) the image direction it is taken along. pixel: (E, 2) where it should lie.
+        intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients, skew], 0 past a camera's own.
+        pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
+            moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
+        built: (E, BUILT) px per metre of what moves it on its target: of a point x, y and what a warp is made of; of a
+            segment its offset to the left; of an arc x, y and radius; 0 for the rest.
+    """
+
+    sights: Sights
+    poses: Array
+    bounds: Indices
+    sight: Indices
+    observation: Indices
+    view: Indices
+    is_curve: Mask
+    feature: Indices
+    residual: Array
+    direction: Array
+    pixel: Array
+    intrinsics: Array
+    pose: Array
+    place: Array
+    built: Array
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+    @property
+    def motion(self) -> Array:
+        return self.pose[:, 3:]
+
+    def of_sights(self, chosen: Mask) -> Mask:
+        """(E,) the equations of the chosen sights."""
+        return np.asarray(chosen[self.sight])
+
+    def slots(self, structure: Structure) -> Indices:
+        """(E, BUILT) which of the structure's offsets are those of `built`, -1 for none."""
+        slots = np.full((len(self), kernels.BUILT), -1)
+        if structure.names:
+            slots[~self.is_curve] = structure.point_slots[self.feature[~self.is_curve]]
+            slots[self.is_curve, :3] = structure.track_slots[self.feature[self.is_curve]]
+        return slots
+
+    def structure_columns(self, structure: Structure) -> Array:
+        """(E, Q) px per metre of each of the structure's numbers."""
+        columns, slots = np.zeros((len(self), len(structure.offsets))), self.slots(structure)
+        for k in range(slots.shape[1]):
+            moved = np.flatnonzero(slots[:, k] >= 0)
+            columns[moved, slots[moved, k]] += self.built[moved, k]
+        return columns if structure.mixing is None else columns @ structure.mixing
+
+
+def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
+    """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""
+    x, y = np.zeros(len(equations)), np.zeros(len(equations))
+    first, second = pairs_of(equations)
+    (a, b), (c, d) = equations.built[first, :2].T, equations.built[second, :2].T
+    p, q = values[first], values[second]
+    determinant = a * d - b * c
+    x[first] = x[second] = 1e3 * (d * p - b * q) / determinant
+    y[first] = y[second] = 1e3 * (a * q - c * p) / determinant
+    curves = np.flatnonzero(equations.is_curve)
+    x[curves] = 1e3 * values[curves] / np.hypot(*equations.built[curves, :2].T)  # it grows fastest across the curve
+    return x, y
+
+
+def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
+    """The two equations of each point, which follow one another."""
+    first, second = np.flatnonzero(~equations.is_curve).reshape(-1, 2).T
+    return first, second
+
+
+def whole_structure(targets: Mapping[str, Target]) -> Structure:
+    """Everything that could be built otherwise than it is drawn."""
+    every = {name: Tolerance(1.0, 1.0, 1.0 if target.bows else 0.0) for name, target in targets.items()}
+    return make_structure(targets, every)
+
+
+def write_equations(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
+    """The equations of every observation whose residual is finite.
+
+    Raises:
+        SolutionError: there is none.
+    """
+    x, y = there.points.T
+    sights = sights.used(np.isfinite(x + y), np.isfinite(there.curves))
+    if not len(sights):
+        raise SolutionError("the calibration can show none of the observations: give those it was made from")
+    return equations_of(observations, sights, estimate, there)
+
+
+def equations_of(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
+    """The equations of some sights, all of whose residuals are finite."""
+    poses = estimate.pose_stack(sights.keys)
+    parts = []
+    for numbers in map(sights.numbers, sights.cameras):
+        own = sights.take(numbers)
+        if len(own.point_rows):
+            parts.append(_of_points(observations, own, numbers, poses[numbers], estimate, there))
+        if len(own.curve_rows):
+            parts.append(_of_curves(observations, own, numbers, poses[numbers], estimate, there))
+    size = max(part["intrinsics"].shape[1] for part in parts)
+    for part in parts:
+        if missing := size - part["intrinsics"].shape[1]:
+            part["intrinsics"] = np.pad(part["intrinsics"], ((0, 0), (0, missing)))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts[1:] else parts[0]
+    if np.any(np.diff(columns["sight"]) < 0):
+        order = np.argsort(columns["sight"], kind="stable")
+        columns = {name: column[order] for name, column in columns.items()}
+    bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
+    columns["is_curve"] = columns["observation"] >= len(observations.points)
+    view = of_observations(columns["observation"], observations.points.view, observations.curves.view)
+    return Equations(sights=sights, poses=poses, bounds=bounds, view=view.astype(np.int64), **columns)
+
+
+def of_observations(numbers: Indices, points: AnyArray, curves: AnyArray) -> AnyArray:
+    """(E,) values of points (N,) and of curve observations (M,) by the number of the observation."""
+    is_curve = numbers >= len(points)
+    if not is_curve.any():
+        return points[numbers]
+    values = np.empty(len(numbers), dtype=points.dtype)
+    values[~is_curve], values[is_curve] = points[numbers[~is_curve]], curves[numbers[is_curve] - len(points)]
+    return values
+
+
+def _of_points(
+    observations: Observations, own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
+) -> dict[str, AnyArray]:
+    """The columns of the points of one camera's sights, of these numbers and poses."""
+    optics = camera_optics(estimate.cameras[own.keys[0].camera])
+    size = len(optics.intrinsics)
+    rows = np.empty((len(own.point_rows), 2, size + 6 + kernels.BUILT))
+    points = point_columns(own, estimate.structure)
+    bends = np.concatenate([bends_of(target) for target in observations.targets.values()])
+    points = points._replace(bends=bends[own.point_index])
+    kernels.point_rows(optics, poses, points, rows)
+    return {
+        "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
+        "observation": np.repeat(own.point_rows, 2),
+        "feature": np.repeat(own.point_index, 2),
+        "residual": there.points[own.point_rows].ravel(),
+        "direction": np.tile(np.eye(2), (len(rows), 1)),
+        "pixel": np.repeat(own.pixels + there.points[own.point_rows], 2, axis=0),
+        "intrinsics": rows[:, :, :size].reshape(-1, size),
+        "pose": rows[:, :, size : size + 6].reshape(-1, 6),
+        "place": np.repeat(points.places, 2, axis=0),
+        "built": rows[:, :, size + 6 :].reshape(-1, kernels.BUILT),
+    }
+
+
+def _of_curves(
+    observations: Observations, own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
+) -> dict[str, AnyArray]:
+    """The columns of their curve observations."""
+    optics = camera_optics(estimate.cameras[own.keys[0].camera])
+    size = len(optics.intrinsics)
+    curves = curve_columns(own, estimate.structure, there.feet[own.curve_rows])
+    rows, normals = np.empty((len(own.curve_rows), size + 6 + kernels.BUILT)), np.empty((len(own.curve_rows), 2))
+    kernels.curve_rows(optics, poses, curves, rows, normals)
+    distance = there.curves[own.curve_rows]
+    return {
+        "sight": numbers[_sight_of(own.curve_bounds)],
+        "observation": len(observations.points) + own.curve_rows,
+        "feature": own.track_index.astype(np.int64),
+        "residual": distance,
+        "direction": normals,
+        "pixel": own.curve_pixels + distance[:, None] * normals,
+        "intrinsics": rows[:, :size],
+        "pose": rows[:, size : size + 6],
+        "place": along_track(curves.tracks[own.track_index], own.on_arc, curves.feet),
+        "built": rows[:, size + 6 :],
+    }
+
+
+def _sight_of(bounds: Indices) -> Indices:
+    """Which sight each row belongs to."""
+    return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))

@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import take_types
 from ceres_cal.base.words import no_such
 from ceres_cal.observations.sights import Sights

@@ -14,7 +14,6 @@ from ceres_cal.report.document import Card, Chapter, Piece, Section, Table, Text
 from ceres_cal.report.grounds import is_against
 
 _MOST_CARDS, _MOST_ROWS = 8, 8
-_MOST_SAID = 3  # amounts that the sentence of a finding says itself
 _CHOSEN_BY = "the simplest within 1.75 standard errors of the least error; radial 2,3 wins ties"
 _MODEL_ERROR = (
     "the model is wrong by more than its noise: no covariance or standard deviation of this calibration includes that "
@@ -80,11 +79,12 @@ def _verdict(diagnosis: Diagnosis) -> list[str]:
 
 
 def _finding(finding: Finding) -> list[str]:
+    most_said = 3  # amounts that the sentence of a finding says itself
     lines = wrapped(finding.sentence, f"-> {finding.advice}")
     moved = plural(finding.observations, "observation")
     size = f"{finding.effect_px:.2f} px, {fixed(finding.effect_mm, 2)} mm; {moved}"
     lines.append(f"   {size}; false alarm: {chance(finding.log10_p)}")
-    if len(finding.amounts) > _MOST_SAID:
+    if len(finding.amounts) > most_said:
         lines += [f"   {one.name:28}{one.value:9.3f} ± {one.sd:.3f} {one.unit}" for one in finding.amounts]
     return lines
 

@@ -10,16 +10,14 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.words import counted, first_of, mm, sentence, short
+from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
-from ceres_cal.report.faults import FaultyMap
-from ceres_cal.report.quality import Quality
+from ceres_cal.report.quality import FaultyMap, Quality
 from ceres_cal.robust.as_built import words_of
-from ceres_cal.scene.heights import HEIGHTS_M
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
@@ -32,8 +30,6 @@ MOVED, MOVED_FAR = 1.0, 3.0
 """Standard deviations by which a named fault moves a result, from which on it is to be used with care, or not at all
 where more than GOOD_MM are left of it."""
 _UNJUDGED = "its residuals could not be judged"
-_MANY_OUTLIERS = 0.3
-_MOST_LINES = 6
 _ORDER = ("good", "care", "no")
 
 
@@ -109,6 +105,7 @@ def _largest_mm(findings: list[Finding]) -> float:
 
 def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     """Level and line of each."""
+    many_outliers = 0.3
     calibration, diagnosis = quality.calibration, quality.diagnosis
     if calibration.converged:
         yield "good", "The solve converged."
@@ -127,7 +124,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
             "dimensions.",
         )
     out = float(np.mean(diagnosis.table.outlier)) if diagnosis is not None and len(diagnosis.table) else 0.0
-    if out > _MANY_OUTLIERS:
+    if out > many_outliers:
         yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
     yield from _of_knowledge(quality)
     known = [conflict.words for conflict in calibration.conflicts]
@@ -167,6 +164,7 @@ def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
 
 
 def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
+    most_lines = 6
     if quality.uncertainty is None:
         return
     if quality.uncertainty.widening:
@@ -174,9 +172,9 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     # What they do to places is in the maps, and what to the picture, in what is said of it.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
-    yield from ((level, f"{sentence(words)}.") for words in weak[:_MOST_LINES])
-    if len(weak) > _MOST_LINES:
-        yield level, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
+    yield from ((level, f"{sentence(words)}.") for words in weak[:most_lines])
+    if len(weak) > most_lines:
+        yield level, f"{len(weak) - most_lines} more such directions: see the numbers."
     if not weak and not disputed(quality):
         yield "good", "Every number of the cameras and stations is known to 1 % or better."
     lost = quality.uncertainty.unknown_placements

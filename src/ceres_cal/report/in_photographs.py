@@ -10,12 +10,10 @@ from ceres_cal.base.words import counted, first_of, fixed
 from ceres_cal.calibration import Calibration
 from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
-from ceres_cal.report.pictures.files import jpeg_of_at_most, read_photograph
-from ceres_cal.report.pictures.frames import Frame, frames_of, marks_of, model_of
+from ceres_cal.report.pictures.frames import Frame, frames_of, jpeg_of_at_most, marks_of, model_of, read_photograph
 from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 
 MOST_PHOTOGRAPHS = 4
-_WIDEST_PX, _MOST_BYTES = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
 _READING = (
     "Magenta: lines, arcs and corners as the calibration predicts them; wide paint is drawn by its two edges. Look "
     "whether they lie on the paint. Residuals do not show a line without observations, another field, or a wrong label."
@@ -58,6 +56,7 @@ def _rms_px(material: Material, frame: Frame) -> float:
 
 
 def _picture(material: Material, photographs: FramePhotographs, frame: Frame, number: int) -> PhotoFigure:
+    widest_px, most_bytes = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
     calibration, path = material.calibration, photographs.paths[frame.name]
     model = model_of(calibration, frame)
     owner = calibration.estimate.stations[frame.station].camera
@@ -74,7 +73,7 @@ def _picture(material: Material, photographs: FramePhotographs, frame: Frame, nu
         f"photograph-{number}",
         f"Frame {frame.name}, {frame.station}",
         f"{' '.join(notes)} Residuals {fixed(_rms_px(material, frame), 2)} px rms.",
-        jpeg_of_at_most(drawn, _WIDEST_PX, _MOST_BYTES),
+        jpeg_of_at_most(drawn, widest_px, most_bytes),
     )
 
 

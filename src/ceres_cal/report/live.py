@@ -16,7 +16,7 @@ from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.material import paint_of
-from ceres_cal.report.pictures.advised import places_in_picture
+from ceres_cal.report.pictures.overlay import places_in_picture
 from ceres_cal.report.quality import Quality
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.words import mm, sentence, short
+from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, image_grid
 from ceres_cal.report import canvas
@@ -18,7 +18,6 @@ from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
-from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,10 +30,8 @@ _SERIES = (
     (1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 3.9, 4.7, 5.6, 6.8, 8.2),
 )
 """Rounder steps first; the finer ones where the others would leave too few lines."""
-_FEWEST_STEPS = 6
 _TABLE_SIZE = 7, 6
 _DOT, _DOT_ALPHA = 1.1, 0.45
-_MOST_LINES = 4
 LABEL = "95 % within, mm"
 
 
@@ -86,11 +83,12 @@ class MapDrawing:
 
 def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> None:
     """The colours of a map (Y, X) over x and y, and lines of equal amounts with what they are."""
+    most_lines = 4
     scale.fill(axes, *grid, values)
     known = np.where(np.isinf(values), np.nan, values)
     if np.isfinite(known).any():
         levels = levels_of(known)
-        few = levels[1 :: -(-len(levels) // _MOST_LINES)]
+        few = levels[1 :: -(-len(levels) // most_lines)]
         lines = axes.contour(*grid, known, few, colors=[scale.ink(level) for level in few], linewidths=0.4)
         for text in axes.clabel(lines, fmt=short, fontsize=6.5, colors=scale.ink(0.0)):
             text.set_bbox({"facecolor": COLORS[0], "edgecolor": "none", "pad": 0.6, "alpha": 0.75})
@@ -98,6 +96,7 @@ def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> 
 
 def levels_of(*maps: Array) -> Array:
     """Lines of equal amounts: round numbers around everything that the maps (Y, X) show, at least three."""
+    fewest_steps = 6
     values = np.concatenate([one[np.isfinite(one)] for one in maps])
     if not len(values):
         return np.array([1.0, 2.0, 5.0])
@@ -107,7 +106,7 @@ def levels_of(*maps: Array) -> Array:
         steps = np.array([s * 10.0**d for d in decades for s in series])
         first = max(int(np.searchsorted(steps, low, side="right")) - 1, 0)
         levels = steps[first : max(int(np.searchsorted(steps, high)), first + 2) + 1]
-        if len(levels) > _FEWEST_STEPS:
+        if len(levels) > fewest_steps:
             break
     return levels
 

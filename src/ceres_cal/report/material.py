@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.cached import cached_property
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis
@@ -23,12 +23,6 @@ from ceres_cal.report.quality import Quality, Seam
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.targets import Target
-
-_CURVE_PIECES = 95
-_FINER = 2  # than the maps' own grid, where that is quick
-_BORDER_STEPS = 60
-_MOST_SEAMS = 6
-_MOST_DOTS = 2000  # observations drawn into one map
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +75,18 @@ class Material(Quality):
         return {name: tuple(self._finer(one) for one in maps) for name, maps in self.maps.items()}
 
     def _finer(self, one: FieldMap) -> FieldMap:
+        finer = 2  # than the maps' own grid, where that is quick
         uncertainty = self.calibration.uncertainty
         if self.observations.stations[one.station] in uncertainty.posterior.followed:  # each place takes long there
             return one
-        x, y = (np.linspace(axis[0], axis[-1], _FINER * (len(axis) - 1) + 1) for axis in (one.x_m, one.y_m))
+        x, y = (np.linspace(axis[0], axis[-1], finer * (len(axis) - 1) + 1) for axis in (one.x_m, one.y_m))
         return uncertainty.map_sd_mm(one.station, one.height_m, x, y)
 
     @cached_property
     def seams(self) -> tuple[Seam, ...]:
         """At most six; none of new data, which say nothing of how well the others agree."""
-        return () if self.diagnosis.new_data else tuple(islice(self.each_seam(), _MOST_SEAMS))
+        most_seams = 6
+        return () if self.diagnosis.new_data else tuple(islice(self.each_seam(), most_seams))
 
     @cached_property
     def closed_form(self) -> ClosedForm | str:
@@ -99,10 +95,12 @@ class Material(Quality):
             return "these observations are others than those the calibration was made from"
         if not self.calibration.rounds:
             return "this calibration is the closed form itself"
-        try:
-            calibration = calibrate(self.observations, replace(self.calibration.options, closed_form_only=True))
-        except CalibrationError as error:  # reads: "..." in place of the paper's method
-            return str(error)
+        options = replace(self.calibration.options, closed_form_only=True)
+        calibration = attempt(
+            lambda: calibrate(self.observations, options)
+        )  # reads: "..." in place of the paper's method
+        if isinstance(calibration, CalibrationError):
+            return str(calibration)
         remaining = residuals(self.observations, gather_sights(self.observations), calibration.estimate)
         lengths = np.concatenate([np.linalg.norm(remaining.points, axis=1), np.abs(remaining.curves)])
         return ClosedForm(calibration, lengths)
@@ -114,22 +112,25 @@ class Material(Quality):
 
     def observed(self, station: str) -> Array:
         """(N, 2) px: where observations of a station lie that took part, evenly thinned where they are many."""
+        most_dots = 2000  # observations drawn into one map
         table = self.diagnosis.table
         seen = np.array([view["station"] == station for view in table.views])
         pixels = table.pixel[seen[table.view] & table.inlier]
-        return np.asarray(pixels[:: -(-len(pixels) // _MOST_DOTS) or 1])
+        return np.asarray(pixels[:: -(-len(pixels) // most_dots) or 1])
 
 
 def paint_of(targets: Iterable[Target]) -> Iterator[Array]:
     """Each curve of targets that lie in the world as a polyline (S, 3) m."""
+    curve_pieces = 95
     for target in targets:
-        yield from (curve_points(curve, 0, _CURVE_PIECES) for curve in target.curves.values())
+        yield from (curve_points(curve, 0, curve_pieces) for curve in target.curves.values())
 
 
 def image_border(camera: Camera, height_m: float) -> Array:
     """(B, 2) m: the border of a posed camera's image on a plane, NaN where it does not meet that."""
+    border_steps = 60
     width, height = camera.image_size
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
-    steps = np.linspace(0.0, 1.0, _BORDER_STEPS)[:, None]
+    steps = np.linspace(0.0, 1.0, border_steps)[:, None]
     sides = [a + steps * (b - a) for a, b in pairwise(corners)]
     return camera.locate(np.concatenate(sides), height_m)

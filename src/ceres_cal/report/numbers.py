@@ -33,10 +33,7 @@ from ceres_cal.scene.camera import Camera
 
 _HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "verdict")
 _MOST_FEATURES, _MOST_OFFSETS = 6, 40
-_MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
 _ANGLES = ("alpha, the paper's", "beta, the paper's", "gamma, the paper's", "tilt from straight down")
-_TURN = 1e-6  # rad
-_CLEARLY = 3.0  # standard deviations from what is usual of cameras: nearer it is not listed among the first numbers
 _PHI_FROM = {
     "fixed": "held",
     "views": "started from the views",
@@ -116,16 +113,17 @@ def stopped(calibration: Calibration) -> Section:
 
 def warnings(calibration: Calibration) -> Iterator[str]:
     """What to know of it, and what may be wrong with the observations."""
+    many_outliers, large_scale = 0.3, 4.0  # from where on a warning is due
     yield from calibration.warnings
     if not calibration.rounds:  # nothing was solved
         return
     if not calibration.converged:
         yield "the solve did not converge: raise --max-iterations"
     out = len(calibration.outliers)
-    if out > _MANY_OUTLIERS * (calibration.fit.points + calibration.fit.curves + out):
+    if out > many_outliers * (calibration.fit.points + calibration.fit.curves + out):
         yield "many observations were taken out: check labels, target dimensions and the lens"
     scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
-    if scale > _LARGE_SCALE:
+    if scale > large_scale:
         yield (
             f"the residuals are {scale:.0f} times the stated sigmas: the lens may not suit the camera, or labels and "
             "target dimensions may be wrong"
@@ -153,6 +151,7 @@ def _percent(share: float | None) -> str:
 
 
 def _camera(quality: Quality, name: str) -> Section:
+    clearly = 3.0  # standard deviations from what is usual of cameras: nearer it is not listed among the first numbers
     camera, options = quality.calibration.cameras[name], quality.calibration.options
     (width, height), (cx, cy) = camera.image_size, camera.principal_point
     units = {"phi": "px", "cx": "px", "cy": "px"}
@@ -169,7 +168,7 @@ def _camera(quality: Quality, name: str) -> Section:
 
     def differs(one: str, usual: float) -> bool:
         verdict = known(one)
-        return abs(values[one] - usual) > (_CLEARLY * verdict.sd if verdict else 0.0)
+        return abs(values[one] - usual) > (clearly * verdict.sd if verdict else 0.0)
 
     started = quality.calibration.phi_from.get(name, "")
     freed = {"aspect": options.free_aspect, "skew": options.free_skew}
@@ -282,13 +281,14 @@ def _angles(quality: Quality, name: str, camera: Camera) -> Iterator[_Row]:
 
 def _angle_sds(rotation: Array, covariance: Array, sd: Array) -> Array:
     """(4, n) degrees: of the angles, by the correlation of the three turns and each column of their sd (3, n) rad."""
+    turn = 1e-6  # rad
     own = np.sqrt(np.diagonal(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = covariance / own[:, None] / own
     slopes = np.stack(
-        [(_angles_deg(rotation_exp(_TURN * axis) @ rotation) - _angles_deg(rotation)) / _TURN for axis in np.eye(3)], 1
+        [(_angles_deg(rotation_exp(turn * axis) @ rotation) - _angles_deg(rotation)) / turn for axis in np.eye(3)], 1
     )
-    slopes = (slopes + 180.0 / _TURN) % (360.0 / _TURN) - 180.0 / _TURN  # a turn past 180 degrees is a small one
+    slopes = (slopes + 180.0 / turn) % (360.0 / turn) - 180.0 / turn  # a turn past 180 degrees is a small one
     with np.errstate(invalid="ignore"):  # of what is unknown; an angle that does not depend on it is unknown, too
         spread = np.stack([np.einsum("ai,ij,aj->a", slopes * s, correlation, slopes * s) for s in sd.T], 1)
     return np.where(np.isfinite(spread), np.sqrt(np.maximum(spread, 0.0)), np.inf)

@@ -28,8 +28,6 @@ from ceres_cal.report.document import (
     Tiles,
 )
 
-_SHORT = 14  # letters that stay on one line
-
 
 @singledispatch
 def html(piece: Any) -> str:
@@ -50,9 +48,11 @@ def _(piece: BulletList) -> str:
 
 @html.register
 def _(piece: Table) -> str:
+    short = 14  # letters that stay on one line
+
     def of_row(row: Sequence[str]) -> str:
         cells = (
-            f'<td{_class("short" if len(text) <= _SHORT else "")} data-head="{escape(name)}">{escape(text)}</td>'
+            f'<td{_class("short" if len(text) <= short else "")} data-head="{escape(name)}">{escape(text)}</td>'
             for name, text in zip(piece.head[1:], row[1:], strict=True)
         )
         return f'<tr><th scope="row">{escape(row[0])}</th>{"".join(cells)}</tr>'

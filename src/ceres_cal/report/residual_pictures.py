@@ -24,19 +24,13 @@ from ceres_cal.scene.camera import Camera
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_DRAWN = 5000  # strokes of one page, shared among its cameras
-_MEAN_GRID = 16  # cells along the image's longer side
-_FEWEST = 4  # observations of a cell
-_NOT_NOISE = 13.8  # squared length of a mean in its sigmas that noise reaches once in a thousand
-_VAGUE = 0.3  # of the residuals' reach: a ring's mean that is less sure than that is in the table alone
-_TYPICAL = 0.015  # of the image's width: what the median is enlarged to
-_ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _MOST_FRAMES_NAMED, _MOST_BARS = 24, 12
 
 
 def stride(material: Material, count: int) -> int:
     """Every how manieth of so many rows is drawn, so that they are few enough for the page."""
-    most = max(_MOST_DRAWN // len(material.observations.cameras), 200)
+    most_drawn = 5000  # strokes of one page, shared among its cameras
+    most = max(most_drawn // len(material.observations.cameras), 200)
     return max(-(-count // most), 1)
 
 
@@ -76,8 +70,10 @@ def vectors(material: Material, name: str) -> Figure:
 
 def _enlarged(table: ResidualTable, inliers: Indices, size: tuple[int, int]) -> int:
     """How many times strokes are enlarged, a round number."""
-    wanted = _TYPICAL * size[0] / max(_typical_px(table, inliers), 1e-12)
-    return max((e for e in _ENLARGED if e <= wanted), default=1)
+    enlarged = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+    typical = 0.015  # of the image's width: what the median is enlarged to
+    wanted = typical * size[0] / max(_typical_px(table, inliers), 1e-12)
+    return max((e for e in enlarged if e <= wanted), default=1)
 
 
 def _typical_px(table: ResidualTable, inliers: Indices) -> float:
@@ -139,8 +135,11 @@ def significant_means(table: ResidualTable, rows: Indices, size: tuple[int, int]
 
     A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
     """
+    not_noise = 13.8  # squared length of a mean in its sigmas that noise reaches once in a thousand
+    fewest = 4  # observations of a cell
+    mean_grid = 16  # cells along the image's longer side
     width, height = size
-    cell = max(width, height) / _MEAN_GRID
+    cell = max(width, height) / mean_grid
     columns, lines = int(np.ceil(width / cell)), int(np.ceil(height / cell))
     pixel, residual = table.pixel[rows], table.residual_px[rows]
     column = np.clip((pixel[:, 0] / cell).astype(int), 0, columns - 1)
@@ -155,9 +154,9 @@ def significant_means(table: ResidualTable, rows: Indices, size: tuple[int, int]
     np.add.at(moved, region, weight[:, None] * residual)
     np.add.at(centre, region, pixel)
     sizes = np.linalg.eigvalsh(normal)
-    good = (count >= _FEWEST) & (sizes[:, 0] > 0.1 * sizes[:, 1])
+    good = (count >= fewest) & (sizes[:, 0] > 0.1 * sizes[:, 1])
     places, means = centre[good] / count[good, None], np.linalg.solve(normal[good], moved[good, :, None])[:, :, 0]
-    significant = np.sum(means * moved[good], axis=1) > _NOT_NOISE
+    significant = np.sum(means * moved[good], axis=1) > not_noise
     return places[significant], means[significant], len(places)
 
 
@@ -196,6 +195,7 @@ def _region_table(summary: Summary, camera: str) -> Table:
 
 def against_radius(material: Material, name: str) -> Figure:
     """Residuals away from the principal point against the radius, with their trend."""
+    vague = 0.3  # of the residuals' reach: a ring's mean that is less sure than that is in the table alone
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     trend = next(trend for trend in material.diagnosis.summaries.trends if trend.camera == name)
     radius, outward = _outward(table, np.flatnonzero(material.of_camera(name) & table.inlier), camera)
@@ -203,7 +203,7 @@ def against_radius(material: Material, name: str) -> Figure:
     drawn = known[:: stride(material, len(known))]
     middle = 0.5 * (trend.radius_px[1:] + trend.radius_px[:-1])
     spread = float(np.quantile(np.abs(outward[known]), 0.995)) if len(known) else 1.0
-    mean_px = np.where(trend.sd_px < _VAGUE * spread, trend.outward_px, np.nan)  # else it hides the others
+    mean_px = np.where(trend.sd_px < vague * spread, trend.outward_px, np.nan)  # else it hides the others
     reach = 1.15 * max(spread, float(np.nanmax(np.abs(mean_px), initial=0.0)), 1e-9)
 
     def draw(axes: Axes, width_in: float) -> None:

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 COLORS = ("#eef5fa", "#d9e8f3", "#bfd8ea", "#a3c6e0", "#86b2d4", "#6a9dc7", "#4f88b8", "#a05c08", "#7e3f06", "#5e1c0a")
 _ON_LIGHT, _ON_DARK = "#26303a", "#eef5fb"
 """What is drawn upon them, in a dark window too."""
-_DARK = 7  # of the colours, from which on
 _UNKNOWN = "#fcede4"
-_ENDLESS = 1e300
 
 
 @dataclass(frozen=True)
@@ -35,17 +33,19 @@ class Scale:
 
     def fill(self, axes: Axes, x: Array, y: Array, values: Array) -> None:
         """Values (Y, X) over a grid: NaN stays open, infinity is hatched."""
+        endless = 1e300
         unknown = np.isinf(values)
         if unknown.any():
             axes.contourf(x, y, unknown.astype(float), [0.5, 1.5], colors=[_UNKNOWN], hatches=["////"])
         known = np.where(unknown, np.nan, values)
         if np.isfinite(known).any():
-            axes.contourf(x, y, known, [0.0, *self.borders, _ENDLESS], colors=COLORS)
+            axes.contourf(x, y, known, [0.0, *self.borders, endless], colors=COLORS)
 
     def ink(self, values: Array | float) -> str:
         """The colour of what is drawn where values are about these."""
+        dark = 7  # of the colours, from which on
         known = np.ravel(values)[np.isfinite(np.ravel(values))]
-        return _ON_DARK if len(known) and np.median(known) > self.borders[_DARK - 1] else _ON_LIGHT
+        return _ON_DARK if len(known) and np.median(known) > self.borders[dark - 1] else _ON_LIGHT
 
     def bar(self, axes: Axes, label: str) -> None:
         """The whole scale beneath the axes, whatever of it the picture needs."""

@@ -11,15 +11,13 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.paper import Disc, Paper
+from ceres_cal.scene.targets.target import Disc, Paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.patches import PathPatch
 
-_INCH_M = 0.0254
-_MOST_M = 14400 / 72.0 * _INCH_M  # of a page, by PDF's own limit
 _MARGIN_M, _FOOT_M = 0.008, 0.022
 
 
@@ -37,14 +35,16 @@ def sheet_pdf(target: Target, title: str) -> bytes:
 
 
 def _page(paper: Paper, title: str) -> Figure:
+    inch_m = 0.0254
+    most_m = 14400 / 72.0 * inch_m  # of a page, by PDF's own limit
     from matplotlib.figure import Figure
 
     low, high = np.array(paper.low_m), np.array(paper.high_m)
     width, height = high - low
     page = np.array([width + 2.0 * _MARGIN_M, height + 2.0 * _MARGIN_M + _FOOT_M])
-    if page.max() > _MOST_M:
-        raise InputError(f"a sheet of {width:.2f} x {height:.2f} m is too large for one page, at most {_MOST_M:.2f} m")
-    figure = Figure(figsize=tuple(page / _INCH_M))
+    if page.max() > most_m:
+        raise InputError(f"a sheet of {width:.2f} x {height:.2f} m is too large for one page, at most {most_m:.2f} m")
+    figure = Figure(figsize=tuple(page / inch_m))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, page[0]), ylim=(0.0, page[1]))  # metres from the bottom left
     axes.set_axis_off()

@@ -20,11 +20,7 @@ from ceres_cal.scene.camera import Camera
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_NUMBERS = 24  # of a correlation picture
-_MOST_PAIRS = 30
 _STEPS, _TABLE_STEPS = 120, 10
-_WIDEST = 2.5  # r' over r: what lies beyond is nearly at a right angle to the axis
-_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
 
 
 # ---- correlation ----------------------------------------------------------------------------------------------------
@@ -32,11 +28,12 @@ _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
 
 def correlation(material: Material) -> Figure | None:
     """Correlation of the shared numbers, cameras and stations first; None where there is no covariance."""
+    most_numbers = 24  # of a correlation picture
     posterior = material.calibration.posterior
     if posterior is None:
         return None
     order = sorted(range(len(posterior.keys)), key=lambda i: posterior.keys[i].kind not in ("camera", "station"))
-    chosen = np.array(order[:_MOST_NUMBERS])
+    chosen = np.array(order[:most_numbers])
     keys = [posterior.keys[i] for i in chosen]
     sd = np.sqrt(np.diagonal(posterior.covariance)[chosen])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -89,9 +86,10 @@ def label(key: Key, others: Sequence[Key]) -> str:
 
 
 def _pairs(matrix: Array, labels: Sequence[str]) -> Table:
+    most_pairs = 30
     first, second = np.triu_indices(len(labels), 1)
     strength = matrix[first, second]
-    order = np.argsort(-np.abs(np.nan_to_num(strength)))[:_MOST_PAIRS]
+    order = np.argsort(-np.abs(np.nan_to_num(strength)))[:most_pairs]
     return Table(
         ("strongest pairs", "and", "correlation"),
         tuple((labels[first[i]], labels[second[i]], fixed(float(strength[i]), 4, "+")) for i in order),
@@ -166,9 +164,10 @@ def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
 
 
 def _comparison(bundle: Calibration, closed: Calibration, curves: dict[str, Array], shares: Array) -> Table:
+    quantiles = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
     rows = [
         (f"{q:.0%} of residuals below, px", *(fixed(float(np.interp(q, shares, c)), 3) for c in curves.values()))
-        for q in _QUANTILES
+        for q in quantiles
     ]
     for name, camera in bundle.cameras.items():
         other = closed.cameras[name]
@@ -188,10 +187,11 @@ def ideal_radii(camera: Camera, radii: Array) -> Array:
 
     NaN past the lens's monotone radius, and from 90 degrees on.
     """
+    widest = 2.5  # r' over r: what lies beyond is nearly at a right angle to the axis
     rays = camera.lens.undistort(np.column_stack([radii, 0.0 * radii]), camera.phi)
     with np.errstate(divide="ignore", invalid="ignore"):
         ideal = camera.phi * np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2]
-        return np.where((rays[:, 2] > 0.0) & (ideal <= _WIDEST * np.maximum(radii, 1.0)), ideal, np.nan)
+        return np.where((rays[:, 2] > 0.0) & (ideal <= widest * np.maximum(radii, 1.0)), ideal, np.nan)
 
 
 def draw_distortion(axes: Axes, camera: Camera, reach: float = np.inf) -> None:

@@ -7,7 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.words import DASH, at_precision, counted, fixed, metres, mm, plural, sentence, short, two_digits
+from ceres_cal.base.words import (
+    DASH,
+    HEIGHTS_M,
+    at_height,
+    at_precision,
+    counted,
+    fixed,
+    metres,
+    mm,
+    plural,
+    sentence,
+    short,
+    two_digits,
+)
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.seam import RigPair
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
@@ -27,7 +40,6 @@ from ceres_cal.report.grounds import (
 )
 from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
 from ceres_cal.report.quality import Quality, Seam
-from ceres_cal.scene.heights import HEIGHTS_M, at_height
 
 if TYPE_CHECKING:
     from ceres_cal.report.material import Material

@@ -17,7 +17,6 @@ from ceres_cal.report.residual_pictures import frame_image, lines_in_image, numb
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_CELLS = 16  # along the longer side of the image
 _NEAR = 0.06  # of the image's width: a stretch of a line is supported where an observation of it lies as near
 _FILLED, _EMPTY = "#d9e8f3", "#fcede4"
 
@@ -73,7 +72,8 @@ def support(material: Material, name: str) -> Figure:
 
 def _counts(pixels: Array, size: tuple[int, int]) -> tuple[Array, tuple[Array, Array]]:
     """How many observations (Y, X) lie in each part of an image, and the parts' ends."""
-    cell = max(size) / _CELLS
+    cells = 16  # along the longer side of the image
+    cell = max(size) / cells
     ends = [np.linspace(-0.5, side - 0.5, round(side / cell) + 1) for side in size]
     counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], ends)
     return counts.T, (ends[0], ends[1])

@@ -15,7 +15,7 @@ together tell, are. The posterior has them under their sigmas like any tolerance
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,17 +28,39 @@ from ceres_cal.effects.evidence import AS_BUILT, LIKELY, RepeatedAmounts, agreem
 from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.equations import Equations, equations_of, whole_structure
 from ceres_cal.problem.parameters import Estimate, Options, unit_px
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
-from ceres_cal.problem.structure import Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn
+from ceres_cal.problem.residuals import Equations, equations_of, whole_structure
+from ceres_cal.problem.structure import EXACT, Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn
 from ceres_cal.robust.competing import Explanation, Solver, compete
 from ceres_cal.robust.robust import RobustSolution, judge_at, solve_robustly
 from ceres_cal.scene.targets import Target
 
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """How targets are likely built.
+
+    Attributes:
+        every: the kinds of features that are not where they are drawn. whole: their likeliest offsets.
+    """
+
+    every: tuple[AsBuilt, ...] = ()
+    whole: Structure = EXACT
+
+    def held(self, sights: Sights, observations: Observations) -> Sights:
+        """The sights of targets that are drawn as they are built."""
+        if not self.every:
+            return sights
+        own = make_structure(observations.targets, tolerances_of(self.every))
+        return own.carrying(self.whole).built_into(sights)
+
+
+AS_DRAWN = Built()
 
 
 def solve_as_built(
@@ -47,28 +69,38 @@ def solve_as_built(
     end: RobustSolution,
     explanations: tuple[Explanation, ...],
     solver: Solver,
+    built: Built,
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
     """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
 
     Args:
-        problem: of all the observations. end: of its rounds, without what the explanations took out. solver: of some
-            of the observations, see `compete`.
+        problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
+            drawn as `built`. solver: of some of the observations, see `compete`.
     """
-    every: tuple[AsBuilt, ...] = ()
-    now, whole = estimate_as_built(problem, observations, end)
-    if not now:
-        return end, problem, explanations, ()
-    stated, options, rounds = end.solution.estimate.structure, problem.options, 0
-    while now and not _alike(now, every) and rounds < _MOST_ROUNDS:
-        every, rounds = now, rounds + 1
-        held = _held(problem, make_structure(observations.targets, tolerances_of(every)).carrying(whole))
-        start = replace(end.solution.estimate, structure=stated)
-        end = solve_robustly(taking_part(held, observations, explanations), observations, start, is_near=True)
-        tolerances = {**options.tolerances, **tolerances_of(every)}
+    options, stated = problem.options, end.solution.estimate.structure
+
+    def solved(there: Built) -> RobustSolution:
+        held = taking_part(_held(problem, there, observations), observations, explanations)
+        return solve_robustly(held, observations, replace(end.solution.estimate, structure=stated), is_near=True)
+
+    def freed(there: Built) -> Structure:
+        tolerances = {**options.tolerances, **tolerances_of(there.every)}
         structure = make_structure(observations.targets, tolerances, options.dimensions)
-        structure = structure.carrying(whole, end.solution.estimate.structure)
-        now, whole = estimate_as_built(problem, observations, _freed(end, problem, structure))
-    end, explanations = compete(held, observations, end, solver)
+        return structure.carrying(there.whole, end.solution.estimate.structure)
+
+    now = estimate_as_built(problem, observations, _freed(end, problem, freed(built)) if built.every else end)
+    if not now.every:
+        if built.every:
+            end, explanations = compete(problem, observations, solved(now), solver)
+        return end, problem, explanations, ()
+    before, rounds = built, 0
+    while now.every and not (rounds and _alike(now.every, before.every)) and rounds < _MOST_ROUNDS:
+        before, rounds = now, rounds + 1
+        end = solved(before)
+        now = estimate_as_built(problem, observations, _freed(end, problem, freed(before)))
+    every, structure = before.every, freed(before)
+    if not _alike(every, built.every):
+        end, explanations = compete(_held(problem, before, observations), observations, end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
     estimate = replace(end.solution.estimate, structure=structure)
@@ -97,9 +129,9 @@ def words_of(every: Sequence[AsBuilt]) -> tuple[str, ...]:
     return tuple(f"{target!r} is not as drawn: {words}; solved for" for target, words in said.items())
 
 
-def _held(problem: Problem, built: Structure) -> Problem:
+def _held(problem: Problem, built: Built, observations: Observations) -> Problem:
     """The problem of targets that are drawn as they are built."""
-    return replace(problem, sights=built.built_into(problem.sights))
+    return replace(problem, sights=built.held(problem.sights, observations))
 
 
 def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> RobustSolution:
@@ -201,9 +233,7 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
 _REPEATS = 2.0
 
 
-def estimate_as_built(
-    problem: Problem, observations: Observations, end: RobustSolution
-) -> tuple[tuple[AsBuilt, ...], Structure]:
+def estimate_as_built(problem: Problem, observations: Observations, end: RobustSolution) -> Built:
     """The kinds of features that are likely not where they are drawn, of targets without a stated tolerance; and the
     whole structure with their likeliest offsets, and those of stated tolerances as they are.
 
@@ -217,14 +247,14 @@ def estimate_as_built(
     as_stated = structure.carrying(stated)
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
-        return (), as_stated
+        return Built((), as_stated)
     sights = _some(end.problem.sights, most_screened)
     equations, weights = _equations(stated, observations, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
     # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved.
     if not any(agreement(scores[:, numbers]) > _REPEATS for numbers in kinds.values()):
-        return (), as_stated
+        return Built((), as_stated)
     equations, weights = _equations(stated, observations, end, _some(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
@@ -234,7 +264,7 @@ def estimate_as_built(
     sigmas = np.repeat([one.sigma_m for one in every], [len(own) for own in numbers])
     values = as_stated.values.copy()
     values[moved] = repeats.amounts(moved, sigmas)[0]
-    return every, structure.with_values(values)
+    return Built(every, structure.with_values(values))
 
 
 def _some(sights: Sights, most: int) -> Sights:

@@ -17,17 +17,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Indices, Mask, medians_known
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, attempt, or_none
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.evidence import Offsets, measure_offsets
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.conflicts import without_suspicious
 from ceres_cal.robust.groups import (
     FEWEST,
@@ -101,9 +100,6 @@ class Explanation:
         )
 
 
-# Log Bayes factor, by the linear model, from which on a group is looked at by a solve without it: one in thirty sound
-# scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above -4.7.
-_SUSPECT = -4.4
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
@@ -147,22 +143,22 @@ def _freed(every: Subproblem, solver: Solver) -> Subproblem:
     freed = without_suspicious(every.problem, every.observations, every.end)
     if freed is every.problem:
         return every
-    try:
-        end = solver(freed, every)
-    except CalibrationError:  # quiet: they are competed with as stated; what contradicts them is tested afterwards
+    # quiet: they are competed with as stated; what contradicts them is tested afterwards
+    end = attempt(lambda: solver(freed, every))
+    if isinstance(end, CalibrationError) or end.solution.failed:
         return every
-    return every if end.solution.failed else replace(every, problem=freed, end=end)
+    return replace(every, problem=freed, end=end)
 
 
 def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanation:
     """With the other estimate under all that is stated: what moves without that is no doubt about a group."""
     if not one.is_doubtful:
         return one
-    try:
-        other = part.end if one.is_taken else solver(part.without(one.rows), part)
-    except CalibrationError:  # quiet: without that solve the doubt stays as large as it was
+    # quiet: without that solve the doubt stays as large as it was
+    other = part.end if one.is_taken else attempt(lambda: solver(part.without(one.rows), part))
+    if isinstance(other, CalibrationError) or other.solution.failed:
         return one
-    return one if other.solution.failed else replace(one, other=other.solution.estimate)
+    return replace(one, other=other.solution.estimate)
 
 
 _Suspects = tuple[ObservationGroups, tuple[int, ...]]
@@ -246,6 +242,10 @@ class _Competition:
 
     def _by_offsets(self, end: RobustSolution, groups: ObservationGroups) -> Iterator[tuple[int, ...]]:
         """Those that the offsets speak against: single ones, and the pair of most evidence."""
+        # Log Bayes factor, by the linear model, from which on a group is looked at by a solve without it: one in thirty
+        # sound scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above
+        # -4.7.
+        suspect = -4.4
         if isinstance(groups, ViewGroups):
             above = excess(self._some.observations, groups, end, self._taking_part)
             if np.max(above) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(above)), 1))):
@@ -256,7 +256,7 @@ class _Competition:
         none, each = offsets.log_evidence(), offsets.log_evidence_with_each()
         first = int(np.argmax(each))
         for number in np.argsort(-each)[:2]:
-            if each[number] - none > _SUSPECT + np.log(1.0 - offsets.prior.absent):
+            if each[number] - none > suspect + np.log(1.0 - offsets.prior.absent):
                 yield (int(chosen[number]),)
         both = offsets.log_evidence_with_each((first,))
         second = int(np.argmax(both))
@@ -291,16 +291,14 @@ class _Competition:
         least = min(one.log_odds for one in explanations)
         return _Trial(suspects, without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
 
+    @or_none  # quiet: what determines nothing without the suspects is no explanation
     def _without(self, groups: ObservationGroups, numbers: tuple[int, ...]) -> RobustSolution | None:
         """The end of a solve without some groups; None where the others determine nothing."""
         gone = groups.among(np.array(numbers))
-        try:
-            end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
-            every = self._some.problem
-            there = residuals(self._some.observations, every.sights, end.solution.estimate)
-            require_fits(replace(end, residuals=there), every)
-        except CalibrationError:  # quiet: what determines nothing without the suspects is no explanation
-            return None
+        end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
+        every = self._some.problem
+        there = residuals(self._some.observations, every.sights, end.solution.estimate)
+        require_fits(replace(end, residuals=there), every)
         if isinstance(groups, FeatureGroups):
             return end
         alone = self._some.of_rows(gone).weighted(replace(end.problem.weighting, loss="cauchy"))

@@ -21,9 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.numerical import numerical
+from ceres_cal.base.arrays import Array, numerical
+from ceres_cal.base.errors import CalibrationError, attempt, or_none
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.evidence import FEATURE_ASIDE
@@ -179,7 +178,6 @@ def log_probability(squared: float, rest: Rest) -> float:
 
 # Probability of a linear picture from which on it is worth another solve: 2.2 sigma, where one in twenty is wrong.
 _SUSPICIOUS = 0.028
-_DOUBTFUL = 0.05  # probability that a statement is wrong, from which on both explanations are named
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
@@ -295,14 +293,12 @@ def _wrong(squared: float) -> float:
     return float(np.sum(others) / (right + np.sum(others)))
 
 
+@or_none  # quiet: the linear test decides, and the answer stays
 def _solved(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
 ) -> RobustSolution | None:
     """The problem solved from where another one ended; None where it cannot be."""
-    try:
-        after = solve_robustly(problem, observations, end.solution.estimate, usual)
-    except CalibrationError:  # quiet: the linear test decides, and the answer stays
-        return None
+    after = solve_robustly(problem, observations, end.solution.estimate, usual)
     return None if after.solution.failed else after
 
 
@@ -333,6 +329,7 @@ class _ForwardSelection:
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
+        doubtful = 0.05  # probability that a statement is wrong, from which on both explanations are named
         tests = [worst_test(one, linear_rest(one, self.end)) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
         if number < 0 or tests[number].log_p > np.log(_SUSPICIOUS):
@@ -347,7 +344,7 @@ class _ForwardSelection:
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
             likely = _wrong(test.squared)
-            if after is not None and suspect.kind == "prior" and likely > _DOUBTFUL:
+            if after is not None and suspect.kind == "prior" and likely > doubtful:
                 shift = difference(after.solution.estimate, self.end.solution.estimate, self._first.shared.keys)
                 words = doubted(suspect, test, len(self.every) == 1, likely)
                 self.doubts.append(Doubt(suspect.keys, likely, shift, words))
@@ -380,11 +377,11 @@ class _ForwardSelection:
         test = worst_test(statement, rest_at(statement, after, self.observations))
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
-        try:
-            least, most = solve(without, rest.estimate), solve(bound, self.end.solution.estimate)
-        except CalibrationError:  # quiet: the linear test decides
+        starts = (without, rest.estimate), (bound, self.end.solution.estimate)
+        ends = attempt(lambda: [solve(*start).cost for start in starts])  # quiet: the linear test decides
+        if isinstance(ends, CalibrationError):
             return test
-        rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
+        rise = max(2.0 * (ends[1] - ends[0]), 0.0)  # of exact observations it is rounding
         if rise >= alone.squared or len(statement.priors) > 1:
             return test
         share = rise / alone.squared

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
@@ -23,10 +23,10 @@ from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
-from ceres_cal.problem.equations import write_equations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
+from ceres_cal.problem.residuals import write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
 _MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move

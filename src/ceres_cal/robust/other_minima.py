@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import or_none
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Solution, placement_costs, solve
 from ceres_cal.problem.information import Information
@@ -240,17 +240,15 @@ def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float
                 break
 
 
+@or_none  # quiet: nothing is seen from there, so no minimum is
 def solved_soon(problem: Problem, start: Estimate, *, is_near: bool = True) -> Solution | None:
     """Where a short solve ends; None where it finds nothing. Along a flat valley the solver creeps for hundreds of
     iterations that change nothing here.
     """
     near = 1e-6  # of a variance: how nearly an end costs the least; by a thousandth of a standard deviation it is off
     short = replace(problem.options, max_iterations=min(30, problem.options.max_iterations))
-    try:
-        precision = near / max(problem.equations, 1)
-        solution = solve(replace(problem, options=short), start, is_near=is_near, precision=precision)
-    except CalibrationError:  # quiet: nothing is seen from there, so no minimum is
-        return None
+    precision = near / max(problem.equations, 1)
+    solution = solve(replace(problem, options=short), start, is_near=is_near, precision=precision)
     return None if solution.failed else solution
 
 

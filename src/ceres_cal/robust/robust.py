@@ -12,20 +12,18 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Indices
+from ceres_cal.base.arrays import Indices, numerical
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.numerical import numerical
 from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.effects.smoothness import with_smoothness
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
-from ceres_cal.problem.equations import Equations
 from ceres_cal.problem.noise import Inliers, Redundancy, by_count, by_leverage, judge, median_scales, visible_from
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.problem.residuals import Residuals, residuals, residuals_alone
+from ceres_cal.problem.residuals import Equations, Residuals, residuals, residuals_alone
 from ceres_cal.robust.other_minima import with_lost_boards_posed, without_mirrored_poses
 
 MOST_ROUNDS = 15

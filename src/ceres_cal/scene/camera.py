@@ -32,8 +32,6 @@ from ceres_cal.scene.foreign import (
 )
 from ceres_cal.scene.lens import Lens
 
-_ACROSS = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -291,8 +289,9 @@ class Camera:
     @property
     def opencv_models(self) -> tuple[str, ...]:
         """Those of OpenCV's models that may come near it: its fisheye where that is our lens, or sees across."""
+        across = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
         is_one = ForeignCamera.coefficients_of(self.lens, FISHEYE) is not None
-        fisheye = is_one or bool(np.any(self.rays(image_grid(self.image_size))[:, 2] < _ACROSS))
+        fisheye = is_one or bool(np.any(self.rays(image_grid(self.image_size))[:, 2] < across))
         return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
 
     @classmethod

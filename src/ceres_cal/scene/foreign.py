@@ -38,7 +38,6 @@ _NAMES = {
 TO_HOLD = ("opencv12", THIN_PRISM_FISHEYE)
 """Models for lenses that they hold exactly: no other lens is fitted by them."""
 _GRID = (41, 31)  # pixels of the image over which a fit is made
-_ANGLES, _DIRECTIONS = 120, 24  # of rays in all directions, to see what a foreign model shows
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
 
 
@@ -201,10 +200,11 @@ def _error(pixels: Array, wanted: Array) -> tuple[float, float]:
 
 def _all_directions() -> Array:
     """(directions, angles, 3) rays from the axis outwards to 89 degrees."""
-    angle = np.radians(np.linspace(0.0, 89.0, _ANGLES))
-    turn = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)[:, None]
+    angles, directions = 120, 24  # of rays in all directions, to see what a foreign model shows
+    angle = np.radians(np.linspace(0.0, 89.0, angles))
+    turn = np.linspace(0.0, 2.0 * np.pi, directions, endpoint=False)[:, None]
     across = np.sin(angle)
-    depth = np.broadcast_to(np.cos(angle), (_DIRECTIONS, _ANGLES))
+    depth = np.broadcast_to(np.cos(angle), (directions, angles))
     return np.stack([across * np.cos(turn), across * np.sin(turn), depth], axis=-1)
 
 

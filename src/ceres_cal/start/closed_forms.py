@@ -4,11 +4,13 @@ Plane points are (x, y) of a plane of constant z; image points are offsets from 
 profile w(r) = 1 + c_1 r^2 + c_2 r^4 with r in units of `unit_px` turns a measured offset p into the direction
 (p, phi w(r)): the same for every lens, and still finite where a fisheye looks beyond 90 degrees. With a profile a
 homography maps a plane point to (p, w(r)), up to scale.
+
+What a lens does along the radius, as a start finds it, and the lens of a kind that comes nearest to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +20,9 @@ from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
-from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies
+from ceres_cal.kernels import plane_homographies
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Lens
 
 # Medians of the errors: no clean residual is that long, nine standard deviations. Nothing changes at half of it.
 _WRONG = 8.0
@@ -175,45 +179,65 @@ class PlaneData:
 
 @dataclass(frozen=True, eq=False)
 class RadialAlignment:
-    """Answer of `radial_alignment`: the profile, H (S, 3, 3) of every sight, and each point's error.
+    """Answer of `radial_alignment`: the profile, and each point's error.
 
     Attributes:
         error_px: (N,). relative_error: (N,) the same in units of what is usual at that distance from the centre.
     """
 
     profile: RadialProfile
-    homographies: Array
     error_px: Array
     relative_error: Array
 
 
 def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -> RadialAlignment:
-    """Profile and homographies of sights of points, whatever the radial distortion (design, section 7).
+    """Profile from sights of points, whatever the radial distortion (design, section 7).
 
     p_x (h2 . X) - p_y (h1 . X) = 0 holds for any radial lens: it gives h1 and h2 of each sight. Along p, then,
     r (h3 . X) - q sum c_k r^2k = q with q = (h1 . X, h2 . X) . p / r is linear in h3 of each sight and in the shared c.
     Rounds of reweighting keep wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
     """
-    p = data.offsets / unit_px
-    sights = len(data.bounds) - 1
-    x, lifts = np.empty((2, len(p))), np.empty((sights, 3))
-    normalised_planes(data.bounds, data.plane, x, lifts)
-    h12, shares, errors = np.empty((sights, 6)), np.empty((sights, 3, terms + 1)), np.empty(len(p))
-    usual, weights = np.empty(len(p)), np.ones(len(p))
-    order, counts = _rings(np.linalg.norm(p, axis=1))
+    (a, b), sizes = data.offsets.T / unit_px, np.diff(data.bounds)
+    r2 = a * a + b * b
+    r = np.sqrt(r2)
+
+    def summed(values: Array) -> Array:
+        """(..., S) over each sight of (..., N)."""
+        return np.add.reduceat(values, data.bounds[:-1], axis=-1)
+
+    def sent(h: Array) -> Array:
+        """(N,) h . X with each sight's own (S, 3)."""
+        return np.asarray((h.T.take(own, axis=1) * x).sum(axis=0))
+
+    own = np.repeat(np.arange(len(sizes)), sizes)
+    plane = data.plane.T - (summed(data.plane.T) / sizes).take(own, axis=1)
+    spread = np.sqrt(summed(np.sum(plane * plane, axis=0)) / sizes) + 1e-12
+    x = np.vstack([plane / spread.take(own), np.ones_like(a)])  # of unit size each
+    aligned = np.array([b * b, -a * b, a * a])[:, None, None] * x[:, None] * x
+    normal, powers = np.empty((len(sizes), 6, 6)), r2 ** np.arange(1, terms + 1)[:, None]
+    usual, weights = np.empty_like(a), np.ones_like(a)
+    order, counts = _rings(r)
     for _ in range(rounds):
-        reduced = np.zeros((terms + 1, terms + 1))
-        align_sights(data.bounds, x, p, weights, h12, shares, reduced)
+        normal[:, :3, :3], normal[:, 3:, :3], normal[:, 3:, 3:] = summed(weights * aligned).transpose(0, 3, 1, 2)
+        h12 = np.linalg.eigh(normal)[1][:, :, 0]  # of the lower triangle
+        u, v = sent(h12[:, :3]), sent(h12[:, 3:])
+        agree = summed(weights * (u * a + v * b))
+        scale = (summed(weights * r2) / np.where(np.abs(agree) > 1e-12, agree, 1e-12)).take(own)
+        u, v = scale * u, scale * v
+        q = (u * a + v * b) / np.maximum(r, 1e-9)
+        rows = np.vstack([r * x, -q * powers, q])
+        depths = summed(weights * rows[:, None] * rows).transpose(2, 0, 1)
+        depths[:, :3, :3] += 1e-12 * np.trace(depths[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        shares = np.linalg.solve(depths[:, :3, :3], depths[:, :3, 3:])
+        reduced = np.sum(depths[:, 3:, 3:] - np.swapaxes(shares, 1, 2) @ depths[:, :3, 3:], axis=0)
         c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
-        h3 = shares[:, :, terms] - shares[:, :, :terms] @ c
-        alignment_errors(data.bounds, x, p, h12, h3, np.asarray(c, dtype=float), errors)
+        depth = sent(shares[:, :, terms] - shares[:, :, :terms] @ c)
+        across = r * (a * v - b * u) / np.maximum(np.hypot(u, v), 1e-9)
+        errors = np.hypot(across, r - q * (1.0 + c @ powers) / np.where(np.abs(depth) > 1e-9, depth, 1e-9))
         parts = np.split(errors[order], np.cumsum(counts)[:-1])
         usual[order] = np.repeat([max(median(part), 1e-12) for part in parts], counts)
         weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
-    homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
-    return RadialAlignment(
-        RadialProfile(tuple(float(v) for v in c), unit_px), homographies, errors * unit_px, errors / usual
-    )
+    return RadialAlignment(RadialProfile(tuple(c.tolist()), unit_px), errors * unit_px, errors / usual)
 
 
 def _rings(radius: Array) -> tuple[Indices, Indices]:
@@ -238,15 +262,6 @@ def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Arr
 
     run_parts(solve, parts_of(len(homographies), len(errors), point_ns))
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
-
-
-def _restored(lifts: Array) -> Array:
-    """(S, 3, 3) from plane points (x, y, 1) to those of `normalised_planes`."""
-    restore = np.zeros((len(lifts), 3, 3))
-    restore[:, 0, 0] = restore[:, 1, 1] = lifts[:, 2]
-    restore[:, :2, 2] = -lifts[:, :2] * lifts[:, 2:]
-    restore[:, 2, 2] = 1.0
-    return restore
 
 
 def fit_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array | None, float]:
@@ -345,3 +360,61 @@ def orthogonality_error(homographies: Array, phi: ArrayLike) -> Array:
     aa = a[:, 0] ** 2 + a[:, 1] ** 2 + phi**2 * a[:, 2] ** 2
     bb = b[:, 0] ** 2 + b[:, 1] ** 2 + phi**2 * b[:, 2] ** 2
     return np.asarray(np.sqrt(4.0 * dot**2 + (aa - bb) ** 2) / (aa + bb))
+
+
+RADII = np.linspace(0.02, 1.0, 50)  # of the observed ones, at which lenses are compared
+
+
+def edge_over(camera: Camera, reach_px: float) -> float:
+    """How many times as far out as its observations reach a camera's lens is asked about."""
+    margin = 1.15  # of what a start takes for the edge of the picture: its profile is least sure there
+    return margin * max(1.0, camera.corner_radius / reach_px)
+
+
+@dataclass(frozen=True, eq=False)
+class LensProfile:
+    """What a lens does: the angles (n,), rad, to the axis of what it shows at radii (n,), px, as far as was seen."""
+
+    radii_px: Array
+    angles: Array
+
+    @classmethod
+    def of(cls, camera: Camera, reach_px: float) -> LensProfile:
+        """A camera's up to some radius."""
+        r, lens = RADII * reach_px, camera.lens
+        across = {*lens.decentring, *lens.more_terms.get("tangential", ())}
+        lens = lens.with_values([0.0 if name in across else lens.coefficients[name] for name in lens.names])
+        rays = lens.undistort(np.column_stack([r, np.zeros_like(r)]), camera.phi)
+        angles = np.arctan2(rays[:, 0], rays[:, 2])
+        known = np.isfinite(angles)
+        return cls(r[known], angles[known])
+
+    @property
+    def reach_px(self) -> float:
+        return float(np.max(self.radii_px, initial=0.0))
+
+    def nearest(self, blank: Lens, phi: float, held: Container[str]) -> Lens:
+        """The lens that comes nearest to it: every model is linear in its coefficients at given radii. Fewer of them
+        where it would fold.
+
+        Args:
+            blank: with the values of the coefficients that are held.
+        """
+        grazing = 0.02  # cosine of the angle at which a ray has no ideal radius any more
+        r = self.radii_px
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ideal = np.where(np.cos(self.angles) > grazing, phi * np.tan(self.angles), np.nan)
+        columns, right = blank.start_equations(r, ideal, self.angles, phi)
+        free = [i for i, name in enumerate(blank.names) if name in columns and name not in held]
+        ahead = np.isfinite(right)
+        right = right - sum(
+            np.nan_to_num(columns[n]) * blank.coefficients[n] for n in blank.names if n in columns and n in held
+        )
+        for count in range(len(free), 0, -1):
+            basis = np.column_stack([columns[blank.names[i]] for i in free[:count]])[ahead]
+            values = np.array(blank.values)
+            values[free[:count]] = np.linalg.lstsq(basis, right[ahead], rcond=1e-8)[0]
+            lens = blank.with_values(values)
+            if lens.monotone_radius(phi) > 1.05 * self.reach_px:
+                return lens
+        return blank

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.numerical import numerical
+from ceres_cal.base.arrays import Array, Indices, numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
@@ -21,11 +20,16 @@ from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
-from ceres_cal.start.chaining import chained_poses
-from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
-from ceres_cal.start.lens_profile import RADII, LensProfile, edge_over
+from ceres_cal.start.closed_forms import (
+    RADII,
+    LensProfile,
+    RadialProfile,
+    edge_over,
+    orthogonality_error,
+    poses_from_homographies,
+)
 from ceres_cal.start.planes import Homographies, profile_and_homographies
-from ceres_cal.start.world import Placed, beforehand, placed
+from ceres_cal.start.world import Placed, beforehand, chained_poses, placed
 
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
-from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.errors import or_none
 from ceres_cal.base.native import kept_signals
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.start.closed_forms import (
@@ -28,8 +28,6 @@ from ceres_cal.start.closed_forms import (
     ring_profile,
 )
 
-_MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
-_GOLDEN = 0.6180339887498949
 # A median beyond it may be no fit at all, however even: corners are detected to a tenth of it. Nothing changes from
 # half to double.
 _ROUGH_PX = 1.0
@@ -76,14 +74,15 @@ class PlaneSight:
 
 def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
     """The observations on a plane, by default the one that holds most of them; thinned where there are very many."""
+    most = 1500  # observations of one kind in a sight beyond which a start learns nothing more
     starts, along = sight.tracks[:, 0], sight.tracks[:, 1]
     level = np.abs(along[:, 2]) < 1e-12
     height = _usual_height(sight, level) if height_m is None else height_m
     on = np.flatnonzero(np.abs(sight.points[:, 2] - height) < 1e-9)
-    on = on[:: max(1, len(on) // _MOST)]
+    on = on[:: max(1, len(on) // most)]
     usable = level & ~sight.is_arc & (np.abs(starts[:, 2] - height) < 1e-9)
     straight = np.flatnonzero(usable[sight.track_index])
-    straight = straight[:: max(1, len(straight) // _MOST)]
+    straight = straight[:: max(1, len(straight) // most)]
     c, a = starts[sight.track_index[straight], :2], along[sight.track_index[straight], :2]
     normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
     points = sight.points[on, :2]
@@ -217,9 +216,10 @@ def _spread_rows(bounds: Indices) -> Indices:
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
     """
+    golden = 0.6180339887498949
     enough_points = 40.0  # of a board
     sizes = np.diff(bounds)
-    order = (np.arange(sizes.max()) * _GOLDEN) % 1.0
+    order = (np.arange(sizes.max()) * golden) % 1.0
     place = np.arange(bounds[-1]) - np.repeat(bounds[:-1], sizes)
     return np.flatnonzero(order[place] < np.repeat(enough_points / sizes, sizes))
 
@@ -306,6 +306,7 @@ def _homographies_of_boards(board: Sights, data: PlaneData, profile: RadialProfi
     return homographies
 
 
+@or_none  # quiet: these points make no homography; the caller keeps the one of all
 def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array | None:
     """The homography that most points agree on within `limit_px`, by LO-RANSAC (pycolmap), or None.
 
@@ -322,7 +323,4 @@ def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array 
     if consensus is None:
         return None
     inliers = np.asarray(consensus["inlier_mask"], dtype=bool)
-    try:
-        return homography_from_points(plane[inliers], lifted[inliers])
-    except DegenerateError:  # quiet: these points make no homography; the caller keeps the one of all
-        return None
+    return homography_from_points(plane[inliers], lifted[inliers])

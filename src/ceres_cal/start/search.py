@@ -20,20 +20,10 @@ from ceres_cal.start.sightlines import Candidates, Sightlines
 _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
 _TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
 _AZIMUTHS, _ROLLS = (1, 6, 11, 15, 18, 18), 18
-_FIRST, _THEN = 64, 20  # cameras that take the first steps, then the rest
 _FIRST_STEPS, _STEPS, _LAST_STEPS = 6, 12, 20
 _LEAST_PX = 1e-3  # of a scale: below it all data are exact
-_FAR_PX = 1e6
 _ROUGH_PX = 2.0  # scale of a search's first rounds
-_LOWEST = 0.01  # of the extent of what is seen: a camera that lies on a line sees it everywhere
-_WIDEST = 2.7  # of log phi from the middle: from a fisheye to a telescope
-_MOST_STEP = 0.3  # rad, and of log phi
-_BEHIND = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
 _DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
-_WRONG_LABEL = 25.0  # variances that a wrong label costs by itself
-_ROUNDING = 1e-9
-_NEAR = 0.02  # rad, and of the height: as near, cameras are on the way to one minimum
-_NOTHING = 1e-3  # variances: who gains less is there
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +77,7 @@ def information(lines: Sightlines, known: Beforehand, pose: Candidates, scale_px
 
 def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int, most_px: float = np.inf) -> Candidates:
     """Each brought towards its minimum, at the scale of its own residuals, at most so many px."""
+    nothing = 1e-3  # variances: who gains less is there
     if not len(poses):
         return poses
     damping = np.full(len(poses), _DAMPING)
@@ -103,7 +94,7 @@ def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int,
         poses = moved.where(better, poses)
         at = np.where(better[:, None], there[0], at[0]), np.where(better[:, None, None], there[1], at[1])
         damping = np.clip(damping * np.where(better, 0.2, 6.0), _LEAST_DAMPING, 1e6)
-        if np.all(np.where(better, gained < _NOTHING, damping > _GIVEN_UP)):
+        if np.all(np.where(better, gained < nothing, damping > _GIVEN_UP)):
             break
     return poses
 
@@ -112,6 +103,7 @@ def _step(
     lines: Sightlines, at: tuple[Array, Array], known: Beforehand, poses: Candidates, scale: Array, damping: Array
 ) -> Array:
     """(K, 8) a damped Gauss-Newton step of each, reweighted against what does not fit."""
+    most_step = 0.3  # rad, and of log phi
     r, derivatives = at
     free = np.flatnonzero(~known.held)
     weights = lines.weight / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
@@ -130,8 +122,8 @@ def _step(
     normal[:, each, each] += damping[:, None]
     step = np.zeros((len(poses), 8))
     step[:, free] = -np.linalg.solve(normal, (right / sizes)[..., None])[..., 0] / sizes
-    step[:, :3] = _bounded(step[:, :3], _MOST_STEP)
-    step[:, 6] = np.clip(step[:, 6], -_MOST_STEP, _MOST_STEP)
+    step[:, :3] = _bounded(step[:, :3], most_step)
+    step[:, 6] = np.clip(step[:, 6], -most_step, most_step)
     return step
 
 
@@ -142,10 +134,11 @@ def _bounded(vectors: Array, most: float) -> Array:
 
 def scales(r: Array, share: Array, free: int) -> Array:
     """(K, 1) px: the middle of the residuals (K, N) that so many numbers cannot take up; each counts by its share."""
+    rounding = 1e-9
     order = np.argsort(np.abs(r), axis=1)
     sums = np.cumsum(np.take_along_axis(np.broadcast_to(share, r.shape), order, 1), axis=1)
     total = sums[:, -1:]
-    middle = np.argmax(sums >= np.minimum(0.5 * (total + free), total) - _ROUNDING, axis=1)[:, None]
+    middle = np.argmax(sums >= np.minimum(0.5 * (total + free), total) - rounding, axis=1)[:, None]
     return np.maximum(np.abs(np.take_along_axis(r, np.take_along_axis(order, middle, 1), 1)), _LEAST_PX)
 
 
@@ -157,9 +150,11 @@ def _cost(lines: Sightlines, r: Array, known: Beforehand, poses: Candidates, sca
 
 def _possible(lines: Sightlines, known: Beforehand, poses: Candidates) -> Mask:
     """(K,) whether a camera stands over what it sees, with a phi that lenses have."""
+    widest = 2.7  # of log phi from the middle: from a fisheye to a telescope
+    lowest = 0.01  # of the extent of what is seen: a camera that lies on a line sees it everywhere
     floor, reach = float(lines.places[:, 2].min()), float(np.ptp(lines.places, axis=0).max())
-    is_lens = np.abs(poses.log_phi - known.log_phi[0]) < _WIDEST
-    return np.asarray(is_lens & (poses.positions[:, 2] > floor + _LOWEST * reach))
+    is_lens = np.abs(poses.log_phi - known.log_phi[0]) < widest
+    return np.asarray(is_lens & (poses.positions[:, 2] > floor + lowest * reach))
 
 
 def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> tuple[Array, Array]:
@@ -169,11 +164,13 @@ def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: fl
     A curve's label is right, or it is wrong, which is unlikely, and all of its rows then say no more than its numbers;
     the scale is that of the rest.
     """
+    behind = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
+    far_px = 1e6
     r, _ = lines.equations(poses)
-    r = np.nan_to_num(r, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX)
+    r = np.nan_to_num(r, nan=far_px, posinf=far_px, neginf=-far_px)
     free = int(np.count_nonzero(~known.held))
     scale = np.maximum(scales(r, lines.weight, free), least_px)
-    r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), _BEHIND * scale))
+    r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), behind * scale))
     wrong = _by_labels(lines, r, np.maximum(scales(r, lines.weight, free), least_px))[1]
     scale = np.maximum(scales(r, np.where(wrong, 0.0, 1.0), free), least_px)
     cost = _by_labels(lines, r, scale)[0] + np.sum(known.residuals(poses)[0] ** 2, axis=1)
@@ -182,12 +179,13 @@ def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: fl
 
 def _by_labels(lines: Sightlines, r: Array, scale: Array) -> tuple[Array, Mask]:
     """Costs (K,) of residuals (K, N), and which are of curves whose labels are rather wrong."""
+    wrong_label = 25.0  # variances that a wrong label costs by itself
     rows = 4.0 * np.log1p((r / (2.0 * scale)) ** 2) + 4.0 * np.log(scale)
     first, wrong = lines.groups, np.zeros(r.shape, dtype=bool)
     if not len(first):
         return np.sum(rows, axis=1), wrong
     right = np.add.reduceat(rows, first, axis=1)
-    otherwise = _WRONG_LABEL + lines.weight[first] * right
+    otherwise = wrong_label + lines.weight[first] * right
     wrong[:, first[0] :] = np.repeat(otherwise < right, np.diff(np.append(first, r.shape[1])), axis=1)
     return np.sum(rows[:, : first[0]], axis=1) + np.sum(np.minimum(right, otherwise), axis=1), wrong
 
@@ -203,14 +201,16 @@ def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Ca
     Args:
         few: some of the rows, for the first rounds.
     """
+    near = 0.02  # rad, and of the height: as near, cameras are on the way to one minimum
+    first, then = 64, 20  # cameras that take the first steps, then the rest
     proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, known.least_px)
     some = _drawn(few, known)
-    some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:_FIRST])
+    some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:first])
     sets = minimal_sets(few, _logs(known, np.geomspace(_PHI_GRID[0], _PHI_GRID[-1], 60)))
-    sets = sets.take(np.argsort(costs(few, known, sets, rough_px))[:_THEN]) if len(sets) else sets
+    sets = sets.take(np.argsort(costs(few, known, sets, rough_px))[:then]) if len(sets) else sets
     some = refined(few, known, Candidates.joined(proposed, some), _FIRST_STEPS)
     some = Candidates.joined(refined(few, known, sets, _FIRST_STEPS, rough_px), some)
-    some = some.take(apart(some, costs(few, known, some, rough_px), _NEAR)[:_THEN])
+    some = some.take(apart(some, costs(few, known, some, rough_px), near)[:then])
     return best_of(lines, known, Candidates.joined(proposed, refined(lines, known, some, _STEPS)))
 
 

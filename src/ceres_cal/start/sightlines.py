@@ -13,13 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 
 _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
-_ROUNDS = 2  # of reweighting against wrong labels
-_LEAST_DOWN = 0.03  # sine of the angle under the horizon: nearer to it a ray has no place on the floor
-_BEYOND = 0.05  # share of a line's length by which a start may see it beyond its ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +184,7 @@ class Sightlines:
 
     def seen(self, poses: Candidates) -> Mask:
         """(K, N) whether each row's place lies ahead and, on a line, between its ends."""
+        beyond = 0.05  # share of a line's length by which a start may see it beyond its ends
         d = self._rays(poses) @ np.swapaxes(poses.rotations, 1, 2)
         to = self.places - poses.positions[:, None]
         good = np.sum(to * d, axis=2) > 0.0
@@ -197,7 +195,7 @@ class Sightlines:
         ap, ep = np.sum(a * p, axis=2), np.sum(e * p, axis=2)
         det = np.maximum(aa * ee - ae**2, _LEAST)
         s, t = (ae * ep - ee * ap) / det, (aa * ep - ae * ap) / det
-        good[:, lines] = (t > 0.0) & (np.abs(s - 0.5) < 0.5 + _BEYOND)
+        good[:, lines] = (t > 0.0) & (np.abs(s - 0.5) < 0.5 + beyond)
         good[:, arcs] = to[:, arcs, 2] * d[:, arcs, 2] > 0.0
         return np.asarray(good)
 
@@ -205,6 +203,7 @@ class Sightlines:
         """(K, 3) m where cameras of these rotations stand: linear in what is seen, of an arc in the circle that its
         rays make on a plane one metre below. Where all that leaves it open they stand over the middle of it.
         """
+        rounds = 2  # of reweighting against wrong labels
         rays = np.empty((len(rotations), len(self.w), 3))
         rays[:, :, :2], rays[:, :, 2] = self.pixels, np.exp(log_phi)[:, None] * self.w
         d = rays @ np.swapaxes(rotations, 1, 2)
@@ -218,7 +217,7 @@ class Sightlines:
             rows = np.concatenate([rows, weight[:, None, None] * np.eye(3)], axis=1)
             places = np.concatenate([places, np.repeat(where[:, None], 3, axis=1)], axis=1)
         middle, weights = self.places.mean(axis=0), np.ones(rows.shape[:2])
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             weighted = rows * weights[..., None]
             matrix = np.swapaxes(weighted, 1, 2) @ rows + _RIDGE * np.eye(3)
             right = np.einsum("kni,kn->ki", weighted, np.sum(rows * places, axis=2)) + _RIDGE * middle
@@ -241,7 +240,8 @@ class Sightlines:
 
 def _over_circle(d: Array, centre: Array, radius: float) -> tuple[Array, Array]:
     """(K, 3) m where cameras stand whose rays d (K, n, 3) show a circle, and a weight (K,), 0 where they do not."""
-    down = np.maximum(-d[:, :, 2], _LEAST_DOWN)
+    least_down = 0.03  # sine of the angle under the horizon: nearer to it a ray has no place on the floor
+    down = np.maximum(-d[:, :, 2], least_down)
     u = d[:, :, :2] / down[..., None]
     rows = np.concatenate([2.0 * u, np.ones((*u.shape[:2], 1))], axis=2)
     matrix = np.swapaxes(rows, 1, 2) @ rows + _RIDGE * np.eye(3)
@@ -249,7 +249,7 @@ def _over_circle(d: Array, centre: Array, radius: float) -> tuple[Array, Array]:
     seen = np.sqrt(np.maximum(solved[:, 2] + np.sum(solved[:, :2] ** 2, axis=1), _RIDGE))  # its radius there
     height = radius / seen
     where = centre - np.column_stack([solved[:, :2] * height[:, None], -height])
-    return where, np.where((d[:, :, 2] < -_LEAST_DOWN).all(axis=1), np.sqrt(float(d.shape[1])), 0.0)
+    return where, np.where((d[:, :, 2] < -least_down).all(axis=1), np.sqrt(float(d.shape[1])), 0.0)
 
 
 def _cross(a: Array, b: Array) -> Array:

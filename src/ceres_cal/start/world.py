@@ -1,33 +1,34 @@
-"""Where a camera stands by one sight of the world: what the homography proposes where it holds, else by a search."""
+"""Where a camera stands by one sight of the world: what the homography proposes where it holds, else by a search.
+
+Poses of sights become stations and placements.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, distinct
-from ceres_cal.observations import Prior
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Pose, Poses, chained, inverted
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
+from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import Beforehand, BestCameras, apart, best_of, information, searched
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
 _MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
-_FEW_POINTS, _FEW_OF_A_CURVE = 8, 4  # for the first rounds of a search
 _HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
 _SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
 _ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
 _LEFT_OVER = 8  # equations beyond the unknowns: with fewer another place may explain them as well
-_BEND_SD = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
 _TOLD = 0.05  # standard deviation of log phi below which a sight tells it: above, the start is called a guess
 _OPEN = 1e-10  # least eigenvalue of the information in its own units: rounding is less, the weakest scenes have 1e-7
 _ALIKE = 30.0  # variances by which another place may cost more at a start: the solve, which is exact, decides
 _APART = 0.05  # rad, and of the height: places that are nearer are one minimum
-_MOST_PLACES = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
-_FINEST_PX = 1e-2  # of a scale: exact data are told no better
-_LEAST_SD = 1e-3  # of a stated number, as a share: a start is no better
 _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")
 
 
@@ -59,12 +60,13 @@ class Placed:
 
 def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float]) -> Beforehand:
     """What is stated of a station's place, and this of phi."""
+    least_sd = 1e-3  # of a stated number, as a share: a start is no better
     position, sd = np.zeros(3), np.full(3, np.inf)
     for prior in priors:
         if prior.owner == "station" and prior.name == station and prior.quantity in ("height_m", "position_m"):
             numbers = slice(3 - len(prior.value), 3)
             position[numbers] = prior.value
-            sd[numbers] = np.maximum(prior.sigma, _LEAST_SD * max(abs(prior.value[-1]), _LEAST_SD))
+            sd[numbers] = np.maximum(prior.sigma, least_sd * max(abs(prior.value[-1]), least_sd))
     return Beforehand(position, sd, log_phi, 0.0)
 
 
@@ -77,6 +79,7 @@ def placed(
         proposed: cam_from_world (3, 4) of a homography at this log phi, where there is one.
         may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
     """
+    bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
     lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
     given = Candidates.none()
     if proposed is not None and np.all(np.isfinite(proposed)):
@@ -87,7 +90,7 @@ def placed(
             if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
                 found = replace(found, poses=given, costs=found.costs[:1])
             return _answered(lines, profile, known, found)
-    known = replace(known, bend_sd=_BEND_SD if may_bend else 0.0)
+    known = replace(known, bend_sd=bend_sd if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
     tried = [_searched(sight, one, known, given) for one in ((profile, none) if may_bend else (profile,))]
     return _answered(*min(tried, key=lambda one: float(one[-1].costs[0])))
@@ -96,17 +99,20 @@ def placed(
 def _searched(
     sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates
 ) -> tuple[Sightlines, RadialProfile, Beforehand, BestCameras]:
+    few_points, few_of_a_curve = 8, 4  # for the first rounds of a search
     lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
-    few = sightlines_of(sight, profile, _FEW_POINTS, _FEW_OF_A_CURVE)
+    few = sightlines_of(sight, profile, few_points, few_of_a_curve)
     return lines, profile, known, searched(lines, few, known, given)
 
 
 def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, found: BestCameras) -> Placed:
     """With what the best place leaves open, and the others that fit alike."""
-    best, scale = found.poses.take(np.array([0])), max(found.scale_px, _FINEST_PX)
+    finest_px = 1e-2  # of a scale: exact data are told no better
+    most_places = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
+    best, scale = found.poses.take(np.array([0])), max(found.scale_px, finest_px)
     matrix = information(lines, known, best, scale)
     alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
-    places = tuple(_place(found.poses, number, profile) for number in alike[:_MOST_PLACES])
+    places = tuple(_place(found.poses, number, profile) for number in alike[:most_places])
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
@@ -178,3 +184,76 @@ def sightlines_of(sight: Sights, profile: RadialProfile, most_points: int, most_
 def _evenly(rows: Indices, most: int) -> Indices:
     count = min(len(rows), most)
     return rows[distinct(np.linspace(0, max(len(rows) - 1, 0), count).round().astype(np.int64))]
+
+
+_STATED = {"x": "position_m", "y": "position_m", "height": "height_m", "phi": "phi"}
+"""What an open number may be stated as."""
+
+
+def chained_poses(
+    observations: Observations,
+    sights: Sights,
+    numbers: Indices,
+    poses: Array,
+    standing: Mapping[str, Station] | None = None,
+    open_numbers: Mapping[int, tuple[str, ...]] | None = None,
+) -> tuple[dict[str, Station], Poses]:
+    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known.
+
+    Args:
+        numbers: (K,) of these sights. standing: stations whose place is known. open_numbers: what other sights leave
+            open, by their numbers.
+
+    Raises:
+        DegenerateError: naming a sight that nothing places.
+    """
+    sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
+    order = np.argsort(-sizes[numbers], kind="stable")
+    keys, seen = [sights.keys[i] for i in numbers[order]], poses[order]
+    stations = {name: station.cam_from_world.matrix for name, station in (standing or {}).items()}
+    stations = stations or {name: np.eye(3, 4) for name in anchored_stations(observations)}
+    placements: dict[str | None, Array] = {None: np.eye(3, 4)}
+    known = -1
+    while len(stations) + len(placements) > known:
+        known = len(stations) + len(placements)
+        for key, pose in zip(keys, seen, strict=True):
+            if key.station not in stations and key.placement in placements:
+                stations[key.station] = chained(pose, inverted(placements[key.placement]))
+        fresh: dict[str | None, int] = {}
+        for row, key in enumerate(keys):
+            if key.placement not in placements and key.station in stations:
+                fresh.setdefault(key.placement, row)
+        if fresh:
+            rows = list(fresh.values())
+            world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
+            placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
+    _require_all(observations, sights, stations, placements, open_numbers or {})
+    cameras = observations.stations
+    named = [name for name in placements if name is not None]
+    return (
+        {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
+        Poses.stacked(named, np.array([placements[name] for name in named]).reshape(-1, 3, 4)),
+    )
+
+
+def _require_all(
+    observations: Observations,
+    sights: Sights,
+    stations: Container[str],
+    placements: Container[str | None],
+    open_numbers: Mapping[int, tuple[str, ...]],
+) -> None:
+    for number, key in enumerate(sights.keys):
+        if key.station in stations and key.placement in placements:
+            continue
+        sight = sights[number]
+        frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
+        said = f"{len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations (on "
+        said += f"{len(distinct(sight.track_index))} curves) cannot fix its pose"
+        if names := open_numbers.get(number, ()):
+            stated = [_STATED[name] for name in names if name in _STATED]
+            state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""
+            what = f"{', '.join(names)} of the camera stay open: add a point or a line beside these{state}"
+        else:
+            what = "give at least four points, not on one line, or straight lines in two directions, two of each"
+        raise DegenerateError(f"frame {frames} ({key}): {said}: {what}, or remove the view")

@@ -14,27 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects
 from ceres_cal.effects.linearised import Weights, make_linear_model
 from ceres_cal.observations import Prior
-from ceres_cal.problem.equations import whole_structure, write_equations
 from ceres_cal.problem.parameters import intrinsic_names
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import residuals, whole_structure, write_equations
 from ceres_cal.problem.structure import dimension_slopes, dimensions_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
-_SCATTER_M = np.array([0.0005, 0.001, 0.002, 0.004, 0.008])  # of paint about its drawing
-ASIDE_M, _OTHER = 0.04, 0.1  # of a curve that lies aside; of a dimension that is another one, as a share of it
+# Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
+# lie aside, root sum of squares: farther, they are others.
+_SCATTER, _FARTHEST = np.array([0.0125, 0.025, 0.05, 0.1, 0.2]), 3.0
+_ASIDE = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
+_OTHER = 0.1  # of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 _BEAM, _MOST = 24, 9
 # Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
 _OTHER_FIELD = 0.02
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
-_FARTHEST_M = 0.12  # of all curves that lie aside, root sum of squares: farther, they are others
 # Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
 # wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
 _MOST_MISFIT = 6.0
@@ -49,7 +50,9 @@ class FieldAsBuilt:
         aside_m: name of a curve -> by how much it lies beside its drawing, m, where it does.
         dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
         sd_m: name of each of those -> its standard deviation, m.
-        drawn: name of a dimension -> its value by the target, m. curves: how many there are to tell.
+        drawn: name of a dimension -> its value by the target, m. names: of the curves that tell it.
+        usual_m: by how much a curve lies aside that does. scatter_m: by how much all the others do, where
+            it is seen.
         misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
     """
 
@@ -57,8 +60,16 @@ class FieldAsBuilt:
     dimensions: Mapping[str, float]
     sd_m: Mapping[str, float]
     drawn: Mapping[str, float]
-    curves: int
+    names: tuple[str, ...]
+    usual_m: float
+    scatter_m: float = 0.0
     misfit: float = 0.0
+
+    @property
+    def laid_m(self) -> Mapping[str, float]:
+        """Name of a curve -> the standard deviation by which it may lie beside its drawing, where it may."""
+        every = self.names if self.scatter_m else ()
+        return dict.fromkeys(every, self.scatter_m) | dict.fromkeys(self.aside_m, self.usual_m)
 
     @property
     def is_other(self) -> bool:
@@ -71,7 +82,7 @@ class FieldAsBuilt:
             if abs(length - self.drawn[name]) > _SURELY * self.sd_m[name]
         ]
         far = float(np.linalg.norm(list(self.aside_m.values())))
-        elsewhere = far > _FARTHEST_M or 2 * len(self.aside_m) > self.curves
+        elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
         return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
 
     def words(self) -> tuple[str, ...]:
@@ -89,8 +100,15 @@ class FieldAsBuilt:
         return (*dimensions, *curves, *([bent] if self.misfit > _MOST_MISFIT else []))
 
 
-AS_DRAWN = FieldAsBuilt({}, {}, {}, {}, 0)
+AS_DRAWN = FieldAsBuilt({}, {}, {}, {}, (), np.inf)
 """Nothing is known of how a target is painted."""
+
+
+def usual_aside_m(target: Target) -> float:
+    """By how much a curve of a target lies aside that does: as it states, or as people lay out what is so large."""
+    widths = [curve.width_m for curve in target.curves.values() if curve.width_m > 0.0]
+    usual = _ASIDE * float(np.sqrt(np.median(widths) * 1e-3 * np.max(np.ptp(target.box, axis=0))))
+    return target.tolerance_m or usual
 
 
 def _spoken(name: str) -> str:
@@ -118,9 +136,10 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
     free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
     problem, estimate = problem_of(camera, seen, free, priors)
-    try:
-        equations = write_equations(seen, problem.sights, estimate, residuals(seen, problem.sights, estimate))
-    except SolutionError:  # reads: "..." of `AsBuilt.words`: this is another field
+    left = residuals(seen, problem.sights, estimate)
+    # reads: "..." of `AsBuilt.words`: this is another field
+    equations = attempt(lambda: write_equations(seen, problem.sights, estimate, left), SolutionError)
+    if isinstance(equations, CalibrationError):
         return replace(AS_DRAWN, misfit=np.inf)
     every = np.ones(len(equations), dtype=bool)
     weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))
@@ -136,7 +155,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
-    shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m)
+    shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, usual_aside_m(target))
     return replace(shape.explained(), misfit=misfit)
 
 
@@ -164,7 +183,7 @@ class _CurveNumbers:
 
     Attributes:
         effects: these numbers as random effects. owner: (Q,) names of curves. moves: (Q, D) of the dimensions, whose
-            values (D,) are `lengths`.
+            values (D,) are `lengths`. usual_m: by how much a curve lies aside that does.
     """
 
     effects: RandomEffects
@@ -172,12 +191,13 @@ class _CurveNumbers:
     moves: Array
     names: tuple[str, ...]
     lengths: Array
+    usual_m: float
 
     def explained(self) -> FieldAsBuilt:
         """The set of curves and dimensions of most evidence."""
         curves = list(dict.fromkeys(self.owner.tolist()))
         moving = [int(d) for d in np.flatnonzero(np.any(self.moves != 0.0, axis=0))]
-        roots = [ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
+        roots = [self.usual_m * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
         roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
         chosen, scatter_m = self._searched(roots)
         together = np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)])
@@ -189,15 +209,23 @@ class _CurveNumbers:
             at += size
             worst = int(np.argmax(np.abs(values)))
             if number < len(curves):
-                aside[curves[number]] = ASIDE_M * float(values[worst])
-                sds[curves[number]] = ASIDE_M * float(own[worst])
+                aside[curves[number]] = self.usual_m * float(values[worst])
+                sds[curves[number]] = self.usual_m * float(own[worst])
                 continue
             d = moving[number - len(curves)]
             name = self.names[d].partition("/")[2]
             dimensions[name] = float(self.lengths[d] * (1.0 + _OTHER * values[0]))
             sds[name] = float(self.lengths[d] * _OTHER * own[0])
         drawn = {name.partition("/")[2]: float(length) for name, length in zip(self.names, self.lengths, strict=True)}
-        return FieldAsBuilt(aside, dimensions, sds, drawn, len(curves))
+        return FieldAsBuilt(
+            aside,
+            dimensions,
+            sds,
+            drawn,
+            tuple(curves),
+            self.usual_m,
+            scatter_m * (scatter_m > _SCATTER[0] * self.usual_m),
+        )
 
     def _searched(self, roots: Sequence[Array]) -> tuple[list[int], float]:
         """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
@@ -205,15 +233,16 @@ class _CurveNumbers:
         padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
         modes = self.effects.modes(np.array(padded).reshape(len(roots), len(self.owner), width))
         beam: list[frozenset[int]] = [frozenset()]
-        best, most, scatter_m = frozenset[int](), -np.inf, float(_SCATTER_M[0])
+        scatters_m = _SCATTER * self.usual_m
+        best, most, scatter_m = frozenset[int](), -np.inf, float(scatters_m[0])
         for _ in range(_MOST + 1):
             sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
-            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), _SCATTER_M)
+            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), scatters_m)
             score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
             order = np.argsort(-score)
             if score[order[0]] > most:
                 best, most = beam[order[0]], float(score[order[0]])
-                scatter_m = float(_SCATTER_M[np.argmax(evidence[order[0]])])
+                scatter_m = float(scatters_m[np.argmax(evidence[order[0]])])
             kept = [beam[row] for row in order[:_BEAM]]
             beam = list({one | {n} for one in kept for n in range(len(roots)) if n not in one})
             if not beam:

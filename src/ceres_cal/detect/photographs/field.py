@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.base.arrays import Array32, Mask
-from ceres_cal.base.errors import InputError, NothingShownError, naming
+from ceres_cal.base.errors import InputError, NothingShownError, naming, or_none
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_light
 from ceres_cal.detect.lines import Lines
-from ceres_cal.detect.photographs.as_built import ASIDE_M
 from ceres_cal.detect.photographs.candidates import prepare_search
 from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
@@ -142,8 +141,8 @@ def detect_field(
     seen |= {target.point_names[number] for number in np.unique(every.points.feature)}
     lengths = [_found(one, next(iter(followed.values()))) for one in options.lengths]
     lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
-    priors = dict.fromkeys((*every.priors, *lengths))
-    return FieldDetections(replace(every, priors=tuple(priors)), followed, missed, searched)
+    priors = {(one.name, one.quantity): one for one in sorted((*every.priors, *lengths), key=lambda one: one.sigma)}
+    return FieldDetections(replace(every, priors=tuple(priors.values())), followed, missed, searched)
 
 
 def _found(prior: Prior, followed: Followed) -> Prior:
@@ -206,12 +205,10 @@ def _looked_for(
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 
 
+@or_none  # reads: "its lines were not found ..."
 def _is_worn(grey: Array32, followed: Followed) -> bool:
     """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
-    try:
-        return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
-    except InputError:  # reads: "its lines were not found ..."
-        return False
+    return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
 
 
 def _starts(
@@ -246,9 +243,13 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     """
     camera, lines = followed.camera, followed.lines
     points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
+    built = followed.built
     if options.points:
         met = find_crossings(followed.target, camera, lines)
-        points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px), met.used
+        laid = target.point_array[met.feature] + built.scatter_m * np.eye(3)[:2, None]
+        laid_px = np.linalg.norm(camera.project(laid.reshape(-1, 3)).reshape(2, -1, 2) - met.pixels, axis=2)
+        sigma = np.hypot(met.sigma_px, laid_px.mean(axis=0)) if built.scatter_m else met.sigma_px
+        points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, sigma), met.used
     curves, beside = _curves(lines, lines.found & ~used, options.edges), followed.beside
     if beside is not None:
         aside = _curves(beside, beside.found, options.edges)
@@ -259,7 +260,7 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
         (View(frame, options.camera, options.station or options.camera, TARGET_NAME),),
         points,
         curves,
-        tuple(Prior.of_offset(TARGET_NAME, name, ASIDE_M) for name in followed.built.aside_m),
+        tuple(Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()),
     )
 
 

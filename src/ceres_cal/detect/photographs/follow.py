@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice, product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array32
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import attempt
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate_near
 from ceres_cal.detect.courses import Course, clear_px, predict
@@ -203,7 +203,10 @@ class _Tracker:
         other = among_others(self.grey, tracker.target, camera, tracker.curves, self.free)
         if other is not None:
             tracker, camera = replace(tracker, target=other[1]), other[0]
-        there = tracker._reached_before(camera) or tracker.at_rest(camera, self.free.names)
+        there = tracker._reached_before(camera)
+        if there is None:
+            there = tracker.at_rest(camera, self.free.names)
+            there = tracker._reached_before(there.camera) or there
         self.reached.append(there)
         return there
 
@@ -325,9 +328,10 @@ class _Tracker:
             for camera in [near] if fits else stretched:  # of which the first is as it is
                 if camera is not near and fits and fits[0][1].fit.curves > _KEPT * len(lines.found):
                     break
-                with suppress(CalibrationError):  # quiet: where none fits these lines, they are judged as found
-                    calibration = calibrate_near(camera, observations, own)
-                    fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
+                # quiet: where none fits these lines, they are judged as found
+                found = attempt(partial(calibrate_near, camera, observations, own))
+                if isinstance(found, Calibration):
+                    fits.append((found.fit.curve_scale * len(lines.found) / found.fit.curves, found))
             near = min(fits, key=lambda fit: fit[0])[1].station() if fits else near
         if not fits:
             return followed

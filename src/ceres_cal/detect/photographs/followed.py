@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.photographs.candidates import FieldSearch
 from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
 from ceres_cal.detect.photographs.matching import divergence
 from ceres_cal.detect.photographs.painted import BY_CHANCE
 from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.scene.curves import Arc
 from ceres_cal.scene.targets import Target
 
 # Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
@@ -22,8 +24,11 @@ _NEAR_PX = 6.0
 _EXPLAINED = 0.75
 # The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole,
 # and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
-# A corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
-_OF_ALL, _OF_ALL_IF_WHOLE, _MANY_CURVES = 0.55, 0.4, 6
+_OF_ALL, _OF_ALL_IF_WHOLE = 0.55, 0.4
+# Of straight lines, those that a camera lays on any others by place, size and bend; the negative log of the chance that
+# the rest lie on lines by themselves, from which on other lines lie there besides: 13 where they do, of others 7; and
+# below which a corner may be any corner, so that nearly all the picture must be explained: 0.92 is, of others 0.88.
+_LAID, _NO_CHANCE, _BY_ANY, _IF_ANY = 5, 9.0, 2.0, 0.9
 # Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
 # another line's at least.
 _PARALLEL, _AS_STRONG = 0.07, 0.5
@@ -65,8 +70,9 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
     share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
-    enough = (_OF_ALL if followed.absent else _OF_ALL_IF_WHOLE) if len(names) >= _MANY_CURVES else _EXPLAINED
-    if share < _EXPLAINED or of_all < enough:
+    told = coincidence(search, followed)
+    enough = _EXPLAINED, _OF_ALL if followed.absent else _OF_ALL_IF_WHOLE
+    if told < _NO_CHANCE and np.any(np.less((share, of_all), _IF_ANY if told < _BY_ANY else enough)):
         share = min(share, of_all)
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
@@ -103,18 +109,14 @@ def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = Fal
     Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
     stripes of sun that run otherwise, or are fainter, say nothing against it.
     """
-    rim = 0.02  # of its size
     course_px = 3.0
-    strokes, camera, target = search.stroke_map.strokes, followed.camera, followed.target
-    course = predict(target, camera, search.curves, course_px)
-    ends = np.stack([camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
-    middles, along = ends.mean(axis=0), np.abs(ends[1] - ends[0])
-    places = replace(search.grid, target=target).outline
-    margin = rim * np.ptp(places, axis=0)
-    with np.errstate(invalid="ignore"):
-        inside = np.all((middles > places.min(axis=0) - margin) & (middles < places.max(axis=0) + margin), axis=1)
-        inside |= everywhere
-        inside &= along.min(axis=1) < _PARALLEL * along.max(axis=1)
+    strokes, parallel = search.stroke_map.strokes, _parallel(search, followed)
+    course = predict(followed.target, followed.camera, search.curves, course_px)
+    inside = parallel.along | parallel.across
+    if not everywhere:
+        low, high = parallel.outline
+        with np.errstate(invalid="ignore"):
+            inside &= np.all((parallel.middle > low) & (parallel.middle < high), axis=1)
     if not np.any(inside) or not len(course):
         return 0.0
     away = np.linalg.norm(strokes.ends[inside].mean(axis=1)[:, None] - course.pixels, axis=2)
@@ -123,6 +125,63 @@ def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = Fal
         return 0.0
     strong = strength > _AS_STRONG * np.median(strength[on_it])
     return float(np.average(on_it[strong], weights=strokes.length_px[inside][strong]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Parallel:
+    """The N strokes on the floor, in the grid: their middles (N, 2), half a pixel there (N,), whether they run along
+    its lines, or across, (N,) each, and between which corners (2, 2) the target lies.
+    """
+
+    middle: Array
+    pixel_m: Array
+    along: Mask
+    across: Mask
+    outline: Array
+
+
+def _parallel(search: FieldSearch, followed: Followed) -> _Parallel:
+    rim = 0.02  # of its size
+    strokes = search.stroke_map.strokes
+    ends = np.stack([followed.camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
+    x, y = np.abs(ends[1] - ends[0]).T
+    places = replace(search.grid, target=followed.target).outline
+    margin = rim * np.ptp(places, axis=0)
+    outline = np.array([places.min(axis=0) - margin, places.max(axis=0) + margin])
+    with np.errstate(invalid="ignore"):
+        pixel_m = np.hypot(x, y) / np.maximum(strokes.length_px, 1.0)
+        return _Parallel(ends.mean(axis=0), pixel_m, y < _PARALLEL * x, x < _PARALLEL * y, outline)
+
+
+def coincidence(search: FieldSearch, followed: Followed) -> float:
+    """How unlikely it is that lines of something else lie where all of the target's do: the negative log of it.
+
+    Of each straight line: in how many of the places beside it, all over the field, there are as many strokes as on it.
+    Where others run everywhere, as on striped floors, it tells nothing; and a camera lays some lines on any others.
+    """
+    share, as_many, near_px = np.linspace(0.0, 1.0, 300), 0.8, 2.0
+    parallel, turn, target = _parallel(search, followed), search.grid.turn, followed.target
+    chances = [1.0] * _LAID
+    for name in followed.curves:
+        curve = target.curves[name]
+        if isinstance(curve, Arc):
+            continue
+        ends = np.array([curve.start[:2], curve.end[:2]]) @ turn
+        axis = int(np.argmax(np.ptp(ends, axis=0)))
+        middle = parallel.middle[:, axis]
+        with np.errstate(invalid="ignore"):
+            rows = (
+                (parallel.along, parallel.across)[axis]
+                & (middle > ends[:, axis].min())
+                & (middle < ends[:, axis].max())
+            )
+        places = np.append(
+            ends[0, 1 - axis], parallel.outline[0, 1 - axis] + np.ptp(parallel.outline[:, 1 - axis]) * share
+        )
+        near = np.abs(parallel.middle[rows, 1 - axis] - places[:, None]) < near_px * parallel.pixel_m[rows]
+        covered = near @ (search.stroke_map.strokes.length_px * parallel.pixel_m)[rows]
+        chances.append(float(np.mean(covered >= as_many * covered[0])))
+    return -float(np.sum(np.log(np.sort(chances)[_LAID:])))
 
 
 def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices32
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import or_none
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.bundle import solve
@@ -102,6 +102,7 @@ def problem_of(
     return Problem(gather_sights(observations), layout, known, weighting, _QUICK), estimate
 
 
+@or_none  # reads: "its lines were not found ..." where no start leads to a camera
 def refit_camera(
     camera: Camera,
     observations: Observations,
@@ -117,11 +118,8 @@ def refit_camera(
         weighting: noise and loss; by default one under which what is far off decides nothing.
     """
     problem, estimate = problem_of(camera, observations, free, priors, weighting)
-    try:
-        solution = solve(problem, estimate, precision=1e-6)
-        refitted = solution.estimate.camera_at(STATION)
-    except CalibrationError:  # reads: "its lines were not found ..." where no start leads to a camera
-        return None
+    solution = solve(problem, estimate, precision=1e-6)
+    refitted = solution.estimate.camera_at(STATION)
     finite = np.all(np.isfinite(refitted.position))
     usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > 0.0
     found = solution.estimate.structure.dimensions

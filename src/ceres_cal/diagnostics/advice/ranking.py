@@ -9,12 +9,13 @@ from functools import partial
 
 import numpy as np
 
+from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each
-from ceres_cal.base.numerical import numerical
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.typed import checked
+from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, still
 from ceres_cal.diagnostics.advice.measurements import Ground, Measurement
@@ -23,7 +24,6 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Weighting
-from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import Target
 
 _LARGER, _LESS = 0.5, 0.2

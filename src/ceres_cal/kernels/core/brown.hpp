@@ -11,8 +11,7 @@ class Brown final : public Lens {
   public:
     explicit Brown(const Making& from)
         : Lens(from),
-          p1_(from.intrinsics[6]),
-          p2_(from.intrinsics[7]),
+          by_{from.intrinsics[6], from.intrinsics[7]},
           rational_(static_cast<int>(from.form[0])),
           prism_(static_cast<int>(from.form[1])) {
         const Numbers& intrinsics = from.intrinsics;
@@ -30,8 +29,8 @@ class Brown final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double phi = this->phi, p1 = p1_, p2 = p2_, k1 = k_[1], k2 = k_[2], k3 = k_[3], k4 = q_[1], k5 = q_[2],
-                     k6 = q_[3], s1 = s_[0], s2 = s_[1], s3 = s_[2], s4 = s_[3], limit2 = limit_ * limit_;
+        const double phi = this->phi, p1 = by_.p1, p2 = by_.p2, k1 = k_[1], k2 = k_[2], k3 = k_[3], k4 = q_[1],
+                     k5 = q_[2], k6 = q_[3], s1 = s_[0], s2 = s_[1], s3 = s_[2], s4 = s_[3], limit2 = limit_ * limit_;
         int bad = 0;
         each(n, [&](int i) {
             const double z = rays.z[i], iz = 1.0 / z, u = rays.x[i] * iz, v = rays.y[i] * iz, r2 = u * u + v * v;
@@ -57,21 +56,16 @@ class Brown final : public Lens {
     void differentiate(const Rows& rows) override {
         const double phi = this->phi, aspect = this->aspect;
         const int n = rows.n;
-        double *x[5], *y[5];
-        for (int k = 0; k < 5; ++k) x[k] = rows.show(4 + k), y[k] = rows.y(4 + k);
+        double *x[3], *y[3];
+        for (int k = 0; k < 3; ++k) x[k] = rows.show(k == 2 ? 8 : 4 + k), y[k] = x[k] + n;
         each(n, [&](int i) {
-            const double u = u_[i], v = v_[i], r2 = r2_[i], a = below_[i] * phi * u, b = below_[i] * aspect * phi * v;
-            const double r4 = r2 * r2, r6 = r4 * r2;
-            x[0][i] = a * r2, y[0][i] = b * r2;
-            x[1][i] = a * r4, y[1][i] = b * r4;
-            x[2][i] = 2.0 * phi * u * v, y[2][i] = aspect * phi * (r2 + 2.0 * v * v);
-            x[3][i] = phi * (r2 + 2.0 * u * u), y[3][i] = 2.0 * aspect * phi * u * v;
-            x[4][i] = a * r6, y[4][i] = b * r6;
+            double power = below_[i] * phi;
+            for (int k = 0; k < 3; ++k) power *= r2_[i], x[k][i] = power * u_[i], y[k][i] = aspect * power * v_[i];
         });
+        differentiate_decentring(rows, 6, u_, v_);
         for (int k = 0; k < 3 && rational_ > 0; ++k) {
-            const double* over = rows.x(k == 2 ? 8 : 4 + k);  // k1, k2 and k3 have the same powers over the line
-            double* own = rows.show(rational_ + k);
-            each(n, [&](int i) { own[i] = -radial_[i] * over[i], own[n + i] = -radial_[i] * over[n + i]; });
+            double* own = rows.show(rational_ + k);  // k1, k2 and k3 have the same powers over the line
+            each(n, [&](int i) { own[i] = -radial_[i] * x[k][i], own[n + i] = -radial_[i] * y[k][i]; });
         }
         for (int k = 0; k < 4 && prism_ > 0; ++k) {
             rows.open(prism_ + k);
@@ -84,7 +78,8 @@ class Brown final : public Lens {
   private:
     static constexpr double FAR = 6.0, FARTHEST = 1e4;  // ideal radii, of 80.5 and 89.994 degrees off the axis
 
-    double p1_, p2_, k_[4] = {1.0}, q_[4] = {1.0}, s_[4] = {}, limit_ = 0.0;
+    Decentring by_;
+    double k_[4] = {1.0}, q_[4] = {1.0}, s_[4] = {}, limit_ = 0.0;
     int rational_, prism_;
     Lane u_, v_, r2_, below_, radial_;
 };

@@ -4,13 +4,16 @@
 #include <algorithm>
 #include <cmath>
 
+#include "chunk.hpp"
+
 namespace ceres_cal {
 
 constexpr int MANY = 64;        // numbers from which on rounding in what observations leave open adds up
 constexpr double LIFT = 1e-12;  // and the share of the diagonal that is added against it: that changes no slope
 
-// U with U^T U = A from A's lower triangle; where A is singular the row of U is zero. Row i of A begins at i * stride.
-inline void cholesky(int size, const double* normal, int stride, double* upper) {
+// U with U^T U = A from A's lower triangle; where less than a share `least` of the diagonal is left the row of U is
+// zero. Row i of A begins at i * stride.
+inline void cholesky(int size, const double* normal, int stride, double* upper, double least = 1e-15) {
     const double whole = 1.0 + (size > MANY ? LIFT : 0.0);
     std::fill_n(upper, static_cast<size_t>(size) * size, 0.0);
     for (int k = 0; k < size; ++k) {
@@ -23,7 +26,7 @@ inline void cholesky(int size, const double* normal, int stride, double* upper) 
             if (factor == 0.0) continue;
             for (int i = k; i < size; ++i) own[i] -= factor * above[i];
         }
-        if (!(own[k] > 1e-15 * diagonal)) {
+        if (!(own[k] > least * diagonal)) {
             std::fill(own + k, own + size, 0.0);
             continue;
         }
@@ -33,22 +36,19 @@ inline void cholesky(int size, const double* normal, int stride, double* upper) 
     }
 }
 
-// normal += weight row row^T, lower triangle.
-inline void add_product(int size, double weight, const double* row, double* normal) {
-    for (int k = 0; k < size; ++k)
-        for (int j = 0; j <= k; ++j) normal[static_cast<size_t>(size) * k + j] += weight * row[k] * row[j];
-}
-
-// x <- (U^T U)^-1 x by forward and back substitution; U of full rank.
-inline void substitute(int size, const double* upper, double* x) {
-    for (int k = 0; k < size; ++k) {
-        for (int j = 0; j < k; ++j) x[k] -= upper[size * j + k] * x[j];
-        x[k] /= upper[size * k + k];
-    }
-    for (int k = size - 1; k >= 0; --k) {
-        for (int j = k + 1; j < size; ++j) x[k] -= upper[size * k + j] * x[j];
-        x[k] /= upper[size * k + k];
-    }
+// x <- (U^T U)^-1 x by forward and back substitution, of (size, columns); where a row of U is zero x is.
+inline void substitute(int size, const double* upper, double* x, int columns = 1) {
+    const auto finish = [&](int k, int first, int last, int apart, const double* factors) {
+        double *own = x + columns * k, diagonal = upper[size * k + k], scale = diagonal > 0.0 ? 1.0 / diagonal : 0.0;
+        for (int j = first; j < last; ++j) {
+            const double factor = factors[apart * j], *other = x + columns * j;
+            CERES_CAL_INDEPENDENT
+            for (int i = 0; i < columns; ++i) own[i] -= factor * other[i];
+        }
+        for (int i = 0; i < columns; ++i) own[i] *= scale;
+    };
+    for (int k = 0; k < size; ++k) finish(k, 0, k, size, upper + k);
+    for (int k = size - 1; k >= 0; --k) finish(k, k + 1, size, 1, upper + size * k);
 }
 
 // out (rows, columns) = a (rows, inner) b (inner, columns), their rows so many numbers apart.

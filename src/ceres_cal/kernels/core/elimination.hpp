@@ -18,13 +18,7 @@ struct Sweep {
 class Elimination {
   public:
     Elimination(Lens& lens, const Unknowns& unknowns, const Observed& seen, bool newton)
-        : sums_(lens, unknowns, seen),
-          newton_(newton),
-          count_(unknowns.shared()),
-          size_(unknowns.size()),
-          normal_(static_cast<size_t>(size_) * size_),
-          trial_(normal_.size()),
-          gain_(6 * static_cast<size_t>(count_ + 1)) {}
+        : sums_(lens, unknowns, seen), newton_(newton), count_(unknowns.shared()), size_(unknowns.size()) {}
 
     // One sight at its best pose: its cost, and what it says of the shared numbers.
     void eliminate(int64_t sight, double tolerance, const double* change, const Sweep& sweep) {
@@ -51,10 +45,8 @@ class Elimination {
             for (int k = 0; k < 6; ++k) step[k] = -gain(k)[count_];
             move(pose, step, moved);
         }
-        if (!std::isfinite(cost)) {
-            sweep.costs[sight] = INFINITY;
-            return;
-        }
+        sweep.costs[sight] = INFINITY;
+        if (!std::isfinite(cost)) return;
         bool whole = true;
         if (damping > 0.0) promise = solve_pose(0.0), whole = promise <= 1e-2 * cost;
         for (int k = 0; k < 6; ++k) step[k] = whole ? -gain(k)[count_] : 0.0;
@@ -82,36 +74,15 @@ class Elimination {
     // gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is. The
     // answer is what the step, -gain's last column, promises of the cost.
     double solve_pose(double damping) {
-        double lower[6][6];  // its diagonal inverted: a product is cheaper than a quotient
-        for (int k = 0; k < 6; ++k)
-            for (int i = k; i < 6; ++i) {
-                double total = normal(count_ + i)[count_ + k] * (i == k ? 1.0 + damping : 1.0);
-                for (int j = 0; j < k; ++j) total -= lower[i][j] * lower[k][j];
-                const bool held = !(total > 1e-13 * normal(count_ + k)[count_ + k]);
-                lower[i][k] = i == k ? (held ? 0.0 : 1.0 / std::sqrt(total)) : total * lower[k][k];
-            }
+        double damped[36], upper[36], promise = 0.0;
         for (int k = 0; k < 6; ++k) {
-            std::copy_n(normal(count_ + k), count_, gain(k));
-            gain(k)[count_] = normal(count_ + 6)[count_ + k];
-            for (int j = 0; j < k; ++j) add_multiple(-lower[k][j], gain(j), gain(k));
-            scale(lower[k][k], gain(k));
+            std::copy_n(normal(count_ + k) + count_, k + 1, damped + 6 * k), damped[7 * k] *= 1.0 + damping;
+            std::copy_n(normal(count_ + k), count_, gain(k)), gain(k)[count_] = normal(count_ + 6)[count_ + k];
         }
-        for (int k = 5; k >= 0; --k) {
-            for (int j = k + 1; j < 6; ++j) add_multiple(-lower[j][k], gain(j), gain(k));
-            scale(lower[k][k], gain(k));
-        }
-        double promise = 0.0;
+        cholesky(6, damped, 6, upper, 1e-13);
+        substitute(6, upper, gain_.data(), count_ + 1);
         for (int k = 0; k < 6; ++k) promise += gain(k)[count_] * normal(count_ + 6)[count_ + k];
         return promise;
-    }
-
-    void add_multiple(double factor, const double* row, double* own) const {
-        CERES_CAL_INDEPENDENT
-        for (int i = 0; i <= count_; ++i) own[i] += factor * row[i];
-    }
-
-    void scale(double factor, double* own) const {
-        for (int i = 0; i <= count_; ++i) own[i] *= factor;
     }
 
     // reduced += A_cc - A_cp A_pp^-1 A_pc, lower triangle, the residual's row last.
@@ -135,7 +106,8 @@ class Elimination {
     Sums sums_;
     const bool newton_;
     const int count_, size_;
-    std::vector<double> normal_, trial_, gain_;
+    std::vector<double> normal_ = std::vector<double>(static_cast<size_t>(size_) * size_), trial_ = normal_;
+    std::vector<double> gain_ = std::vector<double>(6 * static_cast<size_t>(count_ + 1));
 };
 
 }  // namespace ceres_cal

@@ -17,25 +17,7 @@ class KannalaBrandt final : public Lens {
     }
 
     bool distort(int n, const Rays& rays, Image& image) override {
-        const double phi = this->phi, k1 = k_[0], k2 = k_[1], k3 = k_[2], k4 = k_[3];
-        each(n, [&](int i) { across_[i] = std::sqrt(rays.x[i] * rays.x[i] + rays.y[i] * rays.y[i]) + TINY; });
-        for (int i = 0; i < n; ++i) angle_[i] = std::atan2(across_[i], rays.z[i]);
-        int bad = 0;
-        each(n, [&](int i) {
-            const double x = rays.x[i], y = rays.y[i], z = rays.z[i], across = across_[i], angle = angle_[i];
-            const double across2 = x * x + y * y, range2 = across2 + z * z, a2 = angle * angle;
-            const double measured = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
-            const double slope = 1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4)));
-            const auto [stretch, bend] = along_meridian(measured, slope * z / range2, across, across2, z);
-            image.x[i] = phi * stretch * x, image.y[i] = phi * stretch * y;
-            image.xx[i] = phi * (stretch + bend * x * x), image.yy[i] = phi * (stretch + bend * y * y);
-            image.xy[i] = phi * bend * x * y, image.yx[i] = phi * bend * x * y;
-            image.xz[i] = -phi * x * slope / range2, image.yz[i] = -phi * y * slope / range2;
-            cos_[i] = x / across, sin_[i] = y / across;
-            bad += !((angle < limit_) & (range2 > 0.0));
-        });
-        if (tangential_ > 0) add_tangential(n, rays, image);
-        return bad == 0;
+        return tangential_ > 0 ? distort_by<true>(n, rays, image) : distort_by<false>(n, rays, image);
     }
 
     void differentiate(const Rows& rows) override {
@@ -47,15 +29,7 @@ class KannalaBrandt final : public Lens {
             double d = phi * a2 * angle_[i];
             for (int k = 0; k < 4; ++k, d *= a2) x[k][i] = d * cos_[i], y[k][i] = aspect * d * sin_[i];
         });
-        if (tangential_ <= 0) return;
-        for (int k = 0; k < 2; ++k) {
-            const Decentring one = {k == 0 ? phi : 0.0, k == 1 ? phi : 0.0};
-            x[k] = rows.show(tangential_ + k), y[k] = rows.y(tangential_ + k);
-            each(rows.n, [&](int i) {
-                const double a = angle_[i] * cos_[i], b = angle_[i] * sin_[i];
-                x[k][i] = one.x(a, b), y[k][i] = aspect * one.y(a, b);
-            });
-        }
+        if (tangential_ > 0) differentiate_decentring(rows, tangential_, along_x_, along_y_);
     }
 
   private:
@@ -74,27 +48,42 @@ class KannalaBrandt final : public Lens {
         return {stretch, aside ? turn : 0.0};
     }
 
-    void add_tangential(int n, const Rays& rays, Image& image) {
-        const double phi = this->phi;
+    template <bool decentred>
+    bool distort_by(int n, const Rays& rays, Image& image) {
+        const double phi = this->phi, k1 = k_[0], k2 = k_[1], k3 = k_[2], k4 = k_[3];
         const Decentring by = decentring_;
+        each(n, [&](int i) { across_[i] = std::sqrt(rays.x[i] * rays.x[i] + rays.y[i] * rays.y[i]) + TINY; });
+        for (int i = 0; i < n; ++i) angle_[i] = std::atan2(across_[i], rays.z[i]);
+        int bad = 0;
         each(n, [&](int i) {
-            const double x = rays.x[i], y = rays.y[i], z = rays.z[i], across = across_[i];
-            const double across2 = x * x + y * y, range2 = across2 + z * z;
-            const auto [away, bend] = along_meridian(angle_[i], z / range2, across, across2, z);
-            const double a = away * x, b = away * y;
-            const double ax = away + bend * x * x, ab = bend * x * y, bb = away + bend * y * y;
-            const double xx = by.xx(a, b), xy = by.xy(a, b), yy = by.yy(a, b);
-            image.x[i] += phi * by.x(a, b), image.y[i] += phi * by.y(a, b);
-            image.xx[i] += phi * (xx * ax + xy * ab), image.xy[i] += phi * (xx * ab + xy * bb);
-            image.yx[i] += phi * (xy * ax + yy * ab), image.yy[i] += phi * (xy * ab + yy * bb);
-            image.xz[i] -= phi * (xx * x + xy * y) / range2, image.yz[i] -= phi * (xy * x + yy * y) / range2;
+            const double x = rays.x[i], y = rays.y[i], z = rays.z[i], across = across_[i], angle = angle_[i];
+            const double across2 = x * x + y * y, range2 = across2 + z * z, a2 = angle * angle;
+            const double measured = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
+            const double slope = 1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4)));
+            const auto [stretch, bend] = along_meridian(measured, slope * z / range2, across, across2, z);
+            double to_x = stretch * x, to_y = stretch * y, far = slope / range2, xz = far * x, yz = far * y;
+            double xx = stretch + bend * x * x, xy = bend * x * y, yx = xy, yy = stretch + bend * y * y;
+            if constexpr (decentred) {
+                const auto [away, turn] = along_meridian(angle, z / range2, across, across2, z);
+                const double a = along_x_[i] = away * x, b = along_y_[i] = away * y;
+                const double ax = away + turn * x * x, ab = turn * x * y, bb = away + turn * y * y;
+                const double by_xx = by.xx(a, b), by_xy = by.xy(a, b), by_yy = by.yy(a, b);
+                to_x += by.x(a, b), xx += by_xx * ax + by_xy * ab, xz += (by_xx * x + by_xy * y) / range2;
+                to_y += by.y(a, b), yy += by_xy * ab + by_yy * bb, yz += (by_xy * x + by_yy * y) / range2;
+                xy += by_xx * ab + by_xy * bb, yx += by_xy * ax + by_yy * ab;
+            }
+            image.x[i] = phi * to_x, image.xx[i] = phi * xx, image.xy[i] = phi * xy, image.xz[i] = -phi * xz;
+            image.y[i] = phi * to_y, image.yx[i] = phi * yx, image.yy[i] = phi * yy, image.yz[i] = -phi * yz;
+            cos_[i] = x / across, sin_[i] = y / across;
+            bad += !((angle < limit_) & (range2 > 0.0));
         });
+        return bad == 0;
     }
 
     double k_[4], limit_ = 0.0;
     Decentring decentring_;
     int tangential_;
-    Lane across_, angle_, cos_, sin_;
+    Lane across_, angle_, cos_, sin_, along_x_, along_y_;
 };
 
 }  // namespace ceres_cal

@@ -95,6 +95,15 @@ class Lens {
     // times the offset's) by each coefficient as the solver has it; and row 0, phi's, where the offset is not
     // proportional to phi. Marks the rows that it fills.
     virtual void differentiate(const Rows& rows) = 0;
+
+    // The rows of Brown's decentring of the points (a, b), from the place `at` on.
+    void differentiate_decentring(const Rows& rows, int at, const Lane& a, const Lane& b) const {
+        for (int k = 0; k < 2; ++k) {
+            const Decentring one = {k == 0 ? phi : 0.0, k == 1 ? phi : 0.0};
+            double *x = rows.show(at + k), *y = rows.y(at + k);
+            each(rows.n, [&](int i) { x[i] = one.x(a[i], b[i]), y[i] = aspect * one.y(a[i], b[i]); });
+        }
+    }
 };
 
 constexpr double TINY = 1e-150;  // its square is still a number

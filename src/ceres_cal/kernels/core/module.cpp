@@ -22,60 +22,19 @@ auto unlocked(Work work) {
     return work();
 }
 
-// of_group(g, start, n) of each group of rows: there must be as many as `answers` has room for.
-template <class OfGroup>
-void each_group(const Bounds& bounds, size_t rows, size_t answers, OfGroup of_group) {
-    require(bounds.size() == answers + 1, "bounds: one more than there are groups is needed");
-    check_bounds(bounds, 0, static_cast<int64_t>(answers), rows);
-    unlocked([&] {
-        for (size_t g = 0; g < answers; ++g) {
-            const int64_t start = bounds.data()[g];
-            of_group(g, start, bounds.data()[g + 1] - start);
-        }
-    });
-}
-
-void align_sights(const Bounds& bounds, const Read<2, N>& x, const Read<N, 2>& p, const Read<N>& weights,
-                  const Filled<N, 6>& h12, const Filled<N, 3, N>& shares, const Filled<N, N>& reduced) {
-    const size_t rows = p.shape(0), columns = reduced.shape(0);
-    require(x.shape(1) == rows && weights.size() == rows, "x, p and weights are of as many points");
-    require(
-        shares.shape(0) == h12.shape(0) && shares.shape(2) == columns && reduced.shape(1) == columns && columns >= 1,
-        "h12 and shares are of as many sights, shares and reduced of as many terms and one");
-    each_group(bounds, rows, h12.shape(0), [&](int64_t g, int64_t start, int64_t n) {
-        const Aligned seen{n, row(x, 0) + start, row(x, 1) + start, row(p, start), row(weights, start)};
-        align(seen, row(h12, g));
-        add_depths(seen, row(h12, g), whole(columns), row(shares, g), reduced.data());
-    });
-}
-
-void find_alignment_errors(const Bounds& bounds, const Read<2, N>& x, const Read<N, 2>& p, const Read<N, 6>& h12,
-                           const Read<N, 3>& h3, const Read<N>& profile, const Filled<N>& errors) {
-    const size_t rows = p.shape(0);
-    require(x.shape(1) == rows && errors.size() == rows, "x, p and errors are of as many points");
-    require(h3.shape(0) == h12.shape(0), "h12 and h3 are of as many sights");
-    each_group(bounds, rows, h12.shape(0), [&](int64_t g, int64_t start, int64_t n) {
-        const Aligned seen{n, row(x, 0) + start, row(x, 1) + start, row(p, start), nullptr};
-        alignment_errors(seen, row(h12, g), row(h3, g), profile.data(), whole(profile.size()), row(errors, start));
-    });
-}
-
-void normalised_planes(const Bounds& bounds, const Read<N, 2>& plane, const Filled<2, N>& x,
-                       const Filled<N, 3>& lifts) {
-    require(x.shape(1) == plane.shape(0), "plane and x are of as many points");
-    each_group(bounds, plane.shape(0), lifts.shape(0), [&](int64_t g, int64_t start, int64_t n) {
-        normalise(n, row(plane, start), row(x, 0) + start, row(x, 1) + start, row(lifts, g));
-    });
-}
-
 void plane_homographies(const Bounds& bounds, const Read<N, 2>& plane, const Read<N, 2>& offsets,
                         const Read<N>& profile, double unit, double wrong, const Filled<N, 3, 3>& homographies,
                         const Filled<N>& errors) {
     const size_t rows = plane.shape(0);
     require(offsets.shape(0) == rows && errors.size() == rows, "plane, offsets and errors are of as many points");
     Homographies fits(profile.data(), whole(profile.size()), unit, wrong);
-    each_group(bounds, rows, homographies.shape(0), [&](int64_t g, int64_t start, int64_t n) {
-        if (n > 0) fits.fit(n, row(plane, start), row(offsets, start), row(homographies, g), row(errors, start));
+    require(bounds.size() == homographies.shape(0) + 1, "bounds: one more than there are homographies is needed");
+    const int64_t sights = static_cast<int64_t>(homographies.shape(0)), *first = bounds.data();
+    check_bounds(bounds, 0, sights, rows);
+    unlocked([&] {
+        for (int64_t g = 0, k = first[0]; g < sights; k = first[++g])
+            if (const int64_t n = first[g + 1] - k; n > 0)
+                fits.fit(n, row(plane, k), row(offsets, k), row(homographies, g), row(errors, k));
     });
 }
 
@@ -109,8 +68,7 @@ bool block(Tuple optics, Tuple unknowns, Tuple points, Tuple curves, Tuple loss,
     const auto filled = [&](int k, int size) -> double* {
         kept[k] = array<Filled<N>>(jacobians[k], "jacobians");
         if (kept[k].size() == 0) return nullptr;
-        require(whole(kept[k].size()) == own.size() * size,
-                "jacobians: as many rows as residuals times the block's size");
+        require(whole(kept[k].size()) == own.size() * size, "jacobians: (residuals, numbers of the block)");
         return kept[k].data();
     };
     double* const blocks[4] = {filled(0, own.count), filled(1, 6), filled(2, 6), filled(3, own.structure)};
@@ -145,9 +103,8 @@ void sight_normals(int64_t first, int64_t last, Tuple optics, Tuple unknowns, Tu
                    bool newton, const Poses& poses, const Read<N>& units, const Filled<N>& costs,
                    const Filled<N, N, N>& normals) {
     const Seen seen(first, last, optics, unknowns, points, curves, loss);
-    const size_t size = static_cast<size_t>(seen.unknowns.size()), sights = costs.size();
-    require(last - first == static_cast<int64_t>(sights) && normals.shape(0) == sights,
-            "costs and normals are of as many sights");
+    const size_t size = static_cast<size_t>(seen.unknowns.size()), asked = static_cast<size_t>(last - first);
+    require(costs.size() == asked && normals.shape(0) == asked, "costs and normals are of as many sights");
     require(poses.shape(0) >= static_cast<size_t>(last), "there are fewer poses");
     require(units.size() == size && normals.shape(1) == size && normals.shape(2) == size,
             "units are (K,), normals (S, K, K)");
@@ -233,9 +190,6 @@ bool has_avx2() {
 
 NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("has_avx2", &has_avx2);
-    m.def("align_sights", &align_sights);
-    m.def("alignment_errors", &find_alignment_errors);
-    m.def("normalised_planes", &normalised_planes);
     m.def("plane_homographies", &plane_homographies);
     m.def("cholesky", &factor);
     m.def("loss_weights", &loss_weights);

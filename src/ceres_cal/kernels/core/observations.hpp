@@ -69,20 +69,24 @@ struct Unknowns {
 
 // ---- the robust losses, as Ceres defines them ----
 
-// rho and its derivative at a squared residual.
+// rho and its derivative at a squared residual s; and sqrt(1 + 2 s rho'' / rho'), how the loss' own bend shortens the
+// Jacobian along the residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3).
+//
+// 1 for the redescending losses: along their bend a step may climb.
 struct Robust {
-    double rho, slope;
+    double rho, slope, bend = 1.0;
 };
 
 template <LossCode code>
 inline Robust robust(double scale, double squared) {
+    constexpr double STRAIGHT = 0.1;  // in place of 0, where a loss has no curvature left
     const double b = scale * scale;
     if constexpr (code == LossCode::huber) {
         const double root = std::sqrt(squared);
-        return squared <= b ? Robust{squared, 1.0} : Robust{2.0 * scale * root - b, scale / root};
+        return squared <= b ? Robust{squared, 1.0} : Robust{2.0 * scale * root - b, scale / root, STRAIGHT};
     } else if constexpr (code == LossCode::soft_l1) {
         const double root = std::sqrt(1.0 + squared / b);
-        return {2.0 * squared / (1.0 + root), 1.0 / root};  // 2 b (root - 1) without its rounding
+        return {2.0 * squared / (1.0 + root), 1.0 / root, 1.0 / root};  // 2 b (root - 1) without its rounding
     } else if constexpr (code == LossCode::cauchy) {
         return {b * std::log1p(squared / b), 1.0 / (1.0 + squared / b)};
     } else if constexpr (code == LossCode::tukey) {
@@ -107,17 +111,6 @@ inline auto with_loss(LossCode code, Function function) {
         case LossCode::tukey: return function(Chosen<LossCode::tukey>());
         default: return function(Chosen<LossCode::trivial>());
     }
-}
-
-// sqrt(1 + 2 s rho'' / rho') at the squared residual s: how the loss' own bend shortens the Jacobian along the residual
-// (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3).
-//
-// 1 for the redescending losses: along their bend a step may climb.
-inline double bend(const Loss& loss, double squared) {
-    constexpr double STRAIGHT = 0.1;  // in place of 0, where a loss has no curvature left
-    const double b = loss.scale * loss.scale;
-    if (loss.code == LossCode::huber) return squared > b ? STRAIGHT : 1.0;
-    return loss.code == LossCode::soft_l1 ? 1.0 / std::sqrt(1.0 + squared / b) : 1.0;
 }
 
 }  // namespace ceres_cal

@@ -16,22 +16,9 @@ inline double median(std::vector<double>& values) {
     return values.size() % 2 == 1 ? *half : 0.5 * (*std::max_element(values.begin(), half, before) + *half);
 }
 
-// x and y: the points (n, 2) with their centroid at 0 and unit spread; lift (3): centroid and 1 / spread.
-inline void normalise(int64_t n, const double* plane, double* x, double* y, double* lift) {
-    double sums[2] = {}, spread = 0.0;
-    for (int64_t i = 0; i < n; ++i) sums[0] += plane[2 * i], sums[1] += plane[2 * i + 1];
-    lift[0] = sums[0] / static_cast<double>(n), lift[1] = sums[1] / static_cast<double>(n);
-    for (int64_t i = 0; i < n; ++i) {
-        x[i] = plane[2 * i] - lift[0], y[i] = plane[2 * i + 1] - lift[1];
-        spread += x[i] * x[i] + y[i] * y[i];
-    }
-    lift[2] = 1.0 / (std::sqrt(spread / static_cast<double>(n)) + 1e-12);
-    for (int64_t i = 0; i < n; ++i) x[i] *= lift[2], y[i] *= lift[2];
-}
-
-// The unit vector that `normal` (lower triangle) shrinks most, by inverse iteration from h.
-template <int SIZE>
+// The unit vector that `normal` (SIZE squared, lower triangle) shrinks most, by inverse iteration from h.
 inline void least_direction(double* normal, double* h) {
+    constexpr int SIZE = 9;
     double upper[SIZE * SIZE], trace = 0.0;
     for (int i = 0; i < SIZE; ++i) trace += normal[(SIZE + 1) * i];
     for (int i = 0; i < SIZE; ++i) normal[(SIZE + 1) * i] += 1e-13 * trace;
@@ -57,12 +44,11 @@ class Homographies {
         for (std::vector<double>* one : {&x_, &y_, &a_, &b_, &c_}) one->resize(static_cast<size_t>(n));
         weights_.assign(static_cast<size_t>(n), 1.0);
         double lift[3], normal[81], h[9];
-        lift_offsets(n, offsets);
-        normalise(n, plane, x_.data(), y_.data(), lift);
+        load(n, plane, offsets, lift);
         for (int i = 0; i < 9; ++i) h[i] = 1.0 + 0.1 * i;  // anything: what the moments shrink more vanishes soon
         for (int round = 0; round < PATIENCE; ++round) {
             add_moments(n, normal);
-            least_direction<9>(normal, h);
+            least_direction(normal, h);
             judge(n, h, errors);
             ordered_.assign(errors, errors + n);
             const double usual = median(ordered_), worst = *std::max_element(errors, errors + n);
@@ -80,14 +66,21 @@ class Homographies {
     }
 
   private:
-    void lift_offsets(int64_t n, const double* offsets) {
+    // x and y: the plane's points with their centroid at 0 and unit spread, lift (3): centroid and 1 / spread; and q.
+    void load(int64_t n, const double* plane, const double* offsets, double* lift) {
+        double spread = 0.0;
+        lift[0] = lift[1] = 0.0;
+        for (int64_t i = 0; i < 2 * n; ++i) lift[i % 2] += plane[i] / static_cast<double>(n);
         for (int64_t i = 0; i < n; ++i) {
-            a_[i] = offsets[2 * i] / unit_, b_[i] = offsets[2 * i + 1] / unit_;
-            const double squared = a_[i] * a_[i] + b_[i] * b_[i];
-            double w = 0.0;
-            for (int k = terms_ - 1; k >= 0; --k) w = (w + profile_[k]) * squared;
-            c_[i] = 1.0 + w;
+            x_[i] = plane[2 * i] - lift[0], y_[i] = plane[2 * i + 1] - lift[1];
+            spread += x_[i] * x_[i] + y_[i] * y_[i];
+            const double a = a_[i] = offsets[2 * i] / unit_, b = b_[i] = offsets[2 * i + 1] / unit_;
+            c_[i] = 0.0;
+            for (int k = terms_ - 1; k >= 0; --k) c_[i] = (c_[i] + profile_[k]) * (a * a + b * b);
+            c_[i] += 1.0;
         }
+        lift[2] = 1.0 / (std::sqrt(spread / static_cast<double>(n)) + 1e-12);
+        for (int64_t i = 0; i < n; ++i) x_[i] *= lift[2], y_[i] *= lift[2];
     }
 
     // normal (9, 9), lower triangle: of q_w (h1 . X) - q_x (h3 . X) = 0 and q_w (h2 . X) - q_y (h3 . X) = 0.
@@ -130,79 +123,5 @@ class Homographies {
     double unit_, wrong_;
     std::vector<double> x_, y_, a_, b_, c_, weights_, ordered_;
 };
-
-// ---- radial alignment: what each sight tells by itself, and what all say of the profile together ----
-//
-// Points of one sight: x and y (n) of the plane, p (n, 2) offsets, of unit size each.
-
-struct Aligned {
-    int64_t n;
-    const double *x, *y, *p, *weights;
-};
-
-// h (6): h1 and h2 of p_x (h2 . X) - p_y (h1 . X) = 0, scaled so that |(h1 . X, h2 . X)| is |p| on average.
-inline void align(const Aligned& seen, double* h) {
-    double normal[36] = {}, agree = 0.0, size = 0.0;
-    for (int64_t i = 0; i < seen.n; ++i) {
-        const double a = seen.p[2 * i], b = seen.p[2 * i + 1], x = seen.x[i], y = seen.y[i];
-        const double row[6] = {-b * x, -b * y, -b, a * x, a * y, a};
-        add_product(6, seen.weights[i], row, normal);
-    }
-    for (int k = 0; k < 6; ++k) h[k] = 1.0 + 0.1 * k;
-    least_direction<6>(normal, h);
-    for (int64_t i = 0; i < seen.n; ++i) {
-        const double a = seen.p[2 * i], b = seen.p[2 * i + 1];
-        const double u = h[0] * seen.x[i] + h[1] * seen.y[i] + h[2], v = h[3] * seen.x[i] + h[4] * seen.y[i] + h[5];
-        agree += seen.weights[i] * (u * a + v * b), size += seen.weights[i] * (a * a + b * b);
-    }
-    for (int k = 0; k < 6; ++k) h[k] *= size / (std::abs(agree) > 1e-12 ? agree : 1e-12);
-}
-
-// Of r (h3 . X) - q sum c_k r^2k = q: share (3, terms + 1) is how h3 follows (c, 1); the rest is added up.
-inline void add_depths(const Aligned& seen, const double* h, int columns, double* share, double* reduced) {
-    const int size = 3 + columns;
-    std::vector<double> products(static_cast<size_t>(size) * size), row(static_cast<size_t>(size));
-    for (int64_t i = 0; i < seen.n; ++i) {
-        const double a = seen.p[2 * i], b = seen.p[2 * i + 1], r = std::sqrt(a * a + b * b);
-        const double u = h[0] * seen.x[i] + h[1] * seen.y[i] + h[2], v = h[3] * seen.x[i] + h[4] * seen.y[i] + h[5];
-        const double q = (u * a + v * b) / std::max(r, 1e-9);
-        row[0] = r * seen.x[i], row[1] = r * seen.y[i], row[2] = r, row[size - 1] = q;
-        double power = -q;
-        for (int k = 3; k < size - 1; ++k) power *= r * r, row[k] = power;
-        add_product(size, seen.weights[i], row.data(), products.data());
-    }
-    const double trace = products[0] + products[size + 1] + products[2 * (size + 1)];
-    for (int k = 0; k < 3; ++k) products[(size + 1) * k] += 1e-12 * trace;
-    double upper[9], own[3];
-    cholesky(3, products.data(), size, upper);
-    for (int column = 0; column < columns; ++column) {
-        for (int k = 0; k < 3; ++k) own[k] = products[size * (3 + column) + k];
-        substitute(3, upper, own);
-        for (int k = 0; k < 3; ++k) share[columns * k + column] = own[k];
-    }
-    for (int k = 0; k < columns; ++k)
-        for (int j = 0; j < columns; ++j) {
-            double value = products[size * (3 + std::max(k, j)) + 3 + std::min(k, j)];
-            for (int i = 0; i < 3; ++i) value -= products[size * (3 + k) + i] * share[columns * i + j];
-            reduced[columns * k + j] += value;
-        }
-}
-
-// Distance of each point from where h12 (6) and h3 (3) send it under the profile c_k.
-inline void alignment_errors(const Aligned& seen, const double* h, const double* d, const double* profile, int terms,
-                             double* errors) {
-    for (int64_t i = 0; i < seen.n; ++i) {
-        const double a = seen.p[2 * i], b = seen.p[2 * i + 1], x = seen.x[i], y = seen.y[i],
-                     r = std::sqrt(a * a + b * b);
-        const double u = h[0] * x + h[1] * y + h[2], v = h[3] * x + h[4] * y + h[5];
-        const double depth = d[0] * x + d[1] * y + d[2];
-        double w = 0.0;
-        for (int k = terms - 1; k >= 0; --k) w = (w + profile[k]) * r * r;
-        const double q = (u * a + v * b) / std::max(r, 1e-9);
-        const double across = (a * v - b * u) / std::max(std::sqrt(u * u + v * v), 1e-9) * r;
-        const double along = r - q * (1.0 + w) / (std::abs(depth) > 1e-9 ? depth : 1e-9);
-        errors[i] = std::sqrt(across * across + along * along);
-    }
-}
 
 }  // namespace ceres_cal

@@ -73,11 +73,7 @@ class Radial final : public Lens {
                 x[i] = d * u_[i], y[i] = aspect * d * v_[i];
             });
         }
-        for (int k = 0; k < 2 && tangential_ > 0; ++k) {
-            const Decentring one = {k == 0 ? phi : 0.0, k == 1 ? phi : 0.0};
-            x = rows.show(tangential_ + k), y = rows.y(tangential_ + k);
-            each(n, [&](int i) { x[i] = one.x(u_[i], v_[i]), y[i] = aspect * one.y(u_[i], v_[i]); });
-        }
+        if (tangential_ > 0) differentiate_decentring(rows, tangential_, u_, v_);
     }
 
   private:

@@ -61,11 +61,10 @@ class Saddles {
         }
         std::copy_n(now, SIZE, fitted);
         fitted[SIZE] = std::sqrt(cost / static_cast<double>(level_.size()));
-        for (int k = 0; k < 2; ++k) {
-            std::fill_n(step, SIZE, 0.0), step[k] = 1.0;
-            factor(0.0), substitute(SIZE, upper_, step);
-            fitted[SIZE + 1 + k] = std::sqrt(step[k]);
-        }
+        double covariance[SIZE][2] = {{1.0, 0.0}, {0.0, 1.0}};
+        factor(0.0), substitute(SIZE, upper_, covariance[0], 2);
+        for (int k = 0; k < 2; ++k)
+            if (covariance[k][k] > 0.0) fitted[SIZE + 1 + k] = std::sqrt(covariance[k][k]);
     }
 
   private:

@@ -126,8 +126,8 @@ class Spline final : public Lens {
                 for (int a = j == 0 ? 2 : (j == 1 ? 1 : 0); a < ORDER; ++a)  // value and slope at the axis are 0
                     profile_[j][d] += intrinsics[3 + j + a] * pieces_[(j * ORDER + d) * ORDER + a];
         for (int k = 1; k <= 8 * INTERVALS && limit_ == END; ++k) {
-            const double u = k / (8.0 * INTERVALS);
-            if (rim_ + along_radius(u).slope <= 0.0) limit_ = u;
+            radius_[0] = k / (8.0 * INTERVALS), add_profile(0);
+            if (rim_ + slope_[0] <= 0.0) limit_ = radius_[0];
         }
     }
 
@@ -141,10 +141,7 @@ class Spline final : public Lens {
         add_conrady(n);
         if (!monomials_.empty()) add_monomials(n);
         if (surface_) add_surface(n);
-        for (int i = 0; i < n; ++i) {  // by itself: its look-up keeps the rest from SIMD registers
-            const Along along = along_radius(radius_[i]);
-            value_[i] = along.value, slope_[i] = along.slope;
-        }
+        for (int i = 0; i < n; ++i) add_profile(i);  // by itself: its look-up keeps the rest from SIMD registers
         int bad = 0;
         each(n, [&](int i) {
             const double x = rays.x[i], y = rays.y[i], z = rays.z[i], u = u_[i], v = v_[i], s = s_[i];
@@ -207,9 +204,6 @@ class Spline final : public Lens {
     static constexpr int CONRADY = 3, MOST = 9, HEAD = 2, TABLE = INTERVALS * ORDER * ORDER;
     static constexpr double END = 2.0;  // rims: nothing is observed farther out
 
-    struct Along {
-        double value, slope;
-    };
     struct Monomial {
         int at, m, n;
         double re, im;
@@ -224,13 +218,13 @@ class Spline final : public Lens {
     }
 
     // G and its slope, straight on beyond the last knot.
-    Along along_radius(double u) const {
+    void add_profile(int i) {
         double t = 0.0, slope = 0.0;
-        const double* own = profile_[interval(u, t)];
+        const double* own = profile_[interval(radius_[i], t)];
         double value = own[DEGREE];
         for (int d = DEGREE - 1; d >= 0; --d) slope = slope * t + value, value = value * t + own[d];
-        slope *= INTERVALS;
-        return {value + slope * std::max(u - 1.0, 0.0), slope};
+        slope_[i] = slope * INTERVALS;
+        value_[i] = value + slope_[i] * std::max(radius_[i] - 1.0, 0.0);
     }
 
     // (2 s C(s) + q^2 conj(C(s))) / 3 with s = |q|^2 and C its three terms, and its derivatives by q and its conjugate.

@@ -36,25 +36,22 @@ class Sums {
     // newton: whether A takes rho'' along, for a step, or rho' alone, as the weight that each observation has.
     double normal_equations(int64_t sight, const double* pose, bool newton, double* normal) {
         std::fill_n(normal, static_cast<size_t>(unknowns_.size()) * unknowns_.size(), 0.0);
-        pose_ = pose, newton_ = newton, normal_ = normal;
-        double cost = 0.0;
+        pose_ = pose, newton_ = newton, normal_ = normal, cost_ = 0.0;
         with_loss(seen_.loss.code, [&](auto code) {
-            const auto add_all = [&](const auto& columns) {
-                return all_chunks(columns, sight, [&](int64_t start, int n) {
-                    cost += add<decltype(code)::value>(start, n, columns);
-                    return true;
-                });
+            const auto of = [&](const auto& columns) {
+                all_chunks(columns, sight,
+                           [&](auto... chunk) { return add<decltype(code)::value>(columns, chunk...); });
             };
-            add_all(seen_.points), add_all(seen_.curves);
+            of(seen_.points), of(seen_.curves);
         });
-        return cost;
+        return cost_;
     }
 
   private:
     template <LossCode code, class Columns>
-    double add(int64_t start, int n, const Columns& seen) {
+    bool add(const Columns& seen, int64_t start, int n) {
         constexpr int MANY = Columns::RESIDUALS;
-        if (!shown_.show(start, n, pose_, seen)) return NO_ANSWER;
+        if (!shown_.show(start, n, pose_, seen)) return cost_ = NO_ANSWER, false;
         choose_rows();
         const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
         for (int i = 0; i < filled; ++i) weight_[i] = i < n ? seen.weights[start + i] : 0.0;
@@ -64,7 +61,7 @@ class Sums {
             const double ey = MANY == 2 ? w * shown_.off_y(i) : 0.0, squared = ex * ex + ey * ey;
             const Robust one = robust<code>(seen_.loss.scale, squared);
             const double root = std::sqrt(one.slope), factor = root * w;
-            cost += one.rho, squared_[i] = squared;
+            cost += one.rho, bend_[i] = one.bend;
             factor_[i] = MANY == 2 ? factor : factor * shown_.normal_x[i];
             factor_[filled + i] = MANY == 2 ? factor : factor * shown_.normal_y[i];
             error[i] = root * ex;
@@ -77,14 +74,14 @@ class Sums {
             else
                 each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
         }
-        if (newton_) bend_rows<code>(n, MANY);
+        if (newton_) bend_rows<code, MANY>(n);
         add_rows(MANY * filled);
         for (int i = 0; i < n && seen.slots != nullptr; ++i) {
             double directions[BUILT][3] = {};
             shown_.directions(seen, start + i, i, directions);
             add_structure<Columns>(i, seen.slots + Columns::MOVED * seen.moved(start + i), directions);
         }
-        return cost;
+        return cost_ += cost, true;
     }
 
     // The chunk's rows that take part, and where they stand in A; what the chunk shows nothing of, most of a lens that
@@ -111,26 +108,22 @@ class Sums {
     }
 
     // Take the second derivative of rho into the rows: Newton's step on the loss, its gradient unchanged.
-    template <LossCode code>
-    void bend_rows(int n, int components) {
+    template <LossCode code, int MANY>
+    void bend_rows(int n) {
         constexpr double FLAT = 0.7, MOSTLY_FLAT = 0.5;  // a bend; share beyond which it says nothing of the minimum
         if constexpr (code != LossCode::huber && code != LossCode::soft_l1) return;
         const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
-        int flat = 0;
-        for (int i = 0; i < n; ++i) flat += bend(seen_.loss, squared_[i]) < FLAT;
-        if (flat > MOSTLY_FLAT * n) return;
-        for (int i = 0; i < n; ++i) {
-            const double left = bend(seen_.loss, squared_[i]);
-            if (left == 1.0) continue;
-            double length2 = 0.0;
-            for (int c = 0; c < components; ++c) length2 += own_[last][c * filled + i] * own_[last][c * filled + i];
+        double *error_x = own_[last], *error_y = error_x + filled;
+        const auto flat = std::count_if(bend_.value, bend_.value + n, [](double bend) { return bend < FLAT; });
+        for (int i = 0; i < n && static_cast<double>(flat) <= MOSTLY_FLAT * n; ++i) {
+            if (bend_[i] == 1.0) continue;
+            const double ex = error_x[i], ey = MANY == 2 ? error_y[i] : 0.0, length2 = ex * ex + ey * ey;
             for (int k = 0; k < last; ++k) {
-                double along = 0.0;
-                for (int c = 0; c < components; ++c) along += own_[last][c * filled + i] * own_[k][c * filled + i];
-                for (int c = 0; c < components; ++c)
-                    own_[k][c * filled + i] -= (1.0 - left) * along / length2 * own_[last][c * filled + i];
+                double &x = own_[k][i], &y = own_[k][filled + i];
+                const double share = (1.0 - bend_[i]) * (ex * x + ey * y) / length2;
+                x -= share * ex, y -= share * ey;
             }
-            for (int c = 0; c < components; ++c) own_[last][c * filled + i] /= left;
+            error_x[i] /= bend_[i], error_y[i] /= bend_[i];
         }
     }
 
@@ -160,9 +153,9 @@ class Sums {
     const Observed& seen_;
     const double* pose_ = nullptr;
     bool newton_ = false;
-    double* normal_ = nullptr;
+    double *normal_ = nullptr, cost_ = 0.0;
     Projection shown_;
-    Lane weight_, squared_;
+    Lane weight_, bend_;
     alignas(64) double factor_[2 * CHUNK];
     std::vector<double*> own_;
     std::vector<int> places_;
@@ -212,8 +205,7 @@ inline bool rows_of(int64_t sight, Projection& shown, const double* pose, const 
         shown.differentiate(false);
         for (int k = 0; k < shown.pose_row; ++k) shown.rows.open(k);
         for (int i = 0; i < n; ++i) {
-            double nx = 0.0, ny = 0.0;
-            if (MANY == 1) nx = shown.normal_x[i], ny = shown.normal_y[i];
+            const double nx = MANY == 1 ? shown.normal_x[i] : 0.0, ny = MANY == 1 ? shown.normal_y[i] : 0.0;
             if (MANY == 1) normals[2 * (start + i)] = nx, normals[2 * (start + i) + 1] = ny;
             double directions[BUILT][3] = {};
             shown.directions(seen, start + i, i, directions);

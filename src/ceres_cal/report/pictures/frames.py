@@ -1,4 +1,7 @@
-"""Which photograph shows what: frames by their names, what lies in them, and what was observed there."""
+"""Which photograph shows what: frames by their names, what lies in them, and what was observed there.
+
+Photographs out of image files, and pictures as bytes of them.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Mask
+from ceres_cal.base.arrays import Image, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import frame_of
 from ceres_cal.calibration import Calibration
+from ceres_cal.detect.images import encoded, read_colour
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.report.pictures.model import Model, model_seen
-from ceres_cal.report.pictures.overlay import Marks
+from ceres_cal.report.pictures.overlay import Marks, in_8_bit_colour
 
 Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""
@@ -112,3 +117,33 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
         Marks(pixels[~used], "taken out", "taken out", crosses=True),
     )
     return tuple(one for one in marks if len(one.pixels))
+
+
+def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Image:
+    """A camera's photograph as (height, width) or (height, width, 3), pixels as stored.
+
+    Raises:
+        InputError: no image, or of another size than the camera's.
+    """
+    image = read_colour(path)
+    size = (image.shape[1], image.shape[0])
+    if size != image_size:
+        raise InputError(
+            f"{path}: {size[0]} x {size[1]} px, but camera {camera!r} has {image_size[0]} x {image_size[1]}: "
+            "give photographs of the size that was calibrated"
+        )
+    return image
+
+
+def jpeg_of_at_most(picture: Image, widest_px: int, most_bytes: int) -> bytes:
+    """A JPEG no wider than that, as good as the bytes allow."""
+    qualities = (90, 80, 70, 55, 40, 25)
+    width, height = picture.shape[1], picture.shape[0]
+    if width > widest_px:
+        size = (widest_px, max(1, round(height * widest_px / width)))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    for quality in qualities:
+        content = encoded(in_8_bit_colour(picture), ".jpg", quality)
+        if len(content) <= most_bytes:
+            break
+    return content

@@ -15,10 +15,6 @@ from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.targets import Target
 
-_STEPS = 240  # along a curve
-_BETWEEN = 12  # steps from one corner of a board to the next
-_WIDE_PX = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
-
 
 @dataclass(frozen=True, eq=False)
 class CurveOutline:
@@ -84,14 +80,16 @@ def model_seen(
 
 
 def _lines(built: Built, camera: Camera) -> Iterator[CurveOutline]:
+    wide_px = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
+    steps = 240  # along a curve
     target = built.target
     for number, curve in enumerate(target.curves.values()):
-        s, is_arc = np.linspace(*curve.parameter_range, _STEPS), bool(target.is_arc[number])
+        s, is_arc = np.linspace(*curve.parameter_range, steps), bool(target.is_arc[number])
         middle, left, right = (
             camera.project(along_track(built.tracks[side, number], is_arc, s)) for side in (0, 1, -1)
         )
         width = np.linalg.norm(left - right, axis=1)[in_image(middle, camera.image_size)]
-        wide = len(width) > 0 and float(np.median(width)) >= _WIDE_PX
+        wide = len(width) > 0 and float(np.median(width)) >= wide_px
         yield CurveOutline(middle, (left, right) if wide else ())
     if target.grid is not None:
         grid = built.points.reshape(target.grid.rows, -1, 3)
@@ -100,5 +98,6 @@ def _lines(built: Built, camera: Camera) -> Iterator[CurveOutline]:
 
 def _between(corners: Array) -> Array:
     """Corners (C, 3) and places on the straight lines from each to the next."""
-    at = np.linspace(0.0, len(corners) - 1.0, _BETWEEN * (len(corners) - 1) + 1)
+    between = 12  # steps from one corner of a board to the next
+    at = np.linspace(0.0, len(corners) - 1.0, between * (len(corners) - 1) + 1)
     return np.column_stack([np.interp(at, np.arange(len(corners)), axis) for axis in corners.T])

@@ -1,15 +1,26 @@
-"""Overlay pictures: models and observations drawn into a photograph, with a legend."""
+"""Overlay pictures: models and observations drawn into a photograph, with a legend.
+
+What was seen in a photograph that was refused: the best candidate, and which of its lines were missing.
+
+Where in a photograph something is that should be measured.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Image, Image8, Indices32, Mask
+from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.strokes import find_strokes
+from ceres_cal.diagnostics.advice import Measurement
 from ceres_cal.report.pictures.model import CurveOutline, Model
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.targets import Target
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""
@@ -136,3 +147,49 @@ def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: f
         place = (int(2.0 * pad + sample), int(middle + 0.35 * letter))
         cv2.putText(canvas, text, place, _FONT, scale, COLOURS["ink"], stroke, cv2.LINE_AA)
     return canvas
+
+
+_NAMES = 4  # of missing lines in the legend
+
+
+def draw_seen(photograph: Image, seen: Followed | None, target: Target) -> Image8:
+    """A photograph with the lines found in it, and, of the best candidate, where paint was found and where not."""
+    grey = in_8_bit_colour(photograph).mean(axis=2).astype(np.float32)
+    marks = [Marks(find_strokes(grey).ends.reshape(-1, 2), "lines seen", "before")]
+    if seen is not None:
+        lines = seen.lines
+        missing = [target.curve_names[number] for number in seen.absent]
+        names = ", ".join(missing[:_NAMES]) + (f" and {len(missing) - _NAMES} more" if len(missing) > _NAMES else "")
+        marks += [
+            Marks(lines.pixels[lines.found], "best candidate: paint", "after"),
+            Marks(
+                lines.course.pixels[~lines.found],
+                f"best candidate: no paint{f', all along {names}' if names else ''}",
+                "taken out",
+                crosses=True,
+            ),
+        ]
+    return draw_overlay(photograph, (), marks)
+
+
+def places_in_picture(
+    measurement: Measurement, targets: Mapping[str, Target], camera: Camera
+) -> Iterator[tuple[str, Array]]:
+    """What is drawn, with a label, (N, 2) px each: the outline of a board, a pole from its foot to its top, a line, or
+    the place beneath a camera whose height is to be measured.
+    """
+    pieces = 30
+    if measurement.kind == "tape":
+        yield "measure the height here", camera.project((camera.position * (1.0, 1.0, 0.0))[None])
+    for view in measurement.views:
+        target = {**targets, **measurement.targets}[view.target]
+        if measurement.kind == "board" and view.placement is not None and target.grid is not None:
+            rows = target.point_array.reshape(target.grid.rows, target.grid.columns, 3)
+            edge = np.array([rows[0, 0], rows[0, -1], rows[-1, -1], rows[-1, 0], rows[0, 0]])
+            yield "a board here", camera.project(measurement.placements[view.placement].transform(edge))
+        elif measurement.kind == "pole":
+            top = target.point_array[0]
+            yield "a pole here", camera.project(np.array([top * (1.0, 1.0, 0.0), top]))
+        elif measurement.kind == "line":
+            for name in view.curves or ():
+                yield "this line", camera.project(curve_points(target.curves[name], 0, pieces))

@@ -19,16 +19,8 @@ from ceres_cal.scene.lens import Brown
 
 WIDEST_DEG = 150.0
 MOST_STRETCH = 4.0
-_LEAST_DEG, _MOST_DEG = 1.0, 175.0
-_BORDER_STEP_PX = 0.25
-_RIM_STEPS = 20_000
-_HALVINGS = 60
-_ANGLE_STEP = 1e-6
-_ENDLESS = 1e12  # a stretch that no limit is meant to forbid
-_ROUGHLY = 2000  # places of the outline, for the search
 _GRID, _ROUNDS, _SHRINK = 9, 24, 0.6
 _ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms
-_COUNTED = 100_000  # pixels of a photograph, about, of which it is told whether they are shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +72,9 @@ def straighten(
     Raises:
         InputError: an image without pixels or too large, or nothing within the angle.
     """
-    if angle_deg is not None and not _LEAST_DEG <= angle_deg <= _MOST_DEG:
-        raise InputError(f"the angle of view must be {_LEAST_DEG:g} to {_MOST_DEG:g} degrees, not {angle_deg:g}")
+    least_deg, most_deg = 1.0, 175.0
+    if angle_deg is not None and not least_deg <= angle_deg <= most_deg:
+        raise InputError(f"the angle of view must be {least_deg:g} to {most_deg:g} degrees, not {angle_deg:g}")
     if phi is not None and not (np.isfinite(phi) and phi > 0.0):
         raise InputError(f"phi must be above 0 px, not {phi:g}")
     wanted = camera.image_size if size is None else size
@@ -118,8 +111,9 @@ def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bo
 
 def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
     """The share of the photograph's pixels, of every few, whose centres fall into the straight image."""
+    counted = 100_000  # pixels of a photograph, about, of which it is told whether they are shown
     width, height = camera.image_size
-    step = max(1, int(np.sqrt(width * height / _COUNTED)))
+    step = max(1, int(np.sqrt(width * height / counted)))
     grid = np.meshgrid(np.arange(0.0, width, step), np.arange(0.0, height, step))
     there = _at_depth_1(camera, np.column_stack([part.ravel() for part in grid]), slope)
     return float(np.mean(in_image(there * straight.phi + straight.principal_point, straight.image_size)))
@@ -160,9 +154,10 @@ def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
 
 
 def _region(camera: Camera, angle: float) -> _ShownRegion:
+    rim_steps = 20_000
     slope = float(np.tan(angle))
     border = _at_depth_1(camera, _border(camera.image_size), slope)
-    turn = np.linspace(0.0, 2.0 * np.pi, _RIM_STEPS, endpoint=False)
+    turn = np.linspace(0.0, 2.0 * np.pi, rim_steps, endpoint=False)
     rim = slope * (1.0 - 1e-9) * np.column_stack([np.cos(turn), np.sin(turn)])
     pixels = camera.at(Pose.identity()).project(np.column_stack([rim, np.ones(len(rim))]))
     rim = rim[in_image(pixels, camera.image_size)]
@@ -180,17 +175,20 @@ def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
 
     Measured along the image's x axis: lenses are the same all around, but for Brown's decentring.
     """
+    endless = 1e12  # a stretch that no limit is meant to forbid
+    angle_step = 1e-6
+    halvings = 60
 
     def answers(angle: float) -> bool:
-        angles = np.array([angle - _ANGLE_STEP, angle])
+        angles = np.array([angle - angle_step, angle])
         rays = np.column_stack([np.sin(angles), np.zeros(2), np.cos(angles)])
         measured = float(np.diff(camera.lens.distort(rays, camera.phi)[:, 0])[0])  # NaN where there is no answer
-        return camera.phi * float(np.diff(np.tan(angles))[0]) <= min(most_stretch, _ENDLESS) * measured
+        return camera.phi * float(np.diff(np.tan(angles))[0]) <= min(most_stretch, endless) * measured
 
     low, high = 0.0, most_rad
     if answers(high):
         return high
-    for _ in range(_HALVINGS):
+    for _ in range(halvings):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if answers(middle) else (low, middle)
     return low
@@ -198,9 +196,10 @@ def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
 
 def _border(size: tuple[int, int]) -> Array:
     """Pixels (N, 2) along the border of an image, half a pixel outside of its outermost centres."""
+    border_step_px = 0.25
     width, height = size
-    x = np.linspace(-0.5, width - 0.5, int(width / _BORDER_STEP_PX) + 1)
-    y = np.linspace(-0.5, height - 0.5, int(height / _BORDER_STEP_PX) + 1)
+    x = np.linspace(-0.5, width - 0.5, int(width / border_step_px) + 1)
+    y = np.linspace(-0.5, height - 0.5, int(height / border_step_px) + 1)
     sides = [np.column_stack([x, np.full(len(x), end)]) for end in (-0.5, height - 0.5)]
     sides += [np.column_stack([np.full(len(y), end), y]) for end in (-0.5, width - 0.5)]
     return np.concatenate(sides)
@@ -217,7 +216,8 @@ def _largest_rectangle(region: _ShownRegion, aspect: float | None) -> Array:
     Around a centre the rectangle grows until it meets the outline: its half height is the smallest of
     max(|dx| / aspect, |dy|) over the outline. Centre and aspect are sought on a grid that closes in on the best.
     """
-    rough = region.outline[:: max(1, len(region.outline) // _ROUGHLY)]
+    roughly = 2000  # places of the outline, for the search
+    rough = region.outline[:: max(1, len(region.outline) // roughly)]
     low, high = _box(region)
     best = np.append(0.5 * (low + high), 0.0)
     reach = np.append(0.5 * (high - low), 0.0 if aspect is not None else _ASPECTS[-1])

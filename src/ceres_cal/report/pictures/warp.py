@@ -18,9 +18,6 @@ from ceres_cal.base.errors import InputError
 Plane = Array32
 
 MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767
-_FINEST = 4  # small squares along a pixel
-_USUAL = 0.9  # of all pixels: those that decide how many squares are needed
-_BLOCK = 1 << 18  # new pixels at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +84,10 @@ def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: C
 
 def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Array32, Array32]:
     """Places of all pixels and of one more around them."""
+    block = 1 << 18  # new pixels at a time
     across, down = (np.arange(-1.0, count + 1.0) for count in size)
     there = np.empty((len(down), len(across), 2), dtype=np.float32)
-    rows = max(1, _BLOCK // len(across))
+    rows = max(1, block // len(across))
     for top in range(0, len(down), rows):
         part = down[top : top + rows]
         pixels = np.column_stack([np.tile(across, len(part)), np.repeat(part, len(across))])
@@ -106,8 +104,10 @@ def _divided(plane: Array32, fine: int) -> Array32:
 
 def _squares_along(x: Array32, y: Array32) -> int:
     """How many pixels of the photograph most of the new ones span."""
+    usual = 0.9  # of all pixels: those that decide how many squares are needed
+    finest = 4  # small squares along a pixel
     spans = [np.hypot(np.diff(x, axis=axis), np.diff(y, axis=axis)).ravel() for axis in (0, 1)]
     finite = np.concatenate(spans)
     finite = finite[np.isfinite(finite)]
-    span = float(np.quantile(finite, _USUAL)) if len(finite) else 1.0
-    return int(np.clip(np.ceil(span - 0.25), 1, _FINEST))
+    span = float(np.quantile(finite, usual)) if len(finite) else 1.0
+    return int(np.clip(np.ceil(span - 0.25), 1, finest))

@@ -14,8 +14,8 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.arrays import AnyArray, Array
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.scene.lens.base import Lens
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
@@ -34,6 +34,11 @@ def horner(polynomial: Array, x: Array) -> Array:
 def derivative(polynomial: Array) -> Array:
     """Its derivative's coefficients, lowest power first."""
     return np.asarray(polynomial[1:] * np.arange(1, len(polynomial)))
+
+
+def less(polynomial: AnyArray, other: AnyArray) -> Array:
+    """Their difference's coefficients, lowest power first."""
+    return np.asarray(np.polysub(polynomial[::-1], other[::-1])[::-1])
 
 
 def first_root(polynomial: Array) -> float:
@@ -88,9 +93,8 @@ class Ratio:
         """Its derivative times q^2."""
         if self.below is None:
             return derivative(self.above)
-        return np.asarray(np.polynomial.polynomial.polysub(
-            np.convolve(derivative(self.above), self.below), np.convolve(self.above, derivative(self.below))
-        ))  # fmt: skip
+        first, second = (derivative(self.above), self.below), (self.above, derivative(self.below))
+        return less(np.convolve(*first), np.convolve(*second))
 
     @cached_property
     def limit(self) -> float:
@@ -276,8 +280,7 @@ class Decentred(Planar):
         if self._radial.below is not None:
             below = np.asarray(np.kron(self._radial.below, (1.0, 0.0))[:-1], dtype=float)
         worst = np.array([0.0, 0.0, 3.0 * np.hypot(p1, p2) + np.hypot(s1, s3), 0.0, np.hypot(s2, s4)])
-        less = worst if below is None else np.convolve(worst, below)
-        return Ratio(np.polynomial.polynomial.polysub(above, less), below, self._end)
+        return Ratio(less(above, worst if below is None else np.convolve(worst, below)), below, self._end)
 
     _end: ClassVar[float] = np.inf
 

@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import AnyArray, Array, Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 from ceres_cal.scene.lens.surface import (
@@ -33,7 +33,6 @@ from ceres_cal.scene.lens.surface import (
 
 _TINY = 1e-150
 _TURNS = 48  # directions, between which nothing turns
-_STEPS = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
 # Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
 # ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
 _LOOSE, _LOOSE_ACROSS, _LEAST, _LEAST_ACROSS = 1000.0, 1e-2, 0.1, 3e-3
@@ -161,10 +160,11 @@ class Spline(Planar):
     # ---- its start and its roughness ---------------------------------------------------------------------------------
 
     def spanning(self, angle: float, phi: float, beyond: float, image_size: tuple[int, int]) -> Lens:
+        steps = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
         given = self.coefficients
         if given["rim"] <= 0.0:
             # In steps, so that the numbers of two calibrations of one camera mean the same.
-            rim = 2.0 ** (np.rint(_STEPS * np.log2(2.0 * phi * np.tan(0.5 * angle) * beyond)) / _STEPS)
+            rim = 2.0 ** (np.rint(steps * np.log2(2.0 * phi * np.tan(0.5 * angle) * beyond)) / steps)
             given["rim"] = float(rim)
         for name, side in zip(EXTENTS, image_size, strict=True) if self.terms else ():
             given[name] = given[name] or float(_BEYOND * side / np.hypot(*image_size))

@@ -18,13 +18,11 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, median
-from ceres_cal.base.cached import cached_property
+from ceres_cal.base.lazy import cached_property
 
 INTERVALS, DEGREE = 8, 5
 COUNT = INTERVALS + DEGREE - 2  # of the B-splines: value and slope at the axis are 0
 END = 2.0  # rims: nothing is observed farther out
-_SAMPLES = 100  # radii up to the end, between which nothing turns
-_REFINED = 8  # steps to where growth ends
 
 
 def _b_splines(u: Array) -> Array:
@@ -124,13 +122,15 @@ class Growth:
 
 def first_falls(growth: Callable[[Array], Array], directions: int = 1) -> Array:
     """(T,) where a growth (N, T) at radii (N, T) is first not above 0 in each direction, `END` at most."""
-    places = np.linspace(0.0, END, _SAMPLES + 1)
+    refined = 8  # steps to where growth ends
+    samples = 100  # radii up to the end, between which nothing turns
+    places = np.linspace(0.0, END, samples + 1)
     values = growth(np.repeat(places[:, None], directions, axis=1))
     falling = values <= 0.0
     first, all_of = np.argmax(falling, axis=0), np.arange(directions)
     before = np.maximum(first - 1, 0)
     low, high, above, below = places[before], places[first], values[before, all_of], values[first, all_of]
-    for _ in range(_REFINED if np.any(falling) else 0):  # by the rule of false position (Illinois), from both sides
+    for _ in range(refined if np.any(falling) else 0):  # by the rule of false position (Illinois), from both sides
         share = above / np.where(above > below, above - below, 1.0)
         middle = low + np.clip(share, 0.01, 0.99) * (high - low)
         value = growth(middle[None])[0]

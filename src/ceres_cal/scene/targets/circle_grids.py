@@ -10,8 +10,17 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import checked
-from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, share_inside
-from ceres_cal.scene.targets.target import Grid, Target, TargetKind, from_arguments, require_size
+from ceres_cal.scene.targets.target import (
+    Disc,
+    Footprints,
+    Grid,
+    Paper,
+    Target,
+    TargetKind,
+    from_arguments,
+    require_size,
+    share_inside,
+)
 
 
 @checked

@@ -27,6 +27,7 @@ from ceres_cal.scene.targets.target import LARGEST_M, Target, TargetKind
 
 _FOLDER = Path(__file__).parent / "fields"
 _FUNCTIONS = {name: getattr(math, name) for name in ("acos", "asin", "atan2", "pi", "sqrt")} | {"max": max}
+TOLERANCE = "tolerance_m"  # by how much lines of a field may lie aside: of every kind, and none of its dimensions
 _X, _Y = re.compile(r"\((\w*)\|(\w*)\)"), re.compile(r"\[(\w*)\|(\w*)\]")
 
 Expression = str | float
@@ -136,6 +137,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             optional=tuple(
                 tuple(name for name, _, shape in shapes if part in shape.parts) for part in self.optional if parts[part]
             ),
+            tolerance_m=given.get(TOLERANCE),
         )
 
     def _require_known(self, variant: str | None, given: Mapping[str, float | bool]) -> None:
@@ -143,7 +145,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             key = self.variants.key if self.variants else "variant"
             raise InputError(f"{self.kind}: unknown {key} {variant!r}: {self._choice}")
         for name, value in given.items():
-            if name not in self.dimensions and name not in self.parts:
+            if name not in (*self.dimensions, *self.parts, TOLERANCE):
                 switched = f"; its parts are {', '.join(self.parts)}" if self.parts else ""
                 known = ", ".join(self.dimensions)
                 raise InputError(f"{self.kind}: unknown dimension {name!r}: the dimensions are {known}{switched}")
@@ -156,14 +158,15 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         return f"{' or '.join(self.choices)}, or give every dimension"
 
     def _dimensions(self, variant: str | None, given: Mapping[str, float | bool]) -> dict[str, float]:
-        every = {name: given.get(name, _of(value, variant)) for name, value in self.dimensions.items()}
+        values = self.dimensions | ({TOLERANCE: given[TOLERANCE]} if TOLERANCE in given else {})
+        every = {name: given.get(name, _of(value, variant)) for name, value in values.items()}
         if missing := [name for name, value in every.items() if value is None]:
             key = self.variants.key if self.variants else "variant"
             raise InputError(f"{self.kind}: {missing[0]} is missing: name a {key} or give every dimension")
         for name, value in every.items():
             if not 0.0 < value < LARGEST_M:
                 raise InputError(f"{self.kind}: {name} must be a positive number of metres, not {value}")
-        return {name: float(value) for name, value in every.items()}
+        return {name: float(every[name]) for name in self.dimensions}
 
     def _others(self, variant: str | None, parts: Mapping[str, bool]) -> dict[str, Mapping[str, Any]]:
         """What it may be mistaken for, in words."""
@@ -205,6 +208,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             )
         if self.parts:
             given += f"; true or false: {', '.join(self.parts)}"
+        given += f"; {TOLERANCE}: by how much lines may lie aside, else as is usual of its size"
         what = f"{self.what}: x along its length, the middle at 0, 0; measured {self.measured}"
         return TargetKind(self.kind, what, given, self.features, self.examples, self.from_spec)
 

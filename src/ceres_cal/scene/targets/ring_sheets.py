@@ -11,8 +11,16 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Arc, Curve
-from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, Square, share_inside
-from ceres_cal.scene.targets.target import Target, TargetKind, from_arguments
+from ceres_cal.scene.targets.target import (
+    Disc,
+    Footprints,
+    Paper,
+    Square,
+    Target,
+    TargetKind,
+    from_arguments,
+    share_inside,
+)
 
 
 @checked

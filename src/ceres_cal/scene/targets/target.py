@@ -1,8 +1,11 @@
-"""What a target is: a rigid thing of known geometry with named points and named curves; and what a kind of them is."""
+"""What a target is: a rigid thing of known geometry with named points and named curves; and what a kind of them is.
+
+What a printed target looks like: its sheet of paper, and how much of a small square on it is dark.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from inspect import signature
@@ -13,24 +16,79 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.lazy import cached_property
 from ceres_cal.scene.curves import Arc, Curve, along_curve
 from ceres_cal.scene.targets.crossings import aliases
-from ceres_cal.scene.targets.paper import Paper
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Small squares of a picture on the target's plane z = const.
+
+    Attributes:
+        plane: (M, 2) their middles, m. along_x, along_y: (M, 2) what a step of one square to the right and down is on
+            the plane, m.
+    """
+
+    plane: Array
+    along_x: Array
+    along_y: Array
+
+    def step_m(self, direction: Array) -> Array:
+        """(M,) how far the place moves along a direction (M, 2) over one square, m."""
+        across = np.sum(self.along_x * direction, axis=1), np.sum(self.along_y * direction, axis=1)
+        return np.asarray(np.maximum(np.hypot(*across), 1e-12))
+
+
+def share_inside(distance: Array, step: Array) -> Array:
+    """The share of a square that lies on the positive side of a straight border, from the middle's distance to it."""
+    return np.clip(distance / step + 0.5, 0.0, 1.0)
+
+
+class Square(Struct, frozen=True):
+    """A dark square by its corner of the least x and y, and its side, m."""
+
+    corner_m: tuple[float, float]
+    side_m: float
+    is_dark: bool = True
+
+
+class Disc(Struct, frozen=True):
+    """A disc by its centre and radius, m; a light one lies on a dark one."""
+
+    centre_m: tuple[float, float]
+    radius_m: float
+    is_dark: bool = True
+
+
+class Paper(Struct, frozen=True, eq=False):
+    """The rectangular sheet that a target is printed on.
+
+    Attributes:
+        low_m, high_m: (x, y) of two opposite corners of the sheet.
+        dark: the share (M,) of each small square that is dark, as a camera sees it.
+        shapes: what is printed, in this order, on white.
+    """
+
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+    dark: Callable[[Footprints], Array]
+    shapes: Callable[[], Iterator[Square | Disc]]
+
 
 MOST_FEATURES = 100_000
 """Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
 
 
-_ONCE_ROUND = 2.0 * np.pi * (1.0 + 1e-6)  # people round
 LARGEST_M = 1e7
 """Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
 
 
 def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
     """Raise InputError where a point or a curve of a target has numbers that cannot be."""
+    once_round = 2.0 * np.pi * (1.0 + 1e-6)  # people round
     for name, place in points.items():
         if not np.all(np.abs(place) < LARGEST_M):
             raise InputError(f"{kind}: point {name!r} must have three finite numbers of metres, not {place}")
@@ -40,7 +98,7 @@ def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Map
             raise InputError(f"{kind}: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
         if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
             raise InputError(f"{kind}: arc {name!r} must have a radius of more than half its width")
-        if isinstance(curve, Arc) and curve.to_rad - curve.from_rad > _ONCE_ROUND:
+        if isinstance(curve, Arc) and curve.to_rad - curve.from_rad > once_round:
             raise InputError(f"{kind}: arc {name!r} goes more than once round: its to_rad is too large")
 
 
@@ -80,6 +138,7 @@ class Target:
         dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
             spec its features lie elsewhere.
         optional: names of curves that go together and that a field may lack without being another one.
+        tolerance_m: by how much its lines may lie aside, where it says so; else as is usual of its size.
     """
 
     spec: Mapping[str, Any]
@@ -92,6 +151,7 @@ class Target:
     mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     dimensions: Mapping[str, float] = field(default_factory=dict)
     optional: tuple[tuple[str, ...], ...] = ()
+    tolerance_m: float | None = None
 
     def __post_init__(self) -> None:
         require_places(self.kind, self.points, self.curves)

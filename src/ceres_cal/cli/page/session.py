@@ -16,6 +16,7 @@ from ceres_cal.base.files import make_folder
 from ceres_cal.base.words import frame_of, mm
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.cli.page.state import Change, Commands, Drag, Made, Sitting, State, load_state, save_state, target_words
 from ceres_cal.detect.photographs import by_hand, check_photographs
 from ceres_cal.detect.photographs.clicks import FEWEST
 from ceres_cal.detect.photographs.facing import distinguishing_feature
@@ -24,7 +25,6 @@ from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import EXPORT_FORMATS
 from ceres_cal.moves.comparisons import compare
 from ceres_cal.observations import Observations, combine
-from ceres_cal.page.state import Change, Commands, Drag, Made, Sitting, State, load_state, save_state, target_words
 from ceres_cal.problem.parameters import Options
 from ceres_cal.report.live import advice_of, known_of, strokes_of
 from ceres_cal.report.pictures.frames import frame_by_name, frames_of, model_of

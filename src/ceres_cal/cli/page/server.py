@@ -18,10 +18,10 @@ import msgspec
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from ceres_cal.base.errors import InputError, answer_or_reason
+from ceres_cal.cli.page.session import Session
+from ceres_cal.cli.page.state import Change, Do, Drag, Message, read_message
 from ceres_cal.detect.images import read_colour
-from ceres_cal.page.session import Session
-from ceres_cal.page.state import Change, Do, Drag, Message, read_message
-from ceres_cal.report.pictures.files import jpeg_of_at_most
+from ceres_cal.report.pictures.frames import jpeg_of_at_most
 
 HOST = "127.0.0.1"
 _MOST_BYTES = 1 << 18  # of a message: a state with all that a hand may show
@@ -68,7 +68,7 @@ class Server:
         self._pictures = ThreadPoolExecutor(1, "pictures")
         self._busy = ""
         self._weighing: asyncio.Handle = asyncio.get_running_loop().call_soon(lambda: None)
-        self._pages = {one.name: one.read_bytes() for one in files("ceres_cal.page").joinpath("web").iterdir()}
+        self._pages = {one.name: one.read_bytes() for one in files("ceres_cal.cli.page").joinpath("web").iterdir()}
         self.port: int = 0
 
     def application(self) -> web.Application:
