@@ -19,9 +19,9 @@ from runner import over
 from beside.ssl_vision import SslCamera, calibrated
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.problem.parameters import Options
-from ceres_cal.scene.heights import HEIGHTS_M
 
 NOISES = {"noise alone": SSL_NOISE, "5 % of line points far off": replace(SSL_NOISE, outliers=0.05)}
 PUBLISHED: Mapping[str, tuple[float, float, float]] = {
