@@ -32,7 +32,7 @@ from ceres_cal.problem.noise import (
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.problem.shares import Share, ShareRequest, cut
 from ceres_cal.problem.sums import Histogram, Looked, Used
 from ceres_cal.robust.competing import Explanation
@@ -183,13 +183,14 @@ class Bulk:
 
 @dataclass(frozen=True, eq=False)
 class _BulkResiduals:
-    """Residuals at an estimate: the name of the shares' ones, what these are like, and the lengths of the part's, in
-    stated sigmas.
+    """Residuals at an estimate: the name of the shares' ones, what these are like, those of the part, and the lengths
+    of these in stated sigmas.
     """
 
     name: str
     estimate: Estimate
     looked: Looked
+    here: Residuals
     lengths: tuple[Array, Array]
     placed: tuple[Mask, Mask]
 
@@ -208,20 +209,16 @@ class _BulkResiduals:
         return self.looked.points + own[0], self.looked.curves + own[1]
 
 
-@dataclass(frozen=True, eq=False)
-class _SumRound:
-    """Where one round over all observations ended.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _SumRound(RobustSolution):
+    """Where one round over all observations ended; inliers and residuals are the part's.
 
     Attributes:
-        problem: as it was solved last. solution: of it. seen: residuals there. noise: as it was judged by them.
+        problem: as it was solved last. seen: residuals there. noise: as it was judged by them.
     """
 
-    problem: Problem
-    solution: Solution
     seen: _BulkResiduals
     noise: NoiseScales
-    rounds: int
-    reduced: ReducedInformation | None = None
 
     def judged_like(self, before: _SumRound, no_change: float) -> bool:
         """Whether no scale changed, and about as many take part."""
@@ -252,12 +249,12 @@ class _SumRounds(Rounds[_SumRound]):
     def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _BulkResiduals:
         name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
         self._along = (*self._along, (name, of_world(estimate)))
-        self._there = residuals(self._few, self._problem.sights, estimate)
-        points, curves = relative_lengths(self._few, self._there)
+        here = residuals(self._few, self._problem.sights, estimate)
+        points, curves = relative_lengths(self._few, here)
         if self._part.gone is not None:
             gone = np.split(self._part.gone, [len(points)])
             points, curves = np.where(gone[0], np.inf, points), np.where(gone[1], np.inf, curves)
-        return _BulkResiduals(name, estimate, looked, (points, curves), self._placed)
+        return _BulkResiduals(name, estimate, looked, here, (points, curves), self._placed)
 
     def _judged(self, seen: _BulkResiduals, noise: NoiseScales) -> Problem:
         """The problem of what takes part, judged at the last estimate."""
@@ -271,7 +268,7 @@ class _SumRounds(Rounds[_SumRound]):
             self._problem,
             sights=self._core.used(*inside),
             weighting=weighting,
-            feet=self._there.feet,
+            feet=seen.here.feet,
             smoothness=self._before.problem.smoothness,
             elsewhere=judged,
         )
@@ -283,8 +280,16 @@ class _SumRounds(Rounds[_SumRound]):
         problem = self._judged(state.seen, state.noise)
         solution = solve(problem, state.seen.estimate, self._progress, precision=to_the_last)
         seen = self._look(solution.estimate, state.noise.bounds, problem.weighting)
-        noise = seen.noise(by_count(problem.equations, self._unknowns), self._problem)
-        return _SumRound(problem, solution, seen, noise, state.rounds + 1)
+        return self._round(problem, solution, seen, by_count(problem.equations, self._unknowns), state.rounds + 1)
+
+    def _round(
+        self, problem: Problem, solution: Solution, seen: _BulkResiduals, redundancy: Redundancy, rounds: int,
+        reduced: ReducedInformation | None = None,
+    ) -> _SumRound:  # fmt: skip
+        """Where a solve ended, judged."""
+        noise = seen.noise(redundancy, self._problem)
+        inliers = Inliers.by_noise(*seen.lengths, noise)
+        return _SumRound(problem, solution, inliers, seen.here, rounds, reduced, seen=seen, noise=noise)
 
     def with_leverages(self, state: _SumRound) -> _SumRound:
         """The state judged by the leverages, with what all observations say there."""
@@ -294,23 +299,21 @@ class _SumRounds(Rounds[_SumRound]):
         reduced = information(replace(state.problem, elsewhere=here), state.solution.estimate)
         points, curves = state.seen.inside(state.noise)
         redundancy = by_leverage((2 * points, curves), reduced.leverages)
-        return replace(state, noise=state.seen.noise(redundancy, self._problem), reduced=reduced)
+        return self._round(state.problem, state.solution, state.seen, redundancy, state.rounds, reduced)
 
     def end(self) -> RobustSolution:
         """The end of the rounds, with what all observations say there."""
         most_rounds = 8
         before = self._before
         seen = self._look(before.solution.estimate, _bounds(before), before.problem.weighting)
-        noise = seen.noise(by_count(sum(seen.looked.equations), self._unknowns), self._problem)
-        state = self.to_rest(_SumRound(self._problem, before.solution, seen, noise, 0), most_rounds)
+        redundancy = by_count(sum(seen.looked.equations), self._unknowns)
+        state = self.to_rest(self._round(self._problem, before.solution, seen, redundancy, 0), most_rounds)
         state = state if state.reduced is not None else self.with_leverages(state)
-        self._seen, self._noise = state.seen, state.noise
-        inliers = Inliers.by_noise(*state.seen.lengths, state.noise)
+        self._seen, self._noise, inliers = state.seen, state.noise, state.inliers
         sights = self._problem.used(inliers.points, inliers.curves).sights
-        problem = replace(state.problem, sights=sights, feet=self._there.feet, elsewhere=None)
-        return RobustSolution(
-            problem, state.solution, inliers, self._there, before.rounds + state.rounds, state.reduced
-        )
+        problem = replace(state.problem, sights=sights, feet=state.residuals.feet, elsewhere=None)
+        rounds = before.rounds + state.rounds
+        return RobustSolution(problem, state.solution, inliers, state.residuals, rounds, state.reduced)
 
     def used(self) -> Used:
         """What takes part at the end, of the world."""
@@ -330,7 +333,7 @@ class _SumRounds(Rounds[_SumRound]):
             self._seen.lengths,
             self._placed,
             self._noise.bounds,
-            self._there.lengths,
+            self._seen.here.lengths,
             self._part.rows,
             strict=True,
         )

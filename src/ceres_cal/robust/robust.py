@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 
@@ -32,26 +32,40 @@ MOST_ROUNDS = 15
 AT_REST, AT_REST_AGAIN = 1e-2, 1e-5
 
 
-class Round(Protocol):
-    """Where one round ended: what was judged there, and the problem that it makes."""
+@dataclass(frozen=True, eq=False)
+class RobustSolution:
+    """Where a round ended, and where all of them did.
 
-    @property
-    def problem(self) -> Problem:
-        """What is to be solved next."""
+    Attributes:
+        problem: of the inliers there alone, at their noise: what is to be solved next, and at the end what was solved.
+        solution: of the last one. inliers, residuals: of all observations there. rounds: how many solves there were.
+        reduced: what observations and priors say there, once nothing changes; None before, and where the rounds ran
+            out.
+    """
 
-    @property
-    def rounds(self) -> int:
-        """How many solves there were."""
-
-    @property
-    def reduced(self) -> ReducedInformation | None:
-        """What observations and priors say there, once nothing changes."""
+    problem: Problem
+    solution: Solution
+    inliers: Inliers
+    residuals: Residuals
+    rounds: int
+    reduced: ReducedInformation | None = None
 
     def judged_like(self, before: Self, no_change: float) -> bool:
         """Whether nothing worth another solve changed since another round."""
+        return self.inliers.same_as(before.inliers, no_change)
+
+    def weights_of(self, observations: Observations, equations: Equations) -> Weights:
+        """How the equations counted."""
+        taking_part = self.inliers.points, self.inliers.curves
+        return equation_weights(observations, self.problem.weighting, equations, self.residuals, taking_part)
+
+    def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
+        """The same with another estimate. `problem`: of all the observations."""
+        there = residuals(observations, problem.sights, estimate, self.residuals.feet)
+        return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
 
 
-_Round = TypeVar("_Round", bound=Round)
+_Round = TypeVar("_Round", bound=RobustSolution)
 
 
 class Rounds(ABC, Generic[_Round]):
@@ -104,38 +118,6 @@ _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
 # is painted aside is told from noise only at a scale near the noise's own.
 _MUCH_LESS = 0.3
-
-
-@dataclass(frozen=True, eq=False)
-class RobustSolution:
-    """The end of all rounds.
-
-    Attributes:
-        problem: as it was solved last, of the inliers alone and at their noise. solution: of it.
-        inliers, residuals: of all observations, at the end. rounds: how many solves there were.
-        reduced: what observations and priors say there; None where the rounds ran out.
-    """
-
-    problem: Problem
-    solution: Solution
-    inliers: Inliers
-    residuals: Residuals
-    rounds: int
-    reduced: ReducedInformation | None = None
-
-    def judged_like(self, before: RobustSolution, no_change: float) -> bool:
-        """Whether nothing worth another solve changed since another round."""
-        return self.inliers.same_as(before.inliers, no_change)
-
-    def weights_of(self, observations: Observations, equations: Equations) -> Weights:
-        """How the equations counted."""
-        taking_part = self.inliers.points, self.inliers.curves
-        return equation_weights(observations, self.problem.weighting, equations, self.residuals, taking_part)
-
-    def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
-        """The same with another estimate. `problem`: of all the observations."""
-        there = residuals(observations, problem.sights, estimate, self.residuals.feet)
-        return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
 
 
 @numerical("the solve")

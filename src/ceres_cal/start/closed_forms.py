@@ -202,29 +202,31 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
     r = np.sqrt(r2)
 
     def summed(values: Array) -> Array:
-        """(S, ...) over each sight of (..., N)."""
-        return np.moveaxis(np.add.reduceat(values, data.bounds[:-1], axis=-1), -1, 0)
+        """(..., S) over each sight of (..., N)."""
+        return np.add.reduceat(values, data.bounds[:-1], axis=-1)
 
     def sent(h: Array) -> Array:
         """(N,) h . X with each sight's own (S, 3)."""
-        return np.asarray(np.sum(np.repeat(h.T, sizes, axis=1) * x, axis=0))
+        return np.asarray((h.T.take(own, axis=1) * x).sum(axis=0))
 
-    plane = data.plane.T - np.repeat(summed(data.plane.T).T / sizes, sizes, axis=1)
+    own = np.repeat(np.arange(len(sizes)), sizes)
+    plane = data.plane.T - (summed(data.plane.T) / sizes).take(own, axis=1)
     spread = np.sqrt(summed(np.sum(plane * plane, axis=0)) / sizes) + 1e-12
-    x = np.vstack([plane / np.repeat(spread, sizes), np.ones_like(a)])  # of unit size each
-    xx, powers = x[:, None] * x, r2 ** np.arange(1, terms + 1)[:, None]
+    x = np.vstack([plane / spread.take(own), np.ones_like(a)])  # of unit size each
+    aligned = np.array([b * b, -a * b, a * a])[:, None, None] * x[:, None] * x
+    normal, powers = np.empty((len(sizes), 6, 6)), r2 ** np.arange(1, terms + 1)[:, None]
     usual, weights = np.empty_like(a), np.ones_like(a)
     order, counts = _rings(r)
     for _ in range(rounds):
-        bb, ab, aa = (summed(weights * factor * xx) for factor in (b * b, -a * b, a * a))
-        h12 = np.linalg.eigh(np.block([[bb, ab], [ab, aa]]))[1][:, :, 0]
+        normal[:, :3, :3], normal[:, 3:, :3], normal[:, 3:, 3:] = summed(weights * aligned).transpose(0, 3, 1, 2)
+        h12 = np.linalg.eigh(normal)[1][:, :, 0]  # of the lower triangle
         u, v = sent(h12[:, :3]), sent(h12[:, 3:])
         agree = summed(weights * (u * a + v * b))
-        scale = np.repeat(summed(weights * r2) / np.where(np.abs(agree) > 1e-12, agree, 1e-12), sizes)
+        scale = (summed(weights * r2) / np.where(np.abs(agree) > 1e-12, agree, 1e-12)).take(own)
         u, v = scale * u, scale * v
         q = (u * a + v * b) / np.maximum(r, 1e-9)
         rows = np.vstack([r * x, -q * powers, q])
-        depths = summed(weights * rows[:, None] * rows)
+        depths = summed(weights * rows[:, None] * rows).transpose(2, 0, 1)
         depths[:, :3, :3] += 1e-12 * np.trace(depths[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
         shares = np.linalg.solve(depths[:, :3, :3], depths[:, :3, 3:])
         reduced = np.sum(depths[:, 3:, 3:] - np.swapaxes(shares, 1, 2) @ depths[:, :3, 3:], axis=0)
