@@ -191,13 +191,19 @@ def solve_mrcal(corners: Corners) -> Answer:
     spacing = float(corners.square_m)
     core, _, frames = mrcal.seed_stereographic(size, 0.5 * float(size[0, 0]), indices, grids, spacing)
     intrinsics = np.concatenate([core, np.zeros((1, 5))], axis=1)
-    arguments = (intrinsics, None, frames, None, grids, np.column_stack([indices, -np.ones_like(indices[:, 1])]))
+    newer = "rt_ref_frame" in mrcal.optimize.__doc__  # which 2.5 says for frames_rt_toref
+    cameras, boards = ("rt_cam_ref", "rt_ref_frame") if newer else ("extrinsics_rt_fromref", "frames_rt_toref")
+    seen = np.column_stack([indices, -np.ones_like(indices[:, 1])]).astype(np.int32)
     start = time.perf_counter()
     mrcal.optimize(
-        *arguments,
-        None,
-        None,
-        "LENSMODEL_OPENCV5",
+        intrinsics=intrinsics,
+        **{cameras: None, boards: frames},
+        points=None,
+        observations_board=grids,
+        indices_frame_camintrinsics_camextrinsics=seen,
+        observations_point=None,
+        indices_point_camintrinsics_camextrinsics=None,
+        lensmodel="LENSMODEL_OPENCV5",
         imagersizes=size,
         do_optimize_calobject_warp=False,
         calibration_object_spacing=spacing,

@@ -93,11 +93,14 @@ def solve_as_built(
         if built.every:
             end, explanations = compete(problem, observations, solved(now), solver)
         return end, problem, explanations, ()
-    before, rounds = built, 0
-    while now.every and not (rounds and _alike(now.every, before.every)) and rounds < _MOST_ROUNDS:
-        before, rounds = now, rounds + 1
-        end = solved(before)
+    before, rounds, at_rest = now, 1, _alike(now.every, built.every)
+    end = solved(before)
+    while not at_rest and rounds < _MOST_ROUNDS:
         now = estimate_as_built(problem, observations, _freed(end, problem, freed(before)))
+        at_rest = not now.every or _alike(now.every, before.every)
+        if not at_rest:
+            before, rounds = now, rounds + 1
+            end = solved(before)
     every, structure = before.every, freed(before)
     if not _alike(every, built.every):
         end, explanations = compete(_held(problem, before, observations), observations, end, solver)

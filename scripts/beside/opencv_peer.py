@@ -1,0 +1,124 @@
+"""OpenCV, and what ROS and Kalibr ask of its solver and its lenses.
+
+Called as https://docs.opencv.org/5.x/dc/dbb/tutorial_py_calibration.html says; `released` is calibrateCameraRO, which
+solves for the board too (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html, "a more accurate camera calibration
+with imprecise targets"). ROS' camera_calibration calls calibrateCamera with two radial coefficients and k3 held
+(https://docs.ros.org/en/rolling/p/camera_calibration/, `--k-coefficients 2`). Kalibr's pinhole-equi is the lens of
+cv2.fisheye (https://github.com/ethz-asl/kalibr/wiki/supported-models); its own estimator is not run here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+from benchmarks.peers import Array, Corners, solve_opencv
+
+from beside.fitted import Fitted
+from beside.starts import wide_focal
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_cv: Any = cv2  # which takes more than its stubs say, and numbers its flags elsewhere in each release
+FISHEYE = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+
+
+def brown(places: Array, values: Array) -> Array:
+    """(N, 2) px by OpenCV's lens: fx, fy, cx, cy and coefficients in its order; NaN behind the camera."""
+    return _shown(places, values, lambda *given: cv2.projectPoints(*given)[0])
+
+
+def fisheye(places: Array, values: Array) -> Array:
+    """The same by cv2.fisheye, in whose formulas a place beside or behind the camera is seen too."""
+    fx, fy, cx, cy, *lens = values
+    aside = np.linalg.norm(places[:, :2], axis=1)
+    angle = np.arctan2(aside, places[:, 2])
+    grown = angle * (1.0 + np.sum([k * angle ** (2 * n + 2) for n, k in enumerate(lens)], axis=0))
+    return np.asarray(places[:, :2] / np.maximum(aside, 1e-15)[:, None] * grown[:, None] * (fx, fy) + (cx, cy))
+
+
+def _shown(places: Array, values: Array, project: Callable[..., Any]) -> Array:
+    fx, fy, cx, cy, *lens = values
+    matrix, zero = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.zeros(3)
+    pixels = np.asarray(project(np.ascontiguousarray(places[:, None]), zero, zero, matrix, np.array(lens)))
+    pixels = pixels.reshape(-1, 2)
+    return np.asarray(np.where(places[:, 2:] > 1e-6, pixels, np.nan))
+
+
+def numbers_of(matrix: Array, lens: Array, count: int) -> Array:
+    """(4 + count,) fx, fy, cx, cy and coefficients."""
+    return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens.ravel()[:count]])
+
+
+def _fit(flags: int, coefficients: int, fixed: tuple[str, ...], corners: Corners) -> Fitted:
+    objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
+    size = tuple(corners.image_size.tolist())
+    start = time.perf_counter()
+    _, matrix, lens, turns, shifts, sd, *_ = _cv.calibrateCameraExtended(objects, images, size, None, None, flags=flags)
+    seconds = time.perf_counter() - start
+    values = numbers_of(matrix, lens, coefficients)
+    stated = np.asarray(sd, dtype=float).ravel()[: len(values)]
+    stated[[NAMES.index(name) for name in fixed]] = 0.0
+    left = [
+        cv2.projectPoints(o, r, t, matrix, lens)[0].reshape(-1, 2) - i
+        for o, i, r, t in zip(objects, images, turns, shifts, strict=True)
+    ]
+    squares = float(np.sum(np.concatenate(left) ** 2))
+    free = 2 * len(corners.view) - len(values) + len(fixed) - 6 * corners.frames
+    noise = float(np.sqrt(squares / max(free, 1)))
+    return Fitted(
+        NAMES[: len(values)], values, brown, corners.board, noise, stated, seconds=seconds,
+        more={"rms_px": float(np.sqrt(squares / len(corners.view)))},
+    )  # fmt: skip
+
+
+def _plain(corners: Corners) -> Fitted:
+    """calibrateCamera, which states no deviations: what is timed."""
+    found = solve_opencv(corners)
+    return Fitted(NAMES[:9], found.intrinsics, brown, corners.board, seconds=found.seconds)
+
+
+def _released(flags: int, coefficients: int, corners: Corners) -> Fitted:
+    """Every view must show every corner: those that do not are left out."""
+    count = len(corners.board)
+    objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
+    whole = [number for number, one in enumerate(images) if len(one) == count]
+    objects, images = [objects[k] for k in whole], [images[k] for k in whole]
+    size, fixed = tuple(corners.image_size.tolist()), int(corners.grid[0]) - 1
+    start = time.perf_counter()
+    _, matrix, lens, _, _, board = _cv.calibrateCameraRO(objects, images, size, fixed, None, None, flags=flags)
+    seconds = time.perf_counter() - start
+    return Fitted(
+        NAMES[: 4 + coefficients], numbers_of(matrix, lens, coefficients), brown,
+        np.asarray(board, dtype=float).reshape(-1, 3), seconds=seconds,
+    )  # fmt: skip
+
+
+def _fisheye(corners: Corners) -> Fitted:
+    objects, images = ([part[None].astype(float) for part in parts] for parts in corners.by_frame())
+    size = tuple(corners.image_size.tolist())
+    flags = _cv.CALIB_RECOMPUTE_EXTRINSIC | _cv.CALIB_FIX_SKEW
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
+    start = time.perf_counter()
+    if (focal := wide_focal(corners)) is None:
+        found = _cv.fisheye.calibrate(objects, images, size, None, None, None, None, flags, criteria)
+    else:
+        width, height = size
+        matrix = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+        flags |= _cv.CALIB_USE_INTRINSIC_GUESS
+        found = _cv.fisheye.calibrate(objects, images, size, matrix, np.zeros(4), None, None, flags, criteria)
+    seconds = time.perf_counter() - start
+    return Fitted(FISHEYE, numbers_of(found[1], found[2], 4), fisheye, corners.board, seconds=seconds)
+
+
+SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+    "default": partial(_fit, 0, 5, ()),
+    "calibrateCamera": _plain,
+    "rational": partial(_fit, cv2.CALIB_RATIONAL_MODEL, 8, ()),
+    "released": partial(_released, 0, 5),
+    "as ROS": partial(_fit, cv2.CALIB_FIX_K3, 5, ("k3",)),
+    "fisheye, as Kalibr's equi": _fisheye,
+}
