@@ -30,7 +30,7 @@ _KEYS = {
     "ssl": ("scene", "noise", "method"), "soccernet": ("method",), "corners": ("frames", "peer", "setting"),
     "photographs": ("set", "method"),
 }  # fmt: skip
-_QUICK_SETTINGS = ("default", "OPENCV", "audit")
+_QUICK_SETTINGS = ("default", "OPENCV")
 _QUICK_FAULTS = ("sound", "repeated picture")
 
 
@@ -48,9 +48,8 @@ def measured(given: argparse.Namespace, peers: Sequence[str]) -> dict[str, list[
 
 
 def _asked(given: argparse.Namespace, tasks: Iterable[boards.Task]) -> list[boards.Task]:
-    """All of them; of the quick form the defaults and a few faults."""
-    names = {*SOURCES, *_QUICK_FAULTS}
-    return [one for one in tasks if not given.quick or (one.setting in _QUICK_SETTINGS and one.name in names)]
+    """All of them; of the quick form the defaults."""
+    return [one for one in tasks if not given.quick or one.setting in _QUICK_SETTINGS]
 
 
 def _truth(given: argparse.Namespace, peers: Sequence[str], sets: Any, folder: Path) -> dict[str, Any]:
@@ -64,7 +63,7 @@ def _prediction(given: argparse.Namespace, peers: Sequence[str], sets: Any, fold
 
 
 def _lies(given: argparse.Namespace, peers: Sequence[str], sets: Any, folder: Path) -> dict[str, Any]:
-    tasks = _asked(given, lies.tasks(peers, folder))
+    tasks = list(lies.tasks(peers, folder, _QUICK_FAULTS if given.quick else tuple(lies.FAULTS)))
     return {"lies": lies.rows(tasks, boards.answers(tasks, given.jobs))}
 
 
@@ -138,7 +137,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--sets", nargs="+", choices=list(SOURCES), help="real sets of boards (default: all at hand)")
     parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS), help="default: all")
     parser.add_argument("--splits", type=int, default=3, help="random halves of each set (default %(default)s)")
-    parser.add_argument("--runs", type=int, default=12, help="seeds of each field (default %(default)s)")
+    parser.add_argument("--runs", type=int, default=8, help="seeds of each field (default %(default)s)")
     parser.add_argument("--frames", type=int, default=400, help="of SoccerNet (default %(default)s)")
     parser.add_argument("--turns", type=int, default=5, help="of what is timed: the best counts (default %(default)s)")
     parser.add_argument(

@@ -332,9 +332,9 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
         "20 views, 1 camera, 1 station, 12 placements",
         "680 point observations, 1591 curve observations",
         f"phi             {camera.phi:.1f} ± 1.5 px (started from the views)",
-        f"a2              {camera.lens.values[0]:.2e} ± 3.2e-06",
-        f"height {camera.position[2]:.3f} m ± 7.2 mm",
-        "located   overhead: ± 0.28 mm on the floor (worst 0.73 at 0.8, 3.0 m), ± 0.34 mm at 150 mm",
+        f"a2              {camera.lens.values[0]:.2e} ± 3.3e-06",
+        f"height {camera.position[2]:.3f} m ± 7.3 mm",
+        "located   overhead: ± 0.36 mm on the floor (worst 1.1 at 0.8, 3.0 m), ± 0.41 mm at 150 mm",
         "deg from straight down",
         "of 2271 taken out",
         "converged after",
@@ -385,7 +385,7 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert known["numbers"][0]["key"] == {"kind": "camera", "owner": "overhead", "quantity": "phi", "unit": "px"}
     floor, robots = known["maps"]["overhead"]
     assert (floor["height_m"], robots["height_m"]) == (0.0, 0.15)
-    assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.0
+    assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.5  # 0.36, 0.41, 1.1 measured
     assert known["weak_directions"] == [] and known["unknown_placements"] == {} and known["seams"] == []
     # Nothing given on the command line is what nothing given in Python is.
     assert data["calibration"]["options"] == _plain(Options(lens="radial", terms=("tangential",)))
@@ -467,8 +467,8 @@ def test_files_are_taken_together(say: Say, tmp_path: Path) -> None:
 def test_says_where_phi_and_height_trade(say: Say, tmp_path: Path) -> None:
     say("simulate", "field-2004", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json", "--lens", "radial")
-    assert said.code == 0 and "px, weak (started from a guess)" in said.out
-    assert "weak      phi of 'overhead' and its height trade off: only their ratio is known, to 0.39 %" in said.out
+    assert said.code == 0 and "px, weak: 571 to 871 px (started from a guess)" in said.out
+    assert "weak      phi of 'overhead' and its height trade off: only their ratio is known, to 0.4 %" in said.out
 
 
 def frontal(folder: Path) -> Path:
@@ -504,7 +504,7 @@ def test_unknown_is_null_for_scripts(say: Say, tmp_path: Path) -> None:
 def test_says_how_two_cameras_agree(say: Say, tmp_path: Path) -> None:
     say("simulate", "two-cameras", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json")
-    assert "seam      left - right: ± 0.57 mm on the floor" in said.out
+    assert "seam      left - right: ± 0.6 mm on the floor" in said.out
     assert "found 1.5 mm where 1.7 were expected (rms of 41 points and stretches that both observed)" in said.out
 
 

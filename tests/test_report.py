@@ -131,7 +131,7 @@ def test_every_reference_in_the_page_leads_to_one_place() -> None:
 def test_verdict_first_then_findings_numbers_pictures() -> None:
     sections = re.findall(r'<section id="(\w+)"', sample_page())
     assert sections == ["verdict", "support", "findings", "numbers", "residuals", "maps", "solve"]
-    assert headline(sample_page()).startswith("good: This calibration can be trusted: to 0.")
+    assert headline(sample_page()).startswith("good: This calibration can be trusted: to 1.")
 
 
 def test_every_picture_has_its_sentence_and_its_table() -> None:

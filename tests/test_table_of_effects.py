@@ -111,7 +111,7 @@ def test_it_widens(calibration: Calibration) -> None:
     """By what is open of its amounts: the same noise before a steady camera says more."""
     steady = calibrate(simulate(scenes.overhead(boards=8), scenes.NOISE, 1).observations, RADIAL)
     sds = [one.uncertainty.posterior.sd for one in (calibration, steady)]
-    assert np.all(sds[0] > sds[1]) and np.max(sds[0] / sds[1]) > 1.1
+    assert np.all(sds[0] > 0.99 * sds[1]) and np.max(sds[0] / sds[1]) > 1.1
 
 
 def test_it_is_diagnosed_and_reported(calibration: Calibration, swayed: Observations, tmp_path: Path) -> None:

@@ -14,9 +14,10 @@ from ceres_cal.calibration.outcome import (
     require_lens_told,
     resting_phi,
     unknown_phi,
+    unusual_pixels,
 )
 from ceres_cal.effects.dependence import Scatter, measure_scatter
-from ceres_cal.effects.effect import AsBuilt, EffectEstimate
+from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
@@ -94,7 +95,7 @@ def solved_from(
     if assessed:
         part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
         usual = again.scales if again else None
-        conflicts = find_conflicts(seen.problem, observations, seen.end, usual, part)
+        conflicts = find_conflicts(seen.problem, observations, seen.end, usual, part, seen.shifts_at)
         seen = seen.without(conflicts, observations)
     settled = None
     if watched.settle is not None:
@@ -107,7 +108,8 @@ def solved_from(
         seen, posterior = _known(seen, observations, conflicts, again, watched)
         alike = seen_alike(seen.others, seen.end.solution.estimate, posterior.half_width)
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
-        warnings = (*warnings, *conflicts.words, *phi, *alike)
+        oblong = unusual_pixels(seen.end, seen.problem, observations)
+        warnings = (*warnings, *conflicts.words, *phi, *oblong, *alike)
     if digest is not None:
         digest.result()  # which the observations remember
     calibration = came_out(seen.start.phi_from, observations, seen.problem, seen.end, seen.explanations)
@@ -142,6 +144,11 @@ class _Explained:
     def effects(self) -> tuple[EffectEstimate, ...]:
         """What was solved for beside the problem."""
         return self.beside.estimates if self.beside else ()
+
+    @property
+    def shifts_at(self) -> ShiftsAt | None:
+        """By which numbers scatter besides."""
+        return self.beside.shifts_at if self.beside else None
 
     def without(self, conflicts: Conflicts, observations: Observations) -> _Explained:
         """The answer without what was stated and everything else contradicts."""
@@ -184,12 +191,14 @@ def _of_targets(
 ) -> _Explained:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
-    if problem.options.as_built == "estimate":
+    is_asked = problem.options.as_built == "estimate"
+    if is_asked:
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved, built)
-    if watched.settle is None and estimated():
+    if is_asked and estimated(observations):
         from ceres_cal.robust.effects import solve_beside_effects
 
-        beside = solve_beside_effects(problem, taking_part(problem, observations, explanations), observations, end)
+        part, is_all = taking_part(problem, observations, explanations), watched.settle is None
+        beside = solve_beside_effects(problem, part, observations, end, solves=is_all)
         problem, end = beside.problem, beside.end
     others: tuple[Solution, ...] = ()
     if end.problem.sights.equations == problem.sights.equations:
@@ -203,11 +212,9 @@ def _known(
     seen: _Explained, observations: Observations, conflicts: Conflicts, again: Again | None, watched: Watched
 ) -> tuple[_Explained, Posterior]:
     """What is known of every number, with what the lens hides and whatever else may be."""
-    end, posterior = _assess(seen.end, observations, seen.problem, again, watched.bends)
+    end, posterior = _assess(seen, observations, again, watched.bends)
     if again is None:
         require_lens_told(end.solution.estimate, posterior)
-    if seen.beside:
-        posterior = posterior.widened(seen.beside.keys, seen.beside.shifts)
     if again is None:
         posterior = with_roughness(posterior, end, observations)
     return replace(seen, end=end), with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
@@ -225,12 +232,13 @@ def _as_long_as_asked(
 
 
 def _assess(
-    end: RobustSolution, observations: Observations, problem: Problem, again: Again | None, bends: bool
+    seen: _Explained, observations: Observations, again: Again | None, bends: bool
 ) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
     Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
     """
+    end = seen.end
     known = end.problem if again is None else replace(end.problem, layout=again.known)
     estimate = end.solution.estimate
     reduced = end.reduced if again is None else None
@@ -242,8 +250,8 @@ def _assess(
         return measure_scatter(observations, known, found, there, says)
 
     freedom = end.inliers.degrees_of_freedom
-    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, bends=bends)
-    return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, seen.shifts_at, bends=bends)
+    return (end if assessed is estimate else end.moved_to(assessed, observations, seen.problem)), posterior
 
 
 def _start_of(others: Problem, some: Subproblem, start: Start, again: Again | None) -> Estimate:

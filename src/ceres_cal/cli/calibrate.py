@@ -111,8 +111,8 @@ class CalibrateArguments(ReportArguments):
         group=_CAMERA,
     )
     as_drawn: bool = switch(
-        "take targets without a tolerance as drawn (default: corners, bows and lines whose residuals repeat over the "
-        "views are solved for, with a sigma from the data)",
+        "take targets without a tolerance as drawn, and floors as flat and square. Default: corners, bows and lines "
+        "whose residuals repeat over the views are solved for; one floor in five is 2 mm of 9 m off",
         group=_CAMERA,
     )
     as_built: bool = switch("the contrary of --as-drawn, which is the default", group=_CAMERA)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
+from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.residuals import Equations, plane_shift, whole_structure
@@ -91,6 +92,16 @@ class EffectEstimate:
     def warning(self) -> str:
         """What somebody must know who uses the calibration."""
         return f"{self.sentence}; it was solved for"
+
+
+class ShiftsAt(Protocol):
+    """By how much effects let numbers scatter at an estimate: the numbers, and shifts of them whose products with
+    themselves, added up, go into their covariance. Under other priors, where these are given.
+    """
+
+    def __call__(
+        self, estimate: Estimate, priors: Sequence[GaussianPrior] | None = None, /
+    ) -> tuple[Sequence[Key], Sequence[Array]]: ...
 
 
 @dataclass(frozen=True)
@@ -263,6 +274,14 @@ class Effect(ABC):
     absorbed: ClassVar[bool] = False
     built: ClassVar[str] = ""
     prior: ClassVar[SizePrior | None] = None
+
+    def concerns(self, observations: Observations) -> bool:
+        """Whether it may displace any of them."""
+        return True
+
+    def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
+        """The prior of one of its groups, where it depends on how large what it is about is."""
+        return self.prior
 
     @abstractmethod
     def columns(self, case: Case) -> Iterator[EffectColumns]:

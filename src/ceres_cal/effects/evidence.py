@@ -80,6 +80,11 @@ likely as not.
 """
 AS_BUILT = SizePrior(0.5, tuple(np.geomspace(1e-5, 3e-2, 30).tolist()))
 """Of how far a target's features lie off its drawing, in its size: that it is as drawn is as likely as not."""
+FLOOR_OFF = SizePrior(0.8, (0.0005,))
+"""Of how much higher or lower a floor's edges are than its middle, and of how far a field's are out of square, over
+half of its longer side: 2 mm of a field of 9 m. Four of five are flat and square.
+"""
+FLOOR_OFF_WORDS = "One floor in five is bowed, or its field out of square, by 2 mm on 9 m"
 DEPENDENCE = SizePrior(0.8, ())
 """Of errors that go together within views, and of views that scatter more than their equations say: errors are
 independent in four of five calibrations. The sizes are those of a grid, or of a factor.
@@ -276,14 +281,16 @@ class RepeatedAmounts:
         return np.asarray(-covariance @ self.score[numbers] / self.noise), np.asarray(covariance)
 
     def size(self, numbers: Indices, others: Indices, sigmas: Array, prior: SizePrior) -> tuple[float, float]:
-        """Sigma and probability of some numbers, with others scattering by sigmas (see `RandomEffects`)."""
+        """Sigma and probability of some numbers, with others scattering by sigmas (see `RandomEffects`); as they were
+        beforehand where too few sights tell what goes together within them.
+        """
         # The same of directions that tell a size. What is free besides takes up nearly all of those that are less
         # determined, and what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a
         # lens had left over.
         tells = 1e-3
         within, freedom = self._within(numbers)
         if freedom < _FEWEST:
-            return 0.0, 0.0
+            return float(np.sqrt(np.mean(np.square(prior.sizes)))), 1.0 - prior.absent
         within = max(within, 1.0)
         score, information = self._beside(numbers, others, sigmas)
         least = tells * float(np.linalg.eigvalsh(information)[-1]) / within

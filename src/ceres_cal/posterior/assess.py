@@ -14,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import numerical
 from ceres_cal.effects.dependence import Scatter
+from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
@@ -48,6 +49,7 @@ def assess(
     reduced: ReducedInformation,
     degrees_of_freedom: float,
     scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
+    shifts_at: ShiftsAt | None = None,
     *,
     bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
@@ -62,12 +64,22 @@ def assess(
         reduced: what the problem says at the estimate.
         degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
         scatter_at: how the data scatter at an estimate, of which the problem says so much.
+        shifts_at: numbers, and shifts by which they scatter besides, at an estimate. Along a valley the profile is as
+            much wider, and what is across it with phi held.
         bends: whether weak directions are followed, which takes a solve for each end.
 
     Raises:
         SolutionError: no possible lens fits.
     """
-    posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
+
+    def known(there: Estimate, says: ReducedInformation) -> Posterior:
+        by_scatter = make_posterior(says, degrees_of_freedom, scatter_at(there, says))
+        if shifts_at is None:
+            return by_scatter
+        by_model = by_scatter.by_model or by_scatter.information
+        return replace(by_scatter.widened(*shifts_at(there)), by_model=by_model)
+
+    posterior = known(estimate, reduced)
     width = posterior.half_width
     valleys: dict[str, tuple[Node, ...]] = {}
     astray = problem  # with phi held of the cameras that went astray, while others are looked at
@@ -82,7 +94,7 @@ def assess(
             astray = astray.holding(name, 0)
     if astray is not problem:
         reduced = information(problem, estimate)
-        posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
+        posterior = known(estimate, reduced)
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
     posterior = replace(posterior, mixtures=mixtures)
     return estimate, _with_bends(posterior, problem, estimate) if bends else posterior

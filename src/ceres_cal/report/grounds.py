@@ -5,7 +5,7 @@ What speaks for it and against it has a level each: good, care, no, or "" where 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -13,6 +13,7 @@ from msgspec import Struct
 from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
+from ceres_cal.effects.evidence import FLOOR_OFF_WORDS
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
@@ -22,6 +23,8 @@ from ceres_cal.robust.as_built import words_of
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
 care, beyond it not to be used."""
+MOST_PLACES = 0.95
+"""Share of the places seen that the verdict speaks of. The worst one is named beside it where it is much worse."""
 GOOD_PX, CARE_PX = 2.0, 10.0
 """The same of places in the picture, of a camera that sees no field: a pixel shows about 5 mm of one."""
 LARGE_NOISE = 3.0
@@ -155,8 +158,8 @@ def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
 def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
     """Level and line of what is wrong with the model, by how far it moves a result."""
     sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
-    worst_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
-    level = "" if sigmas < MOVED else "no" if sigmas >= MOVED_FAR and not worst_mm <= GOOD_MM else "care"
+    left_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
+    level = "" if sigmas < MOVED else "no" if sigmas >= MOVED_FAR and not left_mm <= GOOD_MM else "care"
     counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
     moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
     wrong_mm = mm(model_error_mm(quality))
@@ -169,6 +172,8 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
         return
     if quality.uncertainty.widening:
         yield "", f"{sentence(quality.uncertainty.widening)}."
+    if quality.fields and quality.calibration.options.as_built == "estimate":
+        yield "", f"{FLOOR_OFF_WORDS}; the accuracy includes this, and --as-drawn leaves it out."
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     # What they do to places is in the maps, and what to the picture, in what is said of it.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
@@ -190,12 +195,15 @@ class Reach(Struct, frozen=True):
     """How well places at one height are told, over all stations.
 
     Attributes:
-        height_m: of the places. radius_mm: 95 % of the points located at the worst place are nearer, infinite where it
-            cannot be told, NaN where no image shows any. level: "good", "care" or "no".
+        height_m: of the places. radius_mm: 95 % of the points located are nearer, at 95 of 100 of the places that are
+            seen; worst_mm: at the worst one. Infinite where it cannot be told, NaN where no image shows any.
+        worst_at: of that place. level: "good", "care" or "no".
     """
 
     height_m: float
     radius_mm: float
+    worst_mm: float
+    worst_at: str
     level: str
 
     @property
@@ -207,14 +215,27 @@ def reaches(quality: Quality) -> tuple[Reach, ...]:
     """One for each of HEIGHTS_M, with what is named as wrong counted; none where no station sees the world."""
     if not quality.maps:
         return ()
-    radii = [worst_radius(*(maps[number] for maps in quality.faulty_maps)) for number in range(len(HEIGHTS_M))]
-    return tuple(Reach(height, radius, level_of(radius)) for height, radius in zip(HEIGHTS_M, radii, strict=True))
+    return tuple(
+        _reach(height, [maps[number] for maps in quality.faulty_maps]) for number, height in enumerate(HEIGHTS_M)
+    )
 
 
-def worst_radius(*maps: FieldMap | FaultyMap) -> float:
-    """The largest of their 95 % radii, mm; NaN where they show nothing."""
+def _reach(height_m: float, maps: Sequence[FaultyMap]) -> Reach:
+    """A corner of the picture beyond the paint, of which little is known, is named and does not condemn the rest."""
     radii = np.concatenate([one.radius_95_mm.ravel() for one in maps])
-    shown = radii[~np.isnan(radii)]
+    places = np.concatenate([one.of.places for one in maps])[~np.isnan(radii)]
+    radii = radii[~np.isnan(radii)]
+    if not len(radii):
+        return Reach(height_m, np.nan, np.nan, "", "no")
+    most, at = float(np.quantile(radii, MOST_PLACES, method="higher")), int(np.argmax(radii))
+    farthest, (x, y) = float(radii[at]), places[at, :2]
+    level = "care" if level_of(most) == "good" and level_of(farthest) == "no" else level_of(most)
+    return Reach(height_m, most, farthest, f"x {x:.1f}, y {y:.1f} m", level)
+
+
+def worst_radius(one: FieldMap | FaultyMap) -> float:
+    """The largest of its 95 % radii, mm; NaN where it shows nothing."""
+    shown = one.radius_95_mm[~np.isnan(one.radius_95_mm)]
     return float(shown.max()) if len(shown) else np.nan
 
 
@@ -250,11 +271,22 @@ def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple
         return "no", f"Do not trust this calibration{f': {why}' if why else ''}."
     if doubt:
         return "care", f"Usable with limits, without a stated accuracy: {doubt}."
-    promised = " and ".join(f"to {mm(r.radius_mm)} {r.where}" for r in every if r.level != "no")
     if above.level == "no":
-        return "care", f"Usable on the floor only, to {mm(floor.radius_mm)}: {_short_of(above)}."
+        how = f"to {mm(floor.radius_mm)}{_except_at([floor])}"
+        return "care", f"Usable on the floor only, {how}: {_short_of(above)}."
     level = worst(reasons, floor.level, above.level)
-    return level, f"{'This calibration can be trusted' if level == 'good' else 'Usable with limits'}: {promised}."
+    how = " and ".join(f"to {mm(one.radius_mm)} {one.where}" for one in every) + _except_at(every)
+    return level, f"{'This calibration can be trusted' if level == 'good' else 'Usable with limits'}: {how}."
+
+
+def _except_at(every: Sequence[Reach]) -> str:
+    """The worst place, where it is of another level than most; "" where it is not."""
+    worse = [one for one in every if level_of(one.worst_mm) != level_of(one.radius_mm)]
+    if not worse:
+        return ""
+    farthest = max(worse, key=lambda one: one.worst_mm)
+    how = f"to {mm(farthest.worst_mm)} only" if np.isfinite(farthest.worst_mm) else "not known"
+    return f" (at {farthest.worst_at} {how})"
 
 
 def _short_of(reach: Reach) -> str:
@@ -278,6 +310,6 @@ def _doubt(quality: Quality) -> str:
         return f"the noise is {short(noise_ratio(quality))} times the stated sigma"
     if off := misfit_mm(quality):
         return f"it is off by {mm(off)} rms on these new data"
-    if quality.fault_sigmas >= MOVED_FAR and not all(one.level == "good" for one in reaches(quality)):
+    if quality.fault_sigmas >= MOVED_FAR and not all(one.radius_mm <= GOOD_MM for one in reaches(quality)):
         return f"the faults below move it by {short(quality.fault_sigmas)} standard deviations"
     return ""

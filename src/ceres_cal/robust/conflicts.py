@@ -25,10 +25,11 @@ from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.errors import CalibrationError, attempt, or_none
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.dependence import measure_scatter, scattered
+from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.information import Information, Key, over
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
@@ -115,16 +116,12 @@ def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
     return np.asarray(gradient[[every.index(key) for key in keys]])
 
 
-def rest_at(statement: Statement, end: RobustSolution, observations: Observations | None = None) -> Rest:
-    """Where a problem without the statement was solved; with the observations, as these scatter."""
-    estimate = end.solution.estimate
-    reduced = end.reduced or information(end.problem, estimate)
+def rest_at(statement: Statement, end: RobustSolution, known: Information | None = None) -> Rest:
+    """Where a problem without the statement was solved, by what is known of its numbers there; else by the model."""
+    reduced = end.reduced or information(end.problem, end.solution.estimate)
     freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
-    scatter = None
-    if observations is not None:
-        scatter = measure_scatter(observations, end.problem, end.residuals, estimate, reduced)
-    known = scattered(reduced, scatter).marginal(statement.keys)
-    return Rest(estimate, np.zeros(len(statement.keys)), known, freedom)
+    known = (known or reduced.shared).marginal(statement.keys)
+    return Rest(end.solution.estimate, np.zeros(len(statement.keys)), known, freedom)
 
 
 def worst_test(statement: Statement, rest: Rest) -> WaldTest:
@@ -220,20 +217,21 @@ def find_conflicts(
     end: RobustSolution,
     usual: tuple[float, float] | None = None,
     part: Problem | None = None,
+    shifts_at: ShiftsAt | None = None,
 ) -> Conflicts:
     """Everything stated that the rest contradicts, the worst first, each with those before it left out.
 
     Args:
         problem: of all the observations. end: its solution. usual: noise scales that were seen before.
         part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
-            without an outlier; None where the answer stays.
+            without an outlier; None where the answer stays. shifts_at: by which numbers scatter besides.
     """
     most = 4  # solves
     every = tuple(statements(problem, observations, end.solution.estimate))
     if not every:
         return Conflicts()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
-    search = _ForwardSelection(problem, end, observations, usual, every)
+    search = _ForwardSelection(problem, end, observations, usual, every, shifts_at)
     while search.solves < most and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
@@ -318,6 +316,7 @@ class _ForwardSelection:
     observations: Observations
     usual: tuple[float, float] | None
     every: tuple[Statement, ...]
+    shifts_at: ShiftsAt | None
 
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
@@ -363,10 +362,20 @@ class _ForwardSelection:
         found = []
         for number, (statement, test, rivals) in enumerate(self.out):
             if number < len(self.out) - 1 and statement.kind != "earlier":
-                test = worst_test(statement, rest_at(statement, self.end, self.observations))
+                test = worst_test(statement, rest_at(statement, self.end, self._known(self.end)))
             if test.log_p <= self._level:
                 found.append(contradicted(statement, test, alone, rivals))
         return found
+
+    def _known(self, end: RobustSolution) -> Information:
+        """About the shared numbers at an end, as the observations scatter."""
+        estimate = end.solution.estimate
+        reduced = end.reduced or information(end.problem, estimate)
+        known = scattered(reduced, measure_scatter(self.observations, end.problem, end.residuals, estimate, reduced))
+        if self.shifts_at is None:
+            return known
+        keys, shifts = self.shifts_at(estimate, end.problem.priors)
+        return known.widened(over(np.array(shifts), keys, known.keys)) if len(shifts) else known
 
     def _confirmed(self, statement: Statement, after: RobustSolution) -> WaldTest:
         """The test where the problem without the statement was solved. In a bent valley the least squares themselves
@@ -374,7 +383,7 @@ class _ForwardSelection:
         """
         rest = rest_at(statement, after)
         alone = worst_test(statement, rest)
-        test = worst_test(statement, rest_at(statement, after, self.observations))
+        test = worst_test(statement, rest_at(statement, after, self._known(after)))
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
         starts = (without, rest.estimate), (bound, self.end.solution.estimate)

@@ -17,13 +17,15 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
-from ceres_cal.effects.effect import Case, Effect, EffectEstimate
+from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.residuals import write_equations
@@ -38,27 +40,30 @@ class EffectsEnd:
 
     Attributes:
         problem: of all the observations, the effects' best amounts taken off. end: of its rounds.
-        estimates: of what was solved for. keys, shifts: shared numbers, and shifts of them whose products with
-            themselves, added up, are what the effects add to their covariance.
+        estimates: of what was solved for. shifts_at: what all of them add to the covariance of the shared numbers.
     """
 
     problem: Problem
     end: RobustSolution
-    estimates: tuple[EffectEstimate, ...] = ()
-    keys: Sequence[Key] = ()
-    shifts: Sequence[Array] = ()
+    estimates: tuple[EffectEstimate, ...]
+    shifts_at: ShiftsAt
 
 
 def solve_beside_effects(
-    problem: Problem, part: Problem, observations: Observations, end: RobustSolution
+    problem: Problem, part: Problem, observations: Observations, end: RobustSolution, *, solves: bool = True
 ) -> EffectsEnd:
     """The end with everything solved for that likely displaces the observations.
 
     Args:
         problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
+        solves: whether likely effects are; where the observations are a part of those that count, they only widen.
     """
     points, off = len(observations.points), np.zeros((len(observations.points) + len(observations.curves), 2))
-    amounts = _Amounts.of(part, observations, end, off)
+
+    def amounts_at(under: Problem, end: RobustSolution) -> _Amounts:
+        return _Amounts.of(under, observations, end, off, solves)
+
+    displaced, amounts = part, amounts_at(part, end)
     for _ in range(_MOST_ROUNDS):
         if not len(amounts.likely):
             break
@@ -66,14 +71,25 @@ def solve_beside_effects(
         shifts = -off[:points], -off[points:]
         displaced = replace(part, sights=part.sights.displaced(*shifts))
         end = solve_robustly(displaced, observations, end.solution.estimate, is_near=True)
-        before, amounts = amounts, _Amounts.of(displaced, observations, end, off)
+        before, amounts = amounts, amounts_at(displaced, end)
         if amounts.stay(before):
             break
-    keys = free_keys(end.solution.estimate, part.layout, part.private)
+    last, solved = end, end.solution.estimate
+
+    def shifts_at(
+        there: Estimate, priors: Sequence[GaussianPrior] | None = None
+    ) -> tuple[Sequence[Key], Sequence[Array]]:
+        # Along a valley, and without what was stated, numbers go together differently.
+        own = amounts
+        if there is not solved or priors is not None:
+            under = displaced if priors is None else replace(displaced, priors=tuple(priors))
+            own = amounts_at(under, last.moved_to(there, observations, under))
+        return free_keys(there, part.layout, part.private), list(own.shifts())
+
     if np.any(off):
         problem = replace(problem, sights=problem.sights.displaced(-off[:points], -off[points:]))
-        end = end.moved_to(end.solution.estimate, observations, problem)
-    return EffectsEnd(problem, end, tuple(amounts.estimates()), keys, list(amounts.shifts()))
+        end = end.moved_to(solved, observations, problem)
+    return EffectsEnd(problem, end, tuple(amounts.estimates()), shifts_at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +108,7 @@ class _Amounts:
 
     Attributes:
         taken: (K, Q) how the shared numbers move with each amount. groups: by number. sizes: of each group, its sigma
-            and probability.
+            and probability. solves: whether those are solved for that are likely.
     """
 
     case: Case
@@ -100,9 +116,12 @@ class _Amounts:
     taken: Array
     groups: Sequence[_EffectGroup]
     sizes: Sequence[tuple[float, float]]
+    solves: bool
 
     @classmethod
-    def of(cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array) -> _Amounts:
+    def of(
+        cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array, solves: bool
+    ) -> _Amounts:
         """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
         estimate = end.solution.estimate
         equations = write_equations(observations, problem.sights, estimate, end.residuals)
@@ -111,7 +130,7 @@ class _Amounts:
         model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))
         case = Case(observations, problem, estimate, model)
         groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
-        for effect in estimated():
+        for effect in estimated(observations):
             for columns in effect.columns(case):
                 width, count = columns.columns.shape[1], len(columns.subjects)
                 scaled = columns.columns * model.weight[:, None]
@@ -123,15 +142,16 @@ class _Amounts:
         every = SparseColumns.side_by_side(parts, len(equations))
         repeated = RepeatedAmounts.of(model, every)
         numbers = {number: group.own for number, group in enumerate(groups)}
-        priors = {number: group.effect.prior for number, group in enumerate(groups) if group.effect.prior is not None}
+        each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
+        priors = {number: prior for number, prior in each if prior is not None}
         sizes = repeated.sizes(numbers, priors)
         taken = -model.root @ every.in_shared(model)
-        return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers])
+        return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers], solves)
 
     @cached_property
     def likely(self) -> list[int]:
         """Numbers of the groups that are solved for."""
-        return [number for number, (_, probability) in enumerate(self.sizes) if probability > LIKELY]
+        return [number for number, (_, likely) in enumerate(self.sizes) if self.solves and likely > LIKELY]
 
     @cached_property
     def _best(self) -> tuple[Array, Array]:
@@ -181,7 +201,7 @@ class _Amounts:
         yield from shifts_by(self.taken, covariance)
         for number, group in enumerate(self.groups):
             (sigma, probability), taken = self.sizes[number], self.taken[:, group.own]
-            if probability > LIKELY:
+            if number in self.likely:
                 yield np.sqrt(1.0 - probability) * taken @ amounts[group.own]
             elif probability > negligible:
                 alone, open_ = self.repeated.amounts(group.own, np.full(len(group.own), sigma))

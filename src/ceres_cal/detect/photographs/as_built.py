@@ -30,6 +30,7 @@ from ceres_cal.scene.targets import Target
 # lie aside, root sum of squares: farther, they are others.
 _SCATTER, _FARTHEST = np.array([0.0125, 0.025, 0.05, 0.1, 0.2]), 3.0
 _ASIDE = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
+SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 _OTHER = 0.1  # of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 _BEAM, _MOST = 24, 9
@@ -53,6 +54,7 @@ class FieldAsBuilt:
         drawn: name of a dimension -> its value by the target, m. names: of the curves that tell it.
         usual_m: by how much a curve lies aside that does. scatter_m: by how much all the others do, where
             it is seen.
+        is_stretched: whether that is by pixels that are not square, by which another length may look right.
         misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
     """
 
@@ -63,6 +65,7 @@ class FieldAsBuilt:
     names: tuple[str, ...]
     usual_m: float
     scatter_m: float = 0.0
+    is_stretched: bool = False
     misfit: float = 0.0
 
     @property
@@ -84,6 +87,11 @@ class FieldAsBuilt:
         far = float(np.linalg.norm(list(self.aside_m.values())))
         elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
         return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
+
+    @property
+    def may_be_other(self) -> bool:
+        """Whether it is, or may be: of a stretched picture of another length the rest looks like other dimensions."""
+        return self.is_other or (self.is_stretched and bool(self.dimensions))
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""
@@ -156,7 +164,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
     shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, usual_aside_m(target))
-    return replace(shape.explained(), misfit=misfit)
+    return replace(shape.explained(), misfit=misfit, is_stretched=abs(camera.aspect - 1.0) > SQUARE)
 
 
 def _places_together(residuals: Array, curve: Indices) -> float:

@@ -53,7 +53,8 @@ class FieldSearch:
         turns: of the target that put its painted curves onto themselves; the first is none.
         others: the target drawn with other lengths, where some are not known.
         until_s: of this thread's processor time, after which no further camera is looked at.
-        reached: what was followed so far. refused: those of it that are surely not the field.
+        looked_at: cameras of candidates so far. reached: what was followed. refused: those of it that are surely not
+            the field.
     """
 
     grey: Array32
@@ -62,6 +63,7 @@ class FieldSearch:
     turns: tuple[Pose, ...]
     others: tuple[LineGrid, ...] = ()
     until_s: float = np.inf
+    looked_at: list[Camera] = field(default_factory=list)
     reached: list[Followed] = field(default_factory=list)
     refused: list[Followed] = field(default_factory=list)
 
@@ -126,7 +128,9 @@ def _drawings(target: Target, curves: Collection[str], lengths: Sequence[Prior])
 
 
 def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
-    """Cameras that may have taken it, the best first, each once for all turns of the target; and how it was drawn."""
+    """Cameras that may have taken it, the best first, each once for all turns of the target, and in no later search
+    among other strokes of it again; and how it was drawn.
+    """
     scored: list[tuple[float, Camera]] = []
     drawn: dict[int, LineGrid] = {}
     ends, weights = search.stroke_map.ends, search.stroke_map.weights
@@ -140,7 +144,10 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
         if scored and max(score for score, _ in scored) > _SURE:
             break
     distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
-    return _likely(search, [(camera, drawn[id(camera)]) for camera in distinct])
+    likely = _likely(search, [(camera, drawn[id(camera)]) for camera in distinct])
+    new = [one for one in likely if not any(_same_place(one[0], other, search.turns) for other in search.looked_at)]
+    search.looked_at.extend(camera for camera, _ in new)
+    return new
 
 
 def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:

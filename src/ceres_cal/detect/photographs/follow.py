@@ -44,7 +44,7 @@ _MOST_OTHERS = 3  # ways to see the field that are tried where the best looks li
 _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
-_AT_REST_PX = 0.02
+_AT_REST_PX, _NEARLY_PX = 0.02, 0.3  # the second where it is only asked whether this is the field
 _SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
 
 
@@ -90,7 +90,7 @@ def approach(
     Args:
         reached: what other starts led to, and by and by this one: what leads there, too, is not followed to its end.
     """
-    return next(_Tracker(grey, target, curves, free, reached=reached).tried([camera]))
+    return next(_Tracker(grey, target, curves, free, reached=reached, rest_px=_NEARLY_PX).tried([camera]))
 
 
 def look_again(
@@ -134,6 +134,7 @@ class _Tracker:
     free: FreeIntrinsics
     missing: tuple[str, ...] = ()
     reached: list[Followed] = field(default_factory=list)
+    rest_px: float = _AT_REST_PX
 
     def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
         """What was measured from a camera."""
@@ -228,7 +229,7 @@ class _Tracker:
             before, (tracker, there) = camera, refitted
             moved = moved_px(before, there, lines.course.pixels)
             camera, lines = there, tracker.measured(there)
-            if moved < _AT_REST_PX:
+            if moved < self.rest_px:
                 break
         return tracker.followed(camera, lines, moved)
 

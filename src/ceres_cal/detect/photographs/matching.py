@@ -133,7 +133,7 @@ def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
 
 def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[Match]:
     """The best hypotheses for these lines, the best first."""
-    kept = 800
+    kept = 250
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     scored: list[tuple[float, Array, Array]] = []
     for quarters in range(4 // gcd(4, grid.turns)):

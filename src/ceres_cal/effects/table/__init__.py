@@ -7,6 +7,7 @@ from pkgutil import iter_modules
 
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.effect import Case, Effect
+from ceres_cal.observations import Observations
 
 
 def rows() -> dict[str, Effect]:
@@ -18,9 +19,9 @@ def rows() -> dict[str, Effect]:
 EFFECTS = rows()
 
 
-def estimated() -> list[Effect]:
-    """Those that `calibrate` solves for, and widens by."""
-    return [effect for effect in EFFECTS.values() if effect.prior is not None]
+def estimated(observations: Observations) -> list[Effect]:
+    """Those that `calibrate` solves for in some observations, and widens by."""
+    return [effect for effect in EFFECTS.values() if effect.prior is not None and effect.concerns(observations)]
 
 
 def columns_of_all(case: Case) -> list[EffectColumns]:

@@ -1,4 +1,4 @@
-"""The floor: bowed as a whole, or higher at one place than around it."""
+"""The floor: bowed as a whole, higher at one place than around it, or with a field that is painted out of square."""
 
 from __future__ import annotations
 
@@ -9,23 +9,34 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.evidence import FLOOR_OFF, SizePrior
+from ceres_cal.observations import Observations
 
 
-class FloorBowed(Effect):
+class _Floor(Effect):
+    """What moves the places of targets that are part of the world."""
+
+    absorbed = True
+
+    def concerns(self, observations: Observations) -> bool:
+        return any(not target.movable for target in observations.targets.values())
+
+    def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
+        _, reach_m = _extent(case.equations.place[columns.group == number])
+        return self.prior and self.prior.times(reach_m)
+
+
+class FloorBowed(_Floor):
     """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
 
     kind = "floor bowed"
-    absorbed = True
+    prior = FLOOR_OFF
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         target, names = _target_of(case)
-        heights = np.zeros((len(target), 3))
-        for number in range(len(names)):
-            own = target == number
-            middle, reach = _extent(case.equations.place[own])
-            x, y = ((case.equations.place[own, :2] - middle) / reach).T
-            heights[own] = np.column_stack([x * x, y * y, x * y])
-        yield EffectColumns(self.kind, _raised(case)[:, None] * heights, target, names)
+        x, y = _over_extent(case, target, len(names)).T
+        heights = np.column_stack([x * x, y * y, x * y])
+        yield EffectColumns(self.kind, _moved(case, 2)[:, None] * heights, target, names)
 
     def words(self, evidence: Evidence) -> Words:
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
@@ -38,15 +49,35 @@ class FloorBowed(Effect):
         )
 
 
+class FieldSheared(_Floor):
+    """What runs along x is not at right angles to what runs along y."""
+
+    kind = "field sheared"
+    prior = FLOOR_OFF
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        target, names = _target_of(case)
+        x, y = _over_extent(case, target, len(names)).T
+        yield EffectColumns(self.kind, (_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
+
+    def words(self, evidence: Evidence) -> Words:
+        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"{evidence.score.subject} is out of square: its edges lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves "
+            f"({evidence.size})",
+            "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are",
+            amounts(("shear",), mm, sd, "mm"),
+        )
+
+
 def _lower(mm: float) -> str:
     return f"{'higher' if mm > 0.0 else 'lower'} by {abs(mm):.1f}"
 
 
-class FloorUneven(Effect):
+class FloorUneven(_Floor):
     """The floor is higher or lower at one place."""
 
     kind = "floor uneven"
-    absorbed = True
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted.
@@ -66,7 +97,7 @@ class FloorUneven(Effect):
             of, x = divmod(rest, span)
             at = [(place - span // 2) * cell_m for place in (x, y)]
             subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
-        yield EffectColumns(self.kind, _raised(case)[:, None], group, tuple(subjects))
+        yield EffectColumns(self.kind, _moved(case, 2)[:, None], group, tuple(subjects))
 
     def words(self, evidence: Evidence) -> Words:
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
@@ -87,10 +118,20 @@ def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
     return np.asarray(of_view[case.equations.view]), names
 
 
-def _raised(case: Case) -> Array:
-    """(E,) px per metre that the place of each equation is higher."""
-    up = case.equations.poses[case.equations.sight, :, 2]
-    return np.asarray(np.sum(case.equations.motion * up, axis=1))
+def _moved(case: Case, axis: int) -> Array:
+    """(E,) px per metre that the place of each equation is moved along an axis of the world."""
+    along = case.equations.poses[case.equations.sight, :, axis]
+    return np.asarray(np.sum(case.equations.motion * along, axis=1))
+
+
+def _over_extent(case: Case, target: Indices, count: int) -> Array:
+    """(E, 2) places on so many targets, from the middle of what was observed of each over half of its longer side."""
+    over = np.zeros((len(target), 2))
+    for number in range(count):
+        own = target == number
+        middle, reach_m = _extent(case.equations.place[own])
+        over[own] = (case.equations.place[own, :2] - middle) / reach_m
+    return over
 
 
 def _extent(places: Array) -> tuple[Array, float]:
@@ -101,4 +142,4 @@ def _extent(places: Array) -> tuple[Array, float]:
     return 0.5 * (low + high), max(0.5 * float(np.max(high - low)), 1e-9)
 
 
-EFFECTS = (FloorBowed(), FloorUneven())
+EFFECTS = (FloorBowed(), FloorUneven(), FieldSheared())
