@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -62,7 +63,9 @@ def environment(python: Path, version: str, resolution: str) -> Path:
         _done(uv(*step))
     (wheel,) = wheels.glob("*.whl")
     binary = ["--only-binary", ":all:", "--resolution", resolution]
-    _done(uv("pip", "install", "--python", python_there, *binary, wheel))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    # Named, too: what only the wheel asks for is no direct requirement, of which the lowest is wanted.
+    _done(uv("pip", "install", "--python", python_there, *binary, wheel, *project["dependencies"]))
     return python_there
 
 

@@ -22,6 +22,7 @@ from beside.fitted import Fitted
 from beside.starts import wide_focal
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_BESIDE_DEG = 80.0
 _cv: Any = cv2  # which takes more than its stubs say, and numbers its flags elsewhere in each release
 FISHEYE = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 
@@ -98,20 +99,36 @@ def _released(flags: int, coefficients: int, corners: Corners) -> Fitted:
 
 
 def _fisheye(corners: Corners) -> Fitted:
-    objects, images = ([part[None].astype(float) for part in parts] for parts in corners.by_frame())
-    size = tuple(corners.image_size.tolist())
+    """From nothing, or from a wide lens's focal length. Its start takes no corner beside the camera: where it stops at
+    one, it is given those up to 80 degrees off the axis.
+    """
     flags = _cv.CALIB_RECOMPUTE_EXTRINSIC | _cv.CALIB_FIX_SKEW
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
-    start = time.perf_counter()
-    if (focal := wide_focal(corners)) is None:
-        found = _cv.fisheye.calibrate(objects, images, size, None, None, None, None, flags, criteria)
-    else:
-        width, height = size
+    matrix, focal = None, wide_focal(corners)
+    if focal is not None:
+        width, height = corners.image_size.tolist()
         matrix = np.array([[focal, 0.0, 0.5 * (width - 1)], [0.0, focal, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
         flags |= _cv.CALIB_USE_INTRINSIC_GUESS
-        found = _cv.fisheye.calibrate(objects, images, size, matrix, np.zeros(4), None, None, flags, criteria)
-    seconds = time.perf_counter() - start
-    return Fitted(FISHEYE, numbers_of(found[1], found[2], 4), fisheye, corners.board, seconds=seconds)
+    start = time.perf_counter()
+    try:
+        found = _by_fisheye(corners, np.ones(len(corners.view), dtype=bool), matrix, flags)
+    except cv2.error:
+        if focal is None:
+            raise
+        middle = 0.5 * (corners.image_size - 1.0)
+        near = np.linalg.norm(corners.pixels - middle, axis=1) < np.deg2rad(_BESIDE_DEG) * focal
+        found = _by_fisheye(corners, near, matrix, flags)
+    return Fitted(FISHEYE, found, fisheye, corners.board, seconds=time.perf_counter() - start)
+
+
+def _by_fisheye(corners: Corners, rows: Any, matrix: Any, flags: int) -> Array:
+    cuts = np.searchsorted(corners.view[rows], np.arange(1, corners.frames))
+    objects = [part[None] for part in np.split(corners.board[corners.feature[rows]], cuts)]
+    images = [part[None] for part in np.split(corners.pixels[rows], cuts)]
+    size, criteria = tuple(corners.image_size.tolist()), (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
+    lens = None if matrix is None else np.zeros(4)
+    start = None if matrix is None else matrix.copy()
+    found = _cv.fisheye.calibrate(objects, images, size, start, lens, None, None, flags, criteria)
+    return numbers_of(found[1], found[2], 4)
 
 
 SETTINGS: dict[str, Callable[[Corners], Fitted]] = {

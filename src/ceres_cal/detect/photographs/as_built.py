@@ -86,8 +86,12 @@ class FieldAsBuilt:
         ]
         far = float(np.linalg.norm(list(self.aside_m.values())))
         elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
-        elsewhere |= self.is_stretched and bool(self.dimensions)
         return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
+
+    @property
+    def may_be_other(self) -> bool:
+        """Whether it is, or may be: of a stretched picture of another length the rest looks like other dimensions."""
+        return self.is_other or (self.is_stretched and bool(self.dimensions))
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""
