@@ -199,10 +199,10 @@ class Case:
         squared = np.nansum(((x**2 + y**2) / twice)[rows])
         return Displacement(float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count)
 
-    def moves(self, score: ScoreTest) -> tuple[tuple[Key, float], ...]:
-        """By how much numbers of cameras and stations move where a group of an effect is at its amounts."""
+    def moves(self, score: ScoreTest, amount: Array) -> tuple[tuple[Key, float], ...]:
+        """By how much numbers of cameras and stations move where a group of an effect is at some amounts."""
         keys = free_keys(self.estimate, self.problem.layout, self.problem.private)
-        moved = zip(keys, (self.model.taken_by(score.columns) @ score.amount).tolist(), strict=True)
+        moved = zip(keys, (self.model.taken_by(score.columns) @ amount).tolist(), strict=True)
         return tuple((key, by) for key, by in moved if key.kind in ("camera", "station"))
 
     def noise_px(self, left_over: Array, rows: Mask) -> float:
@@ -309,6 +309,19 @@ class Effect(ABC):
         own = [number for number, score in enumerate(selection.chosen) if score.effect.kind == self.kind]
         yield from self.together([self._finding(case, selection, number) for number in own])
 
+    def _likeliest(self, case: Case, score: ScoreTest) -> Array:
+        """(Q,) amounts of a group under what is expected of their size, where anything is, or under a larger one that
+        they show. A bow of 24 ± 26 mm moves a camera by what floors have, not by 24 mm; nor does one of 150 ± 30 mm,
+        which is something else that looks like it.
+        """
+        most = 4.0  # times the usual size: 9 mm of a field of 9 m
+        prior = self.prior_of(score.effect, score.number, case)
+        if prior is None:
+            return score.amount
+        usual = float(np.mean(np.square(prior.sizes)))
+        size = np.clip(score.amount**2 - score.sd**2, usual, most**2 * usual)
+        return np.asarray(score.amount * size / (size + score.sd**2))
+
     def _finding(self, case: Case, selection: Selection, number: int) -> Finding:
         chosen = selection.chosen
         score, others = chosen[number], case.model
@@ -322,5 +335,5 @@ class Effect(ABC):
             sentence += f"; these data do not distinguish it from {names}"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
-            selection.log10_p(score.log_p), effect.observations, moves=case.moves(score),
+            selection.log10_p(score.log_p), effect.observations, moves=case.moves(score, self._likeliest(case, score)),
         )  # fmt: skip
