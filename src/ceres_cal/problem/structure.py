@@ -56,7 +56,7 @@ class Tolerance:
 
 
 @dataclass(frozen=True, eq=False)
-class Built:
+class BuiltTarget:
     """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
 
     target: Target
@@ -165,7 +165,7 @@ class Structure:
             return sights
         return replace(sights, points=self.points(sights), tracks=self.tracks(sights))
 
-    def built(self, targets: Mapping[str, Target]) -> dict[str, Built]:
+    def built(self, targets: Mapping[str, Target]) -> dict[str, BuiltTarget]:
         """Every target as built; `targets` are those that the corrections were made for, in that order."""
         points = np.concatenate([target.point_array for target in targets.values()])
         tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
@@ -175,7 +175,7 @@ class Structure:
         for name, target in targets.items():
             own, points = np.split(points, [len(target.points)])
             curves, tracks = np.split(tracks, [3 * len(target.curves)])
-            built[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
+            built[name] = BuiltTarget(target, own, curves.reshape(3, -1, 3, 3))
         return built
 
     def _points(self, points: Array, feature: Indices) -> Array:

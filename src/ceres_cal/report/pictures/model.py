@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.transforms import Pose
 from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.structure import Built
+from ceres_cal.problem.structure import BuiltTarget
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.targets import Target
@@ -79,7 +79,7 @@ def model_seen(
     return Model(estimate.camera_at(station).image_size, tuple(lines), np.concatenate(points))
 
 
-def _lines(built: Built, camera: Camera) -> Iterator[CurveOutline]:
+def _lines(built: BuiltTarget, camera: Camera) -> Iterator[CurveOutline]:
     wide_px = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
     steps = 240  # along a curve
     target = built.target
