@@ -22,7 +22,8 @@ from ceres_cal.robust.as_built import words_of
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
-care, beyond it not to be used."""
+care, beyond it not to be used. Where lines are painted wider both are as many times as large.
+"""
 MOST_PLACES = 0.95
 """Share of the places seen that the verdict speaks of. The worst one is named beside it where it is much worse."""
 GOOD_PX, CARE_PX = 2.0, 10.0
@@ -36,9 +37,15 @@ _UNJUDGED = "its residuals could not be judged"
 _ORDER = ("good", "care", "no")
 
 
-def level_of(radius_mm: float) -> str:
-    """By GOOD_MM and CARE_MM; nothing seen is nothing to trust."""
-    return "good" if radius_mm <= GOOD_MM else "care" if radius_mm <= CARE_MM else "no"
+def level_of(radius_mm: float, times: float = 1.0) -> str:
+    """By GOOD_MM and CARE_MM, so many times; nothing seen is nothing to trust."""
+    return "good" if radius_mm <= GOOD_MM * times else "care" if radius_mm <= CARE_MM * times else "no"
+
+
+def paint_over_usual(quality: Quality) -> float:
+    """How many times as wide as GOOD_MM the lines of the fields are painted, at least 1: of a football pitch 12."""
+    widths = [1e3 * curve.width_m for target in quality.fields for curve in target.curves.values()]
+    return max(1.0, float(np.median(widths)) / GOOD_MM) if widths else 1.0
 
 
 def level_of_px(radius_px: float) -> str:
@@ -159,7 +166,13 @@ def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
     """Level and line of what is wrong with the model, by how far it moves a result."""
     sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
     left_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
-    level = "" if sigmas < MOVED else "no" if sigmas >= MOVED_FAR and not left_mm <= GOOD_MM else "care"
+    level = (
+        ""
+        if sigmas < MOVED
+        else "no"
+        if sigmas >= MOVED_FAR and level_of(left_mm, paint_over_usual(quality)) != "good"
+        else "care"
+    )
     counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
     moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
     wrong_mm = mm(model_error_mm(quality))
@@ -197,7 +210,7 @@ class Reach(Struct, frozen=True):
     Attributes:
         height_m: of the places. radius_mm: 95 % of the points located are nearer, at 95 of 100 of the places that are
             seen; worst_mm: at the worst one. Infinite where it cannot be told, NaN where no image shows any.
-        worst_at: of that place. level: "good", "care" or "no".
+        worst_at: of that place. level: "good", "care" or "no". is_worse: whether the worst place is of another level.
     """
 
     height_m: float
@@ -205,6 +218,7 @@ class Reach(Struct, frozen=True):
     worst_mm: float
     worst_at: str
     level: str
+    is_worse: bool
 
     @property
     def where(self) -> str:
@@ -215,22 +229,24 @@ def reaches(quality: Quality) -> tuple[Reach, ...]:
     """One for each of HEIGHTS_M, with what is named as wrong counted; none where no station sees the world."""
     if not quality.maps:
         return ()
+    times = paint_over_usual(quality)
     return tuple(
-        _reach(height, [maps[number] for maps in quality.faulty_maps]) for number, height in enumerate(HEIGHTS_M)
+        reach(height, [maps[number] for maps in quality.faulty_maps], times) for number, height in enumerate(HEIGHTS_M)
     )
 
 
-def _reach(height_m: float, maps: Sequence[FaultyMap]) -> Reach:
+def reach(height_m: float, maps: Sequence[FieldMap | FaultyMap], times: float) -> Reach:
     """A corner of the picture beyond the paint, of which little is known, is named and does not condemn the rest."""
     radii = np.concatenate([one.radius_95_mm.ravel() for one in maps])
-    places = np.concatenate([one.of.places for one in maps])[~np.isnan(radii)]
+    places = np.concatenate([one.places for one in maps])[~np.isnan(radii)]
     radii = radii[~np.isnan(radii)]
     if not len(radii):
-        return Reach(height_m, np.nan, np.nan, "", "no")
+        return Reach(height_m, np.nan, np.nan, "", "no", False)
     most, at = float(np.quantile(radii, MOST_PLACES, method="higher")), int(np.argmax(radii))
     farthest, (x, y) = float(radii[at]), places[at, :2]
-    level = "care" if level_of(most) == "good" and level_of(farthest) == "no" else level_of(most)
-    return Reach(height_m, most, farthest, f"x {x:.1f}, y {y:.1f} m", level)
+    level, worst_level = level_of(most, times), level_of(farthest, times)
+    level = "care" if level == "good" and worst_level == "no" else level
+    return Reach(height_m, most, farthest, f"x {x:.1f}, y {y:.1f} m", level, worst_level != level_of(most, times))
 
 
 def worst_radius(one: FieldMap | FaultyMap) -> float:
@@ -281,7 +297,7 @@ def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple
 
 def _except_at(every: Sequence[Reach]) -> str:
     """The worst place, where it is of another level than most; "" where it is not."""
-    worse = [one for one in every if level_of(one.worst_mm) != level_of(one.radius_mm)]
+    worse = [one for one in every if one.is_worse]
     if not worse:
         return ""
     farthest = max(worse, key=lambda one: one.worst_mm)
@@ -310,6 +326,8 @@ def _doubt(quality: Quality) -> str:
         return f"the noise is {short(noise_ratio(quality))} times the stated sigma"
     if off := misfit_mm(quality):
         return f"it is off by {mm(off)} rms on these new data"
-    if quality.fault_sigmas >= MOVED_FAR and not all(one.radius_mm <= GOOD_MM for one in reaches(quality)):
+    if quality.fault_sigmas >= MOVED_FAR and not all(
+        level_of(one.radius_mm, paint_over_usual(quality)) == "good" for one in reaches(quality)
+    ):
         return f"the faults below move it by {short(quality.fault_sigmas)} standard deviations"
     return ""

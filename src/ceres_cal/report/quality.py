@@ -42,6 +42,11 @@ class FaultyMap:
     left_mm: float
 
     @property
+    def places(self) -> Array:
+        """As those of the map."""
+        return self.of.places
+
+    @property
     def radius_95_mm(self) -> Array:
         """(Y, X) with the faults counted."""
         within = 2.0  # times its root mean square, how far what a fault leaves reaches

@@ -28,15 +28,16 @@ from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table
 from ceres_cal.report.grounds import (
     CARE_MM,
     GOOD_MM,
+    Reach,
     disputed,
     focal,
     is_against,
     judge_quality,
-    level_of,
     level_of_verdict,
+    paint_over_usual,
     promises,
+    reach,
     worst,
-    worst_radius,
 )
 from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
 from ceres_cal.report.quality import Quality, Seam
@@ -46,9 +47,10 @@ if TYPE_CHECKING:
 
 _MOST_FINDINGS, _MOST_DIRECTIONS = 3, 4
 _MEANING = (
-    "The accuracy in the headline holds for 95 % of the points located at the worst place that a camera sees. ± is a "
-    "standard deviation. Both describe the calibration; the noise of the located pixel adds to them. Green: up to "
-    f"{GOOD_MM:g} mm, the width of a painted line. Amber: up to {CARE_MM:g} mm."
+    "The accuracy in the headline holds for 95 % of the points located, at 95 of 100 places that a camera sees. The "
+    "worst place is named where it is much worse. ± is a standard deviation. Both describe the calibration; the noise "
+    f"of the located pixel adds to them. Green: up to {GOOD_MM:g} mm, the width of a painted line. Amber: up to "
+    f"{CARE_MM:g} mm. Where lines are wider, both are as many times as large."
 )
 
 
@@ -194,7 +196,8 @@ def _tiles(material: Material) -> Iterator[Tile]:
     several = len(material.maps) > 1
     for station, maps in material.maps.items():
         for one in maps:
-            yield _map_tile(sentence(at_height(one.height_m)) + (f", {station}" if several else ""), one)
+            label = sentence(at_height(one.height_m)) + (f", {station}" if several else "")
+            yield _map_tile(label, one, reach(one.height_m, [one], paint_over_usual(material)))
     if not material.maps:
         for verdict in focal(material):
             yield _focal_tile(verdict)
@@ -211,11 +214,10 @@ def _tiles(material: Material) -> Iterator[Tile]:
     yield Tile("Taken out", short(share), "%", f"{counted(out, 'outlier')} of {counted(len(table), 'observation')}")
 
 
-def _map_tile(label: str, one: FieldMap) -> Tile:
-    radius = worst_radius(one)
-    if np.isnan(radius):
+def _map_tile(label: str, one: FieldMap, known: Reach) -> Tile:
+    level = known.level
+    if np.isnan(known.worst_mm):
         return Tile(label, "unseen", "", "the image shows no place of the field", "no")
-    level = level_of(radius)
     if np.isinf(one.mean_mm):
         return Tile(
             label, "unknown", "", "not determined by the observations: add tilted boards or measure the height", level
