@@ -76,3 +76,24 @@ def test_no_view_ends_mirrored_from_a_cold_start(seed: int) -> None:
     calibration = calibrate(observations, OPTIONS)
     for name, pose in calibration.placements.items():
         assert turned_deg(pose, scene.placements[name]) < 8.0  # 4; a mirrored pose is 30 to 80 off
+
+
+@pytest.mark.parametrize("how", ["as it is", "mirrored", "axes exchanged"])
+def test_boards_seen_from_behind_are_named(how: str) -> None:
+    """A picture that is mirrored fits as well; only which side of a printed board is seen tells it."""
+    scene = board_scene(
+        checkerboard(9, 6, 0.03),
+        {"camera": Camera((1280, 960), 900.0, (645.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))},
+        {"camera": Station("camera", Pose.identity())},
+        8,
+        1,
+    )
+    observed = simulate(scene, Disturbance(0.2, 0.2), 1).observations
+    pixels, size = observed.points.pixels, (1280, 960)
+    if how == "mirrored":
+        pixels = pixels * (-1.0, 1.0) + (1279.0, 0.0)
+    elif how == "axes exchanged":
+        pixels, size = pixels[:, ::-1].copy(), (960, 1280)
+    given = replace(observed, points=replace(observed.points, pixels=pixels), cameras={"camera": size})
+    named = [words for words in calibrate(given).warnings if "checkerboards from behind" in words]
+    assert len(named) == (how != "as it is")

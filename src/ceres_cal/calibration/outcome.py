@@ -54,6 +54,10 @@ _OBLONG = (
     "camera {!r}: fy / fx comes out as {:.4f}. Few cameras have pixels so far from square. If its pixels are "
     "square, the length or the width of the target is wrong by {} %: measure it, or state --fix aspect=1"
 )
+_BEHIND = (
+    "camera {!r} sees all {} checkerboards from behind: its pictures are mirrored, x and y of its pixels or rows and "
+    "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
+)
 
 
 def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
@@ -109,6 +113,20 @@ def unusual_pixels(end: RobustSolution, problem: Problem, observations: Observat
         free = problem.layout.free.get(name, ())
         if OF_PIXELS.index("aspect") in free and name not in turned and abs(camera.aspect - 1.0) > unusual:
             yield _OBLONG.format(name, camera.aspect, two_digits(100.0 * abs(camera.aspect - 1.0)))
+
+
+def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:
+    """Words about cameras that see every checkerboard from behind, which no printed one shows: the picture of a plane
+    that is mirrored fits as well as the true one.
+    """
+    behind: dict[str, list[bool]] = {}
+    for view in observations.views:
+        if view.placement is not None and observations.targets[view.target].kind == "checkerboard":
+            z_m = estimate.camera_at(view.station, view.placement).position[2]
+            behind.setdefault(view.camera, []).append(z_m > 0.0)
+    for name, each in behind.items():
+        if all(each):
+            yield _BEHIND.format(name, len(each))
 
 
 def _share_text(share: float) -> str:

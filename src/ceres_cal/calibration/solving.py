@@ -13,6 +13,7 @@ from ceres_cal.calibration.outcome import (
     of_all,
     require_lens_told,
     resting_phi,
+    seen_from_behind,
     unknown_phi,
     unusual_pixels,
 )
@@ -108,8 +109,11 @@ def solved_from(
         seen, posterior = _known(seen, observations, conflicts, again, watched)
         alike = seen_alike(seen.others, seen.end.solution.estimate, posterior.half_width)
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
-        oblong = unusual_pixels(seen.end, seen.problem, observations)
-        warnings = (*warnings, *conflicts.words, *phi, *oblong, *alike)
+        strange = (
+            *unusual_pixels(seen.end, seen.problem, observations),
+            *seen_from_behind(seen.end.solution.estimate, observations),
+        )
+        warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
     if digest is not None:
         digest.result()  # which the observations remember
     calibration = came_out(seen.start.phi_from, observations, seen.problem, seen.end, seen.explanations)
