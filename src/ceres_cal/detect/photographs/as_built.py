@@ -54,7 +54,6 @@ class FieldAsBuilt:
         drawn: name of a dimension -> its value by the target, m. names: of the curves that tell it.
         usual_m: by how much a curve lies aside that does. scatter_m: by how much all the others do, where
             it is seen.
-        is_stretched: whether that is by pixels that are not square, by which another length may look right.
         misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
     """
 
@@ -65,7 +64,6 @@ class FieldAsBuilt:
     names: tuple[str, ...]
     usual_m: float
     scatter_m: float = 0.0
-    is_stretched: bool = False
     misfit: float = 0.0
 
     @property
@@ -87,11 +85,6 @@ class FieldAsBuilt:
         far = float(np.linalg.norm(list(self.aside_m.values())))
         elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
         return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
-
-    @property
-    def may_be_other(self) -> bool:
-        """Whether it is, or may be: of a stretched picture of another length the rest looks like other dimensions."""
-        return self.is_other or (self.is_stretched and bool(self.dimensions))
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""
@@ -164,7 +157,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
     shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, usual_aside_m(target))
-    return replace(shape.explained(), misfit=misfit, is_stretched=abs(camera.aspect - 1.0) > SQUARE)
+    return replace(shape.explained(), misfit=misfit)
 
 
 def _places_together(residuals: Array, curve: Indices) -> float:

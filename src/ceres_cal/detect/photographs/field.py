@@ -200,7 +200,7 @@ def _looked_for(
     target = start.target if isinstance(start, Followed) else target
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
-    if not followed.built.may_be_other and (followed.holds or _is_worn(grey, followed)):
+    if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
         return SearchResult(followed)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 

@@ -48,7 +48,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
     Args:
         started: whether somebody said where to start.
     """
-    if followed.built.may_be_other:
+    if followed.built.is_other:
         help_ = ": correct the target, or have them found (--estimate)" if followed.built.dimensions else ""
         return "; ".join(followed.built.words()) + help_
     if followed.share >= LEAST_SHARE:

@@ -22,14 +22,7 @@ from ceres_cal.detect.photographs.facing import (
 from ceres_cal.detect.photographs.follow import SURE_SHARE, approach, look_again, refine
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import grid_of
-from ceres_cal.detect.photographs.judgement import (
-    detected_curves,
-    explained,
-    likelihood,
-    objection,
-    same_labels,
-    why_missed,
-)
+from ceres_cal.detect.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, PointHints
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera, in_image
@@ -190,9 +183,8 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
     camera, one = ways[number], distinct[number // len(problem.turns)]
     free = _free(one.target, auto, camera)
     followed = refine(problem.grey, one.target, camera, curves, free, one.lacks_wholly)
-    against = objection(problem, followed)
-    if against or followed.built.may_be_other:
-        return SearchResult(None, against or why_missed(followed, target, started=False), seen=followed)
+    if against := objection(problem, followed):
+        return SearchResult(None, against, seen=followed)
     if not agreeing:
         given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
         raise SeveralWaysError(f"not with {given}: in this photograph {_sides(ways, target, curves)}", followed)
