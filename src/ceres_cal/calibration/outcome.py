@@ -119,14 +119,12 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
     """Words about cameras that see every checkerboard from behind, which no printed one shows: the picture of a plane
     that is mirrored fits as well as the true one.
     """
-    behind: dict[str, list[bool]] = {}
-    for view in observations.views:
-        if view.placement is not None and observations.targets[view.target].kind == "checkerboard":
-            z_m = estimate.camera_at(view.station, view.placement).position[2]
-            behind.setdefault(view.camera, []).append(z_m > 0.0)
-    for name, each in behind.items():
-        if all(each):
-            yield _BEHIND.format(name, len(each))
+    boards = {name for name, target in observations.targets.items() if target.kind == "checkerboard"}
+    posed = [view for view in observations.views if view.target in boards and view.placement in estimate.placements]
+    for name in estimate.cameras:
+        own = [view for view in posed if view.camera == name]
+        if own and all(estimate.camera_at(view.station, view.placement).position[2] > 0.0 for view in own):
+            yield _BEHIND.format(name, len(own))
 
 
 def _share_text(share: float) -> str:
