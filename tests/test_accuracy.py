@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accuracy import accuracy
+from accuracy import accuracy, floors
 from accuracy import bound as limit
 from accuracy import scenes as scenes
 from benchmarks.problems import corner_observations, wide_lens
@@ -185,3 +185,10 @@ def test_the_script_prints_and_writes_its_rows(tmp_path: Path, capsys: pytest.Ca
     assert {row["verdict"] for row in rows} == {"yes", "open"}
     assert all(row["what"] in printed for row in rows)
     assert "Infinity" not in path.read_text(encoding="utf-8")  # JSON knows none
+
+
+@pytest.mark.parametrize("floor, most", [("flat", 1.1), ("out of square", 2.5)])
+def test_a_floor_that_one_picture_does_not_tell_is_in_the_sd(floor: str, most: float) -> None:
+    """0.48 and 0.57 of a flat one measured, 1.4 and 1.7 of one that is out of square; without the prior .9, and 3 to 5."""
+    for row in floors.rows(floor, 2):
+        assert 0.3 < row.value < most, row
