@@ -189,6 +189,6 @@ def test_the_script_prints_and_writes_its_rows(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.parametrize("floor, most", [("flat", 1.1), ("out of square", 2.5)])
 def test_a_floor_that_one_picture_does_not_tell_is_in_the_sd(floor: str, most: float) -> None:
-    """0.48 and 0.57 of a flat one measured, 1.4 and 1.7 of one that is out of square; without the prior .9, and 3 to 5."""
+    """0.48 and 0.57 of a flat one measured, 1.4 and 1.7 of one out of square; without the prior .9, and 3 to 5."""
     for row in floors.rows(floor, 2):
         assert 0.3 < row.value < most, row
