@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from msgspec import Struct
 
+from ceres_cal.base.arrays import median
 from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
@@ -45,7 +46,7 @@ def level_of(radius_mm: float, times: float = 1.0) -> str:
 def paint_over_usual(quality: Quality) -> float:
     """How many times as wide as GOOD_MM the lines of the fields are painted, at least 1: of a football pitch 12."""
     widths = [1e3 * curve.width_m for target in quality.fields for curve in target.curves.values()]
-    return max(1.0, float(np.median(widths)) / GOOD_MM) if widths else 1.0
+    return max(1.0, median(np.array(widths)) / GOOD_MM) if widths else 1.0
 
 
 def level_of_px(radius_px: float) -> str:
@@ -242,7 +243,7 @@ def reach(height_m: float, maps: Sequence[FieldMap | FaultyMap], times: float) -
     radii = radii[~np.isnan(radii)]
     if not len(radii):
         return Reach(height_m, np.nan, np.nan, "", "no", False)
-    most, at = float(np.quantile(radii, MOST_PLACES, method="higher")), int(np.argmax(radii))
+    most, at = float(np.sort(radii)[int(np.ceil(MOST_PLACES * (len(radii) - 1)))]), int(np.argmax(radii))
     farthest, (x, y) = float(radii[at]), places[at, :2]
     level, worst_level = level_of(most, times), level_of(farthest, times)
     level = "care" if level == "good" and worst_level == "no" else level
