@@ -1,6 +1,6 @@
 """calibsense: its refit with covariance, and its audit, as its README's "Python API" calls them.
 
-https://pypi.org/project/calibsense/: `instrument` re-estimates five coefficients by default; distortion_terms=8 and
+The README of its package says: `instrument` re-estimates five coefficients by default; distortion_terms=8 and
 model="fisheye" are its other lenses. It states a covariance, and a second one clustered by view. `run_audit` says what
 it finds (its `trustworthy`, caveats and findings of WARNING and CRITICAL).
 """
