@@ -29,7 +29,10 @@ from ceres_cal.problem.parameters import Options, intrinsics_vector, with_intrin
 from ceres_cal.problem.residuals import Equations, residuals, whole_structure, write_equations
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
-from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown
+from ceres_cal.scene.targets import checkerboard
+from ceres_cal.simulate import Disturbance, Station, board_scene, simulate
 
 PLAIN = Options(lens="radial", usual_camera=False, loss="trivial")
 
@@ -442,3 +445,27 @@ def test_the_command(run: Run, tmp_path: Path, observations: Observations, calib
     for wrong in (["--folds", 1], ["--false-alarms", 2], ["-o", tmp_path / "t.txt"], ["--held-out", "--new-data"]):
         code, _, err = run("diagnose", tmp_path / "b.json", tmp_path / "bumped.json", *wrong)
         assert code == 2 and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("moved_px, named", [(0.0, False), (15.0, True)])
+def test_another_camera_s_pictures_are_named(moved_px: float, named: bool) -> None:
+    """Two cameras' pictures in one folder, or a lens that was knocked half-way."""
+    board, stations = checkerboard(9, 6, 0.1), {"camera": Station("camera", Pose.identity())}
+    parts = []
+    for number, off in enumerate((0.0, moved_px)):
+        one = Camera((1280, 960), 900.0, (645.0 + off, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))
+        scene = board_scene(board, {"camera": one}, stations, 8, number)
+        parts.append(simulate(scene, Disturbance(0.2, 0.2), number).observations)
+    first, second = parts
+    count = len(first.views)
+    views = (*first.views, *(replace(v, frame=f"b{v.frame}", placement=f"b{v.placement}") for v in second.views))
+    columns = {
+        name: np.concatenate([getattr(first.points, name), getattr(second.points, name) + count * (name == "view")])
+        for name in ("view", "feature", "pixels", "sigma_px")
+    }
+    both = replace(first, views=views, points=replace(first.points, **columns))
+    found = [one for one in diagnose(calibrate(both), both).findings if one.kind == "lens changed"]
+    assert len(found) == named
+    if named:
+        assert found[0].frame == first.views[-1].frame
+        assert abs(found[0].amounts[1].value - moved_px) < 4.0 * found[0].amounts[1].sd

@@ -333,7 +333,10 @@ class Effect(ABC):
         if score.rivals:
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
             sentence += f"; these data do not distinguish it from {names}"
+        likeliest, clear = self._likeliest(case, score), 2.0  # standard deviations
+        if np.any((np.abs(score.amount) > clear * score.sd) & (np.abs(likeliest) < 0.5 * np.abs(score.amount))):
+            sentence += ". That is more than usual, so it is probably something else that looks like it"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
-            selection.log10_p(score.log_p), effect.observations, moves=case.moves(score, self._likeliest(case, score)),
+            selection.log10_p(score.log_p), effect.observations, moves=case.moves(score, likeliest),
         )  # fmt: skip
