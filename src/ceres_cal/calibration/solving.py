@@ -31,6 +31,7 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
+from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
@@ -40,7 +41,6 @@ from ceres_cal.start.initialise import Start, initialise
 if TYPE_CHECKING:
     from ceres_cal.robust.bulk import Settled
     from ceres_cal.robust.competing import Explanation
-    from ceres_cal.robust.effects import EffectsEnd
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,6 @@ def _of_targets(
     if is_asked:
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved, built)
     if is_asked and estimated(observations):
-        from ceres_cal.robust.effects import solve_beside_effects
-
         part, is_all = taking_part(problem, observations, explanations), watched.settle is None
         beside = solve_beside_effects(problem, part, observations, end, solves=is_all)
         problem, end = beside.problem, beside.end

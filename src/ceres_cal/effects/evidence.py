@@ -84,7 +84,10 @@ FLOOR_OFF = SizePrior(0.8, (0.0005,))
 """Of how much higher or lower a floor's edges are than its middle, and of how far a field's are out of square, over
 half of its longer side: 2 mm of a field of 9 m. Four of five are flat and square.
 """
-FLOOR_OFF_WORDS = "One floor in five is bowed, or its field out of square, by 2 mm on 9 m"
+FLOOR_OFF_WORDS = (
+    f"{1.0 - FLOOR_OFF.absent:.0%} of floors are bowed, or their fields out of square, by "
+    f"{1e3 * 4.5 * FLOOR_OFF.sizes[-1]:.0f} mm on 9 m"
+)
 DEPENDENCE = SizePrior(0.8, ())
 """Of errors that go together within views, and of views that scatter more than their equations say: errors are
 independent in four of five calibrations. The sizes are those of a grid, or of a factor.
