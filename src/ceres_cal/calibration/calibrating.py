@@ -87,7 +87,8 @@ def calibrate(
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options) -> Calibration:
-    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be.
+    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be;
+    without what is then known of its numbers.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -98,7 +99,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(start, observations, sights, options, Watched(bends=False)).redrawn()
+        return _of_lens(start, observations, sights, options, Watched(knows=False)).redrawn()
 
 
 def _measured(

@@ -50,8 +50,6 @@ def assess(
     degrees_of_freedom: float,
     scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
     shifts_at: ShiftsAt | None = None,
-    *,
-    bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
@@ -66,7 +64,6 @@ def assess(
         scatter_at: how the data scatter at an estimate, of which the problem says so much.
         shifts_at: numbers, and shifts by which they scatter besides, at an estimate. Along a valley the profile is as
             much wider, and what is across it with phi held.
-        bends: whether weak directions are followed, which takes a solve for each end.
 
     Raises:
         SolutionError: no possible lens fits.
@@ -97,7 +94,7 @@ def assess(
         posterior = known(estimate, reduced)
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
     posterior = replace(posterior, mixtures=mixtures)
-    return estimate, _with_bends(posterior, problem, estimate) if bends else posterior
+    return estimate, _with_bends(posterior, problem, estimate)
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
