@@ -302,9 +302,9 @@ def linearise_within(
     Args:
         known: of the shared numbers, by all equations and priors. `step` is 0: the whole is at its optimum.
     """
-    blank, columns = without_shared(problem, estimate, equations, weights)
     root = known_root(known)
-    return replace(blank, shared=blank.beyond_private(columns) @ root, root=root, step=np.zeros(root.shape[1]))
+    blank, columns = without_shared(problem, estimate, equations, weights, root)
+    return replace(blank, shared=blank.beyond_private(columns), root=root, step=np.zeros(root.shape[1]))
 
 
 def known_root(shared: Information) -> Array:
@@ -325,14 +325,17 @@ def known_root(shared: Information) -> Array:
 
 
 def without_shared(
-    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights
+    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, along: Array | None = None
 ) -> tuple[Linearised, Array]:
-    """The model of private placements alone, and the columns (E, P) of the shared numbers, in standard deviations."""
+    """The model of private placements alone, and the columns (E, P) of the shared numbers, or of directions (K, P) of
+    them, in standard deviations.
+    """
     used, weight = weights.used, weights.inverse_sigma
     score = np.where(used, weights.robust * weight * equations.residual, 0.0)
     private, count = _private_basis(equations, problem, weight, used)
-    columns = shared_columns(equations, estimate, free_keys(estimate, problem.layout, problem.private))
-    shared, root = np.zeros((len(equations), 0)), np.zeros((columns.shape[1], 0))
+    keys = free_keys(estimate, problem.layout, problem.private)
+    columns = _shared_columns(equations, estimate, keys, along)
+    shared, root = np.zeros((len(equations), 0)), np.zeros((len(keys), 0))
     blank = Linearised(equations, weight, used, score, private, shared, root, np.zeros(0), count, 0)
     return blank, columns * weight[:, None]
 
@@ -354,8 +357,12 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
     return basis, int(np.sum(ranks))
 
 
-def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
+def _shared_columns(equations: Equations, estimate: Estimate, every: Sequence[Key], along: Array | None) -> Array:
+    """(E, P) px per unit of each key, or of directions (K, P) of them: what a step of the shared numbers does to every
+    equation. Of a board's thousand corners each moves two equations a view, so directions are taken one by one.
+    """
+    built = np.array([key.is_structure for key in every], dtype=bool)
+    keys = [key for key in every if not key.is_structure]
     columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
     cameras = equations.sights.cameras
     for name in cameras:
@@ -376,10 +383,13 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
             columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]
         if own := owned.get(("placement", str(key.placement)), []):
             columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
-    structure = [column for column, key in enumerate(keys) if key.is_structure]
-    if structure:
-        columns[:, structure] = equations.structure_columns(estimate.structure)
-    return columns
+    if along is not None:
+        return columns @ along[~built] + equations.built_along(estimate.structure, along[built])
+    if not built.any():
+        return columns
+    whole = np.empty((len(equations), len(every)))
+    whole[:, ~built], whole[:, built] = columns, equations.structure_columns(estimate.structure)
+    return whole
 
 
 def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:
