@@ -101,7 +101,8 @@ class Spread(Struct, frozen=True, eq=False):
             limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
         """
         scale, scaled = _scaled(np.asarray(information, dtype=float), limits)
-        inverse = _regular_inverses(scaled)
+        # A file has the lower triangle, and says the same to the last digit.
+        inverse = _regular_inverses(np.tril(scaled) + np.tril(scaled, -1).T)
         if inverse is not None:
             return cls(inverse * scale[:, None] * scale, np.empty((len(scale), 0)), scale)
         values, vectors = np.linalg.eigh(scaled)
@@ -109,7 +110,7 @@ class Spread(Struct, frozen=True, eq=False):
         half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
         return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)
 
-    def depends(self, jacobian: Array) -> Array:
+    def depends(self, jacobian: Array) -> Mask:
         """(..., m) whether functions with derivatives (..., m, n) depend on an unknown direction."""
         if not self.unknown.shape[1]:
             return np.zeros(jacobian.shape[:-1], dtype=bool)

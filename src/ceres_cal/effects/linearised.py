@@ -276,7 +276,7 @@ def equation_weights(
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> Linearised:
     """The linear model of a calibration, its priors included."""
     keys = free_keys(estimate, problem.layout, problem.private)
-    blank, columns = without_shared(problem, estimate, equations, weights)
+    blank, columns = without_shared(problem, estimate, equations, weights, keys)
     rest = blank.beyond_private(columns)
     prior_rows, prior_values = prior_equations(problem, estimate, keys)
     inside = rest[weights.used]
@@ -302,9 +302,15 @@ def linearise_within(
     Args:
         known: of the shared numbers, by all equations and priors. `step` is 0: the whole is at its optimum.
     """
-    root = known_root(known)
-    blank, columns = without_shared(problem, estimate, equations, weights, root)
-    return replace(blank, shared=blank.beyond_private(columns), root=root, step=np.zeros(root.shape[1]))
+    root, built = known_root(known), np.array([key.is_structure for key in known.keys], dtype=bool)
+    blank, columns = without_shared(
+        problem, estimate, equations, weights, [k for k in known.keys if not k.is_structure]
+    )
+    shared = blank.beyond_private(columns) @ root[~built]
+    if built.any():  # of a board's thousand corners, each of which moves two equations a view, no matrix is made
+        moved = equations.built_along(estimate.structure, root[built]) * blank.weight[:, None]
+        shared += blank.beyond_private(moved)
+    return replace(blank, shared=shared, root=root, step=np.zeros(root.shape[1]))
 
 
 def known_root(shared: Information) -> Array:
@@ -325,17 +331,14 @@ def known_root(shared: Information) -> Array:
 
 
 def without_shared(
-    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, along: Array | None = None
+    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, keys: Sequence[Key]
 ) -> tuple[Linearised, Array]:
-    """The model of private placements alone, and the columns (E, P) of the shared numbers, or of directions (K, P) of
-    them, in standard deviations.
-    """
+    """The model of private placements alone, and the columns (E, P) of shared numbers, in standard deviations."""
     used, weight = weights.used, weights.inverse_sigma
     score = np.where(used, weights.robust * weight * equations.residual, 0.0)
     private, count = _private_basis(equations, problem, weight, used)
-    keys = free_keys(estimate, problem.layout, problem.private)
-    columns = _shared_columns(equations, estimate, keys, along)
-    shared, root = np.zeros((len(equations), 0)), np.zeros((len(keys), 0))
+    columns = shared_columns(equations, estimate, keys)
+    shared, root = np.zeros((len(equations), 0)), np.zeros((columns.shape[1], 0))
     blank = Linearised(equations, weight, used, score, private, shared, root, np.zeros(0), count, 0)
     return blank, columns * weight[:, None]
 
@@ -357,12 +360,8 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
     return basis, int(np.sum(ranks))
 
 
-def _shared_columns(equations: Equations, estimate: Estimate, every: Sequence[Key], along: Array | None) -> Array:
-    """(E, P) px per unit of each key, or of directions (K, P) of them: what a step of the shared numbers does to every
-    equation. Of a board's thousand corners each moves two equations a view, so directions are taken one by one.
-    """
-    built = np.array([key.is_structure for key in every], dtype=bool)
-    keys = [key for key in every if not key.is_structure]
+def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
     columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
     cameras = equations.sights.cameras
     for name in cameras:
@@ -383,13 +382,10 @@ def _shared_columns(equations: Equations, estimate: Estimate, every: Sequence[Ke
             columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]
         if own := owned.get(("placement", str(key.placement)), []):
             columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
-    if along is not None:
-        return columns @ along[~built] + equations.built_along(estimate.structure, along[built])
-    if not built.any():
-        return columns
-    whole = np.empty((len(equations), len(every)))
-    whole[:, ~built], whole[:, built] = columns, equations.structure_columns(estimate.structure)
-    return whole
+    structure = [column for column, key in enumerate(keys) if key.is_structure]
+    if structure:
+        columns[:, structure] = equations.structure_columns(estimate.structure)
+    return columns
 
 
 def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:

@@ -225,7 +225,7 @@ class _InformationSums:
             if len(station):  # the placement makes up for whatever its station does
                 gain = np.concatenate([gain, back @ from_station(poses, world)], axis=2)
             stacks.append((own, inverse, gain))
-        self._matrices[np.ix_((0, 1), lead, lead)] += reduced
+        self._matrices[:, lead[:, None], lead] += reduced
         own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
         names = tuple(str(key.placement) for key in sights.keys)
         return Eliminated(names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station])))
