@@ -79,9 +79,12 @@ def _run(*command: str) -> str:
 
 
 def install(name: str) -> str:
-    """Make a peer's environment where it is not there yet; why it cannot be, "" where it is."""
+    """Make a peer's environment where it is not there yet; why it cannot be, "" where it is.
+
+    What Debian or this Python has serves only where pip cannot: it may be years older.
+    """
     peer, folder = PEERS[name], FOLDER / name
-    if imports(name):
+    if Path(_in(folder)).exists() and imports(name):
         return ""
     python = next((path for version, path in _pythons() if peer.least <= version), None)
     why = "" if python else f"no Python {peer.least[0]}.{peer.least[1]} or newer is here"

@@ -18,9 +18,11 @@ _MARK = re.compile(r"^\{\{(\w+)\}\}$", re.MULTILINE)
 
 
 def _figure(value: float | None, digits: int = 3) -> str:
-    """Of so many digits; a dash where there is none."""
+    """Of so many digits; a dash where there is none. More than 10 000 of anything here is a lens out of its range."""
     if value is None or value != value:
         return "-"
+    if value > 10_000:
+        return "> 10000"
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e" in text else text
 

@@ -53,7 +53,8 @@ def _scene(model: str, corners: Corners) -> Any:
         for place, feature in enumerate(features.tolist()):
             tracks[feature].add_element(number + 1, place)
     for place_m, track in zip(corners.board, tracks, strict=True):
-        scene.add_point3D(place_m, track)
+        if track.length() > 1:  # its bundle adjustment takes no point of one picture
+            scene.add_point3D(place_m, track)
     return scene
 
 
