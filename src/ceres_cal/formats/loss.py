@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import HEIGHTS_M, at_height
-from ceres_cal.formats.export_format import ExportLoss
+from ceres_cal.formats.format import ExportLoss
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid
 

@@ -18,7 +18,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.base.words import HEIGHTS_M
-from ceres_cal.formats.export_format import ExportLoss, ExportRequest
+from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene.camera import Camera
