@@ -118,10 +118,11 @@ def python_of(name: str) -> str:
 
 
 def import_seconds(name: str, repeat: int) -> float | None:
-    """How long its import takes in a fresh process (median, files already read once); None where it is not there."""
+    """Median time of its import in a fresh process, after a first one where several are asked; None without it."""
     code = f"import time; start = time.perf_counter(); import {MODULES[name]}; print(time.perf_counter() - start)"
     try:
-        return median([float(run(name, "-c", code)) for _ in range(repeat + 1)][1:])
+        times = [float(run(name, "-c", code)) for _ in range(repeat + (repeat > 1))]
+        return median(times[-repeat:])
     except (OSError, subprocess.CalledProcessError):
         return None
 
@@ -450,7 +451,7 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     for name, seconds in report["import_seconds"].items():
         if seconds is None:
             print(f"{name} is skipped: {python_of(name)} cannot import {MODULES[name]}")
-    report["first_call_seconds"] = [alone("first", WARM_UP_FRAMES) for _ in range(2)][-1]  # the first may compile
+    report["first_call_seconds"] = alone("first", WARM_UP_FRAMES)
     print(f"a process' first calibration takes {report['first_call_seconds']:.2f} s more: compiled kernels are loaded")
     report["comparison"] = compare_all(chosen, report["import_seconds"])
     report["uncertainty_share"] = uncertainty_share(max(chosen.frames), chosen.repeat)

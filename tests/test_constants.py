@@ -73,9 +73,8 @@ def test_a_constant_is_set_where_it_is_read() -> None:
 
 
 def test_figures_are_measured(tmp_path: Path) -> None:
-    """Where next to nothing is worth doing nothing is followed; an error is told, not hidden."""
-    constant = Constant("diagnostics.advice.ranking", "_WORTH", ("advice",))
-    now, then = measured("advice", 1, tmp_path), measured("advice", 1, tmp_path, constant, 1e-6)
-    assert "measurements ranked" in changes(now, {**now, "measurements ranked, 3 deg": "0"})
-    assert changes(now, then) != "nothing"
-    assert "error" in measured("advice", 1, tmp_path, constant, "nonsense")  # type: ignore[arg-type]
+    """Where next to nothing counts as known, more directions are weak; an error is told, not hidden."""
+    constant = Constant("posterior.uncertainty", "KNOWN", ("verdicts",))
+    now, then = measured("verdicts", 1, tmp_path), measured("verdicts", 1, tmp_path, constant, 1e-6)
+    assert "weak directions named, 1 deg" in changes(now, then)
+    assert "error" in measured("verdicts", 1, tmp_path, constant, "nonsense")  # type: ignore[arg-type]

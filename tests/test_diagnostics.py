@@ -372,7 +372,7 @@ def test_held_out_error_is_the_noise_and_what_the_fit_adds(
 
 def test_the_choice_is_the_lens_that_was_simulated() -> None:
     seen = simulate(scenes.overhead(frames=8, boards=2), scenes.NOISE, 4).observations
-    choice = choose(seen, Options(powers=(3,)))
+    choice = choose(seen, Options(powers=(3,)), k=3)
     assert choice.candidates[choice.chosen].label == "radial 2,3"
     assert choice.candidates[choice.current].label == "radial 3"
 
@@ -429,7 +429,8 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 def test_the_command(run: Run, tmp_path: Path, observations: Observations, calibration: Calibration) -> None:
     observations.save(tmp_path / "obs.json")
     calibration.save(tmp_path / "c.json")
-    code, out, _ = run("diagnose", tmp_path / "c.json", tmp_path / "obs.json", "-o", tmp_path / "t.csv", "--held-out")
+    held_out = ("-o", tmp_path / "t.csv", "--held-out", "--folds", 2)
+    code, out, _ = run("diagnose", tmp_path / "c.json", tmp_path / "obs.json", *held_out)
     assert code == 0 and out.startswith("verdict   sound")
     assert "take" in out and (tmp_path / "t.csv").exists()
     faulty = scenes.bumped(1)

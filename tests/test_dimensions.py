@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,6 +27,9 @@ from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance
+from ceres_cal.report.document import Table
+from ceres_cal.report.quality import quality_of
+from ceres_cal.report.summary import numbers_chapter
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
@@ -172,7 +176,6 @@ def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
     assert min(np.linalg.norm(away, axis=1)) < 0.3
 
 
-@pytest.mark.usefixtures("words_alone")
 def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, observed, out = (str(tmp_path / name) for name in ("odd.png", "field.json", "calibration.json"))
     cv2.imwrite(path, picture())
@@ -181,17 +184,24 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     clicked = np.round(camera.project(np.array([target.points[name] for name in names]))).astype(int)
     corners = [word for name, (x, y) in zip(names, clicked, strict=True) for word in ("--corner", f"{name}={x},{y}")]
     asked = ["detect", "field", path, "--target", "ssl-b", *corners, "-o", observed]
-    assert main(asked) == 2 and "--estimate" in capsys.readouterr().err  # says what would help
+    assert main([*asked, "--picture", str(tmp_path / "refused.png")]) == 2
+    error = capsys.readouterr().err
+    assert re.search(r"the field (length|width) is [78]\.\d % smaller than the target says", error)
+    assert "--estimate" in error  # says what would help
+    drawn = cv2.imread(str(tmp_path / "refused.png"))
+    assert drawn is not None and drawn.shape == picture().shape and np.any(drawn != picture())
     assert main([*asked, "--estimate", "mark"]) == 2
     assert "no painted line lies elsewhere with another goal_center_to_penalty_mark_m" in capsys.readouterr().err
     assert main([*asked, "--estimate", "length,width"]) == 0
     assert "lengths, roughly, for `calibrate` to solve for: field_length_m 8.2" in capsys.readouterr().out
     priors = json.loads(Path(observed).read_text())["priors"]
     assert [prior["sigma_m"] for prior in priors] == [None, None]
-    assert main(["calibrate", observed, "-o", out, "--lens", "radial", "--report", str(tmp_path / "report.html")]) == 0
+    assert main(["calibrate", observed, "-o", out, "--lens", "radial"]) == 0
     printed = capsys.readouterr().out
     assert "lengths   field/field_length_m" in printed and "mm (solved for)" in printed
     dimensions = Calibration.load(out).targets["field"].dimensions
     for name, true in TRUE.items():
         assert abs(dimensions[name] - true) < 0.003  # 0.5 mm
-    assert "Dimensions that were solved for" in (tmp_path / "report.html").read_text()
+    quality = quality_of(Calibration.load(out), Observations.load(observed))
+    tables = [piece for piece in numbers_chapter(quality, ()).pieces if isinstance(piece, Table)]
+    assert "Dimensions that were solved for" in [table.caption for table in tables]

@@ -1,6 +1,7 @@
 """From photographs of a field to its observations: lines, crossings, far starts, clicks, and misses that say so."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import cv2
 import numpy as np
 import photographs
 import pytest
+from photos import disturbed
 from photos import shots as script
 from rendering.photograph import photograph
 
@@ -21,6 +23,7 @@ from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
 from ceres_cal.detect.photographs import Clicks, FieldOptions, detect_field, follow, load_clicks
 from ceres_cal.detect.photographs.clicks import FORMAT, clicks_from_json
+from ceres_cal.detect.photographs.field import _signs
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -218,6 +221,33 @@ def test_lines_darker_than_the_floor(tmp_path: Path, shot: script.Shot, known: b
         own = dark.view == number
         assert np.allclose(dark.pixels[own], light.pixels, rtol=0.0, atol=0.01)  # 0.002 measured
         assert np.allclose(dark.sigma_px[own], light.sigma_px, rtol=0.05)  # 0.014 measured
+
+
+def test_either_sign_is_looked_for_where_both_have_strokes() -> None:
+    floor = np.full((200, 300), 90.0, np.float32)
+    light, seams = floor.copy(), floor.copy()
+    light[40::50, 20:280] += 60.0
+    seams[40::50, 20:280] += 60.0
+    seams[20:180, 30::40] -= 60.0
+    assert list(_signs(light, is_near=False)) == [False]
+    assert list(_signs(180.0 - light, is_near=False)) == [True]
+    assert list(_signs(seams, is_near=False)) == [True, False]
+    assert list(_signs(seams, is_near=True)) == [False, True]
+    assert list(_signs(light, is_near=True)) == [False]
+
+
+@pytest.mark.parametrize("shape", [disturbed.drawn_out, disturbed.comatic])
+def test_coma_moves_no_line(shot: script.Shot, shape: Callable[[], tuple[Array, Array]]) -> None:
+    """By the mean of the light lines stay where they are; an even profile has them .6 px inwards at the rim."""
+    drawn_out = disturbed.with_coma(shot.picture.image, shot.camera, 9.0, shape())
+    course = predict(FIELD, shot.camera, FIELD.curve_names, SPACING_PX, SPACING_PX)
+    clear = clear_px(FIELD, shot.camera, course, FIELD.curve_names)
+    plain, drawn = (measure(light(image), course, 3.0, clear) for image in (shot.picture.image, drawn_out))
+    outward = np.sum((drawn.course.pixels - (640.0, 480.0)) * drawn.course.normals, axis=1)
+    rim = drawn.found & (np.abs(outward) > 400.0)
+    towards = np.sign(outward[rim]) * drawn.offset_px[rim]
+    assert np.mean(plain.found) - np.mean(drawn.found) < 0.05
+    assert abs(np.mean(towards)) < 0.1
 
 
 def test_a_wrong_field_is_a_miss(tmp_path: Path, shot: script.Shot) -> None:

@@ -79,7 +79,6 @@ def _imports(path: Path) -> Iterator[tuple[int, str]]:
 
 
 MODULES = {dotted(path): path for path in sorted((SRC / PACKAGE).rglob("*.py"))}
-each_module = pytest.mark.parametrize("name", MODULES)
 
 
 def module_of(target: str) -> str | None:
@@ -89,10 +88,12 @@ def module_of(target: str) -> str | None:
     return target or None
 
 
-@each_module
-def test_imports_go_downwards(name: str) -> None:
-    if name == PACKAGE:
-        return
+def test_imports_go_downwards() -> None:
+    for name in MODULES.keys() - {PACKAGE}:
+        require_downwards(name)
+
+
+def require_downwards(name: str) -> None:
     floor = FLOORS.get(room(name))
     assert floor is not None, f"{name} has no floor: give it a line in FLOORS (design: floor 0 knows nobody)"
     for line, target in imports(MODULES[name]):
@@ -113,9 +114,8 @@ def test_no_cycles() -> None:
         pytest.fail(f"imports run in a circle, {' <- '.join(error.args[1])}: move what both need into a module below")
 
 
-@each_module
-def test_libraries_come_in_by_their_door(name: str) -> None:
-    for line, target in imports(MODULES[name]):
+def test_libraries_come_in_by_their_door() -> None:
+    for name, (line, target) in ((name, one) for name, path in MODULES.items() for one in imports(path)):
         library = target.split(".")[0]
         assert room(name) in DOORS.get(library, {room(name)}), (
             f"{name}, line {line}, imports {library}, which only {sorted(DOORS[library]) or 'tests'} may: use those"
@@ -135,7 +135,7 @@ def test_no_module_hides_a_public_name() -> None:
     assert not hidden, f"modules named like public functions take their place when imported: rename {hidden}"
 
 
-@each_module
-def test_modules_stay_small(name: str) -> None:
-    lines = len(MODULES[name].read_text(encoding="utf-8").splitlines())
-    assert lines <= MAX_LINES, f"{name} has {lines} lines, more than {MAX_LINES}: split off a part that has a name"
+def test_modules_stay_small() -> None:
+    for name, path in MODULES.items():
+        lines = len(path.read_text(encoding="utf-8").splitlines())
+        assert lines <= MAX_LINES, f"{name} has {lines} lines, more than {MAX_LINES}: split off a part that has a name"

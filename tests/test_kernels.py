@@ -18,8 +18,7 @@ from scipy.optimize import minimize_scalar
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
-from ceres_cal.kernels.calls import core
+from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns, core
 from ceres_cal.problem.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import EXACT

@@ -72,6 +72,22 @@ def test_a_smear_is_found_and_moves_nothing() -> None:
     assert as_gaussian.sigma_px[0] > 2.0 * found.sigma_px[0]  # 3.3
 
 
+@pytest.mark.parametrize("lean", [1.0, -1.0])
+def test_coma_is_found_and_moves_nothing(lean: float) -> None:
+    normal, edges = np.array([0.28, 0.96]), 0.5 * WIDTH_PX * np.array([[-1.0, 1.0]])
+    share = np.linspace(0.0, 1.0, 61)
+    along = 5.0 * lean * (share - np.average(share, weights=1.0 - share))
+    image = np.average([stripe(normal, 0.3 + one, 0.6) for one in along], axis=0, weights=1.0 - share)
+    noisy = image + np.random.default_rng(3).normal(0.0, 2.0, image.shape)
+    windows = cut_windows(noisy.astype(np.float32), np.array([[30.0, 30.0]]), normal[None], np.zeros(1), 9.0, 3)
+    even = fit_profiles(windows, edges, fit_shape(windows, edges, EdgeShape(1.0)).blur_px, 1.5)
+    assert abs(even.offset_px[0] - 0.3) > 0.1
+    shape = fit_shape(windows, edges, EdgeShape(0.8, 1.0, 3.0), along=np.array([lean]))
+    assert shape.smear_px == pytest.approx(5.0, rel=0.1)
+    found = fit_profiles(windows, edges, shape.blur_px, 1.5, shape.smear_px, lean)
+    assert abs(found.offset_px[0] - 0.3) < 0.03
+
+
 def test_sigma_is_the_scatter() -> None:
     rng, normal = np.random.default_rng(1), np.array([0.6, 0.8])
     clean = stripe(normal, 0.1, 0.8)
@@ -119,7 +135,7 @@ def test_a_blur_is_told_where_nothing_is_bright() -> None:
     places = np.column_stack([np.full(40, 30.0), np.linspace(12.0, 48.0, 40)])
     normals = np.tile([1.0, 0.0], (40, 1))
     windows = cut_windows(image.astype(np.float32), places, normals, np.zeros(40), 6.0, 3)
-    course = SimpleNamespace(normals=normals, width_px=np.full(40, WIDTH_PX))
+    course = SimpleNamespace(normals=normals, edges=np.tile(0.5 * WIDTH_PX * np.array([[-1.0, 1.0]]), (40, 1)))
     for bright in (np.linspace(-90.0, -10.0, 40), np.zeros(40), np.linspace(10.0, 90.0, 40)):
         found = blur_of(windows, course, bright, no_blur(40))  # type: ignore[arg-type]
         assert np.all(np.isfinite(found.blur_px))

@@ -30,8 +30,7 @@ from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
-from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.registry import target_from_spec
+from ceres_cal.scene.targets import Target, target_from_spec
 
 SIZE = (960, 540)
 LIMITS_PX = (5.0, 10.0, 20.0)

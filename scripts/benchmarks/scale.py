@@ -22,8 +22,7 @@ from benchmarks.problems import corner_observations, field_observations, wide_le
 from ceres_cal.base.arrays import Array
 from ceres_cal.observations import NO_CURVES, Observations
 from ceres_cal.observations.columns import NO_POINTS, View
-from ceres_cal.observations.files import Content, header_of
-from ceres_cal.observations.folders import HEADER
+from ceres_cal.observations.files import HEADER, Content, header_of
 
 FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
 _FRAMES = 2000  # written at once

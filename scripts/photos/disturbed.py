@@ -16,7 +16,7 @@ import numpy as np
 from rendering.photograph import photograph
 from runner import Row, over
 
-from ceres_cal.base.arrays import Image8
+from ceres_cal.base.arrays import Array, Image8
 from ceres_cal.detect.photographs import Auto, Facing
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
@@ -55,10 +55,24 @@ class Taken:
     image: Image8
 
 
+def drawn_out() -> tuple[Array, Array]:
+    """Shifts (N,), as complex shares of 1 along the radius and across it, and weights (N,), of light that is drawn out
+    away from the middle of a lens, ever less of it the farther: lateral colour, and what coma is often taken for.
+    """
+    share = np.linspace(0.0, 1.0, 13)
+    return share.astype(complex), 1.0 - share
+
+
+def comatic() -> tuple[Array, Array]:
+    """The same of coma as it is: zones of the pupil make circles, ever larger and farther out, 60 degrees wide."""
+    zone, turn = (one.ravel() for one in np.meshgrid((np.arange(4) + 0.5) / 4.0, np.arange(9) * 2.0 * np.pi / 9.0))
+    return zone * (2.0 + np.exp(1j * turn)) / 3.0, np.ones(len(zone))
+
+
 @dataclass(frozen=True)
 class Kind:
     """What is painted besides or otherwise, how it is taken, and by which lenses; `most_mm` of mean error, on which
-    field; by what else than the camera above it, and by how much coma at the rim.
+    field; by what else than the camera above it, and by how much coma at the rim, of which shape.
     """
 
     painter: Painter | None = None
@@ -68,6 +82,7 @@ class Kind:
     field: str = "ssl-b"
     camera: Callable[[Camera, np.random.Generator], Camera] = lambda camera, rng: camera
     coma_px: float = 0.0
+    coma: Callable[[], tuple[Array, Array]] = drawn_out
 
 
 def cropped(camera: Camera, rng: np.random.Generator) -> Camera:
@@ -77,19 +92,17 @@ def cropped(camera: Camera, rng: np.random.Generator) -> Camera:
     return replace(camera, principal_point=(float(x), float(y)))
 
 
-def with_coma(image: Image8, camera: Camera, rim_px: float) -> Image8:
-    """A picture whose light is drawn out away from the middle of its lens, ever less of it the farther, about where its
-    mean stays; in proportion to how far from the middle it is, as of a lens that has coma.
+def with_coma(image: Image8, camera: Camera, rim_px: float, shape: tuple[Array, Array]) -> Image8:
+    """A picture whose light is drawn out by shifts with weights, about where their mean stays; in proportion to how far
+    from the middle it is, by so much at the rim.
     """
-    y, x = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
-    dx, dy = x - np.float32(camera.principal_point[0]), y - np.float32(camera.principal_point[1])
-    share = np.linspace(0.0, 1.0, 13)
-    weights = 1.0 - share
-    share -= np.average(share, weights=weights)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    cx, cy = camera.principal_point
+    place, (shifts, weights) = x - cx + 1j * (y - cy), shape
     total = np.zeros(image.shape, np.float32)
-    for part, weight in zip(share * rim_px / camera.corner_radius, weights / weights.sum(), strict=True):
-        there = 1.0 / (1.0 + np.float32(part))
-        places = (x - dx * (1.0 - there), y - dy * (1.0 - there))
+    for part, weight in zip(shifts - np.average(shifts, weights=weights), weights / weights.sum(), strict=True):
+        there = place / (1.0 + part * rim_px / camera.corner_radius)
+        places = ((there.real + cx).astype(np.float32), (there.imag + cy).astype(np.float32))
         total += np.float32(weight) * cv2.remap(image.astype(np.float32), *places, cv2.INTER_LINEAR)
     return np.asarray(np.round(total), np.uint8)
 
@@ -114,6 +127,7 @@ KINDS: dict[str, Kind] = {
     "stretched": Kind(camera=lambda camera, rng: replace(camera, aspect=rng.uniform(0.93, 1.07))),
     "dark": Kind(how=lambda how, rng: replace(how, carpet=rng.uniform(0.45, 0.65), paint=rng.uniform(0.08, 0.2))),
     "coma": Kind(coma_px=6.0, most_mm=MOVED_MM),
+    "comatic": Kind(coma_px=6.0, most_mm=MOVED_MM, coma=comatic),
 }
 
 
@@ -144,7 +158,7 @@ def taken(name: str, seed: int, field: Target) -> Taken:
     painted = custom(curves=curves if kind.painter is None else kind.painter(curves, field, rng))
     scene = field_scene(painted, {"overhead": camera}, {"overhead": Station("overhead", pose)})
     image = photograph(scene, "overhead", "0001", how, seed).image
-    return Taken(camera, painted, with_coma(image, camera, kind.coma_px) if kind.coma_px else image)
+    return Taken(camera, painted, with_coma(image, camera, kind.coma_px, kind.coma()) if kind.coma_px else image)
 
 
 # ---- what comes of it -----------------------------------------------------------------------------------------------

@@ -24,19 +24,21 @@ def names_of(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
 
 
 class LazyTable(UserDict[str, _Row]):
-    """A table by name; of a row that is a text the module of that name, below `package`, holds the row: `found` takes
-    it from there.
+    """A table by name; of a row that is a text the module of that name, below `package`, holds the row: what is of the
+    kind there, and of that name.
     """
 
-    def __init__(self, package: str, rows: Mapping[str, Any], found: Callable[[Any, str], _Row]) -> None:
-        self._package, self._found = package, found
-        super().__init__(rows)
+    def __init__(self, package: str, rows: Mapping[str, _Row | str], kind: type[_Row]) -> None:
+        self._package, self._kind = package, kind
+        super().__init__(cast("Mapping[str, _Row]", rows))
 
     def __getitem__(self, name: str) -> _Row:
-        row: Any = self.data[name]
+        row = self.data[name]
         if isinstance(row, str):
-            row = self.data[name] = self._found(import_module(f"{self._package}.{row}"), name)
-        return cast("_Row", row)
+            held = vars(import_module(f"{self._package}.{row}")).values()
+            row = next(one for one in held if isinstance(one, self._kind) and getattr(one, "name", "") == name)
+            self.data[name] = row
+        return row
 
 
 if TYPE_CHECKING:  # the same to a type checker

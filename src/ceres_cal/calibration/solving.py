@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from ceres_cal.base.errors import attempt
 from ceres_cal.base.threads import meanwhile
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
@@ -22,10 +23,11 @@ from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
+from ceres_cal.posterior.other_lenses import AGREES, agreement
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress, Solution
-from ceres_cal.problem.parameters import Estimate, Layout
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.parameters import Estimate, Layout, Options
+from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
@@ -35,7 +37,8 @@ from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.robust.usable import require_fits, require_possible, require_usable
+from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
+from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
@@ -171,7 +174,7 @@ def _explained(
     problem = replace(problem, sights=built.held(drawn, observations))
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
-        problem, start, end = _as_long_as_asked(problem, observations, start, end, watched)
+        problem, start, end = _as_long_as_asked(problem, observations, start, end, watched.progress)
         require_measured(end.problem, end.solution.estimate)
 
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
@@ -222,17 +225,6 @@ def _known(
     return replace(seen, end=end), with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
-def _as_long_as_asked(
-    problem: Problem, observations: Observations, start: Start, end: RobustSolution, watched: Watched
-) -> tuple[Problem, Start, RobustSolution]:
-    """With a lens whose powers were left open as long as the residuals ask for."""
-    if problem.options.powers:
-        return problem, start, end
-    from ceres_cal.calibration.lens_growing import grown
-
-    return grown(problem, observations, start, end, watched.progress)
-
-
 def _assess(
     seen: _Explained, observations: Observations, again: Again | None, bends: bool
 ) -> tuple[RobustSolution, Posterior]:
@@ -262,3 +254,53 @@ def _start_of(others: Problem, some: Subproblem, start: Start, again: Again | No
     if again is not None or not alike or all(key.placement is None for key in others.sights.keys):
         return start.estimate  # that of the world was found with what does not belong among the rest
     return initialise(some.observations, others.sights, others.options).estimate
+
+
+def _as_long_as_asked(
+    problem: Problem,
+    observations: Observations,
+    start: Start,
+    end: RobustSolution,
+    progress: Callable[[Progress], None] | None,
+) -> tuple[Problem, Start, RobustSolution]:
+    """The problem with the lens that the residuals ask for where nothing is stated of its powers, its start and end.
+
+    A lens without a formula has all of its terms where residuals of different views agree from place to place. How
+    large their numbers are the data say in any case (`effects/smoothness.py`): they cost time.
+    """
+    options = problem.options
+    if options.powers:
+        return problem, start, end
+    problem, end = _named(problem), replace(end, problem=_named(end.problem))
+    longer = replace(options, terms=tuple(options.blank_lens.more_terms))
+    may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
+    if may_grow and agreement(end, observations.cameras) > AGREES:
+        near = _seen_longer(end.solution.estimate, longer)
+        try_of = problem_of(observations, problem.sights, longer, near)
+        # quiet: the lens without these terms stays; what it leaves is diagnosed
+        found = attempt(lambda: solve_robustly(try_of, observations, near, progress=progress))
+        if isinstance(found, RobustSolution) and _shows_all(found):
+            problem, end = _named(try_of), replace(found, problem=_named(found.problem))
+    return problem, replace(start, estimate=_seen_longer(start.estimate, problem.options)), end
+
+
+def _named(problem: Problem) -> Problem:
+    """The same with the powers of its lens stated."""
+    return replace(problem, options=replace(problem.options, powers=problem.options.blank_lens.powers))
+
+
+def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
+    """The estimate with the lens of the options, which holds its own."""
+    cameras = dict(estimate.cameras)
+    for name, camera in cameras.items():
+        lens = make_lens(options.lens, options.blank_lens.powers, camera.lens.coefficients, options.terms)
+        # Its own span is set, and nothing else is asked for.
+        cameras[name] = replace(camera, lens=lens.spanning(0.0, camera.phi, 1.0, camera.image_size))
+    return replace(estimate, cameras=cameras)
+
+
+def _shows_all(end: RobustSolution) -> bool:
+    """Whether no lens folds inside what was observed."""
+    sights = end.problem.sights
+    cameras = end.solution.estimate.cameras.items()
+    return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)

@@ -290,9 +290,5 @@ _MODULES = {
 }
 
 
-def _command_of(module: Any, name: str) -> Command:
-    return next(one for one in vars(module).values() if isinstance(one, Command) and one.name == name)
-
-
-COMMANDS: Mapping[str, Command] = LazyTable("ceres_cal.cli", _MODULES, _command_of)
+COMMANDS: Mapping[str, Command] = LazyTable("ceres_cal.cli", _MODULES, Command)
 """Every command by its name."""

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import LEAST_BLUR_PX, MOST_BLUR_PX, MOST_SMEAR_PX, EdgeShape, Windows, fit_shape
+from ceres_cal.detect.profiles import (
+    LEAST_BLUR_PX,
+    MOST_BLUR_PX,
+    MOST_SMEAR_PX,
+    EdgeShape,
+    Profiles,
+    Windows,
+    fit_profiles,
+    fit_shape,
+)
 
 _WINDOWS = 150  # that tell a blur
 # Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
@@ -22,21 +32,28 @@ class Blur:
 
     Attributes:
         blur_px: (N,) standard deviation of a Gaussian, lens and pixel together. smear_px: (N,) how far beside it a
-            camera that moved smears them. stretch: the paint's width over what the target says.
+            camera that moved, or coma, smears them. stretch: the paint's width over what the target says. lean: (N,) of
+        the smear, to which end it holds more.
     """
 
     blur_px: Array
     smear_px: Array
-    stretch: float = 1.0
+    stretch: float
+    lean: Array
 
     @property
     def usual_px(self) -> float:
         """Standard deviation of all that."""
         return float(np.sqrt(np.mean(self.blur_px**2 + self.smear_px**2 / 12.0)))
 
-    def take(self, rows: Mask) -> Blur:
+    def take(self, rows: Mask | Indices) -> Blur:
         """At these places only."""
-        return replace(self, blur_px=self.blur_px[rows], smear_px=self.smear_px[rows])
+        return Blur(self.blur_px[rows], self.smear_px[rows], self.stretch, self.lean[rows])
+
+    def fitted(self, windows: Windows, course: Course) -> Profiles:
+        """What fits the windows of these places best."""
+        reach_px = 1.5
+        return fit_profiles(windows, self.stretch * course.edges, self.blur_px, reach_px, self.smear_px, self.lean)
 
     def smeared(self, rows: Indices) -> EdgeShape:
         """What these places look like if what is beyond a lens's blur is a smear."""
@@ -50,7 +67,7 @@ class Blur:
 
 def no_blur(count: int) -> Blur:
     """Of so many places, before any is known."""
-    return Blur(np.zeros(count), np.zeros(count))
+    return Blur(np.zeros(count), np.zeros(count), 1.0, np.zeros(count))
 
 
 def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Blur:
@@ -66,7 +83,7 @@ def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Bl
         return replace(no_blur(len(course)), blur_px=np.ones(len(course)))
     every = _brightest(bright, rows)
     own = _by_direction(angle, bright, rows) or [every]
-    edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
+    edges = course.edges
     if np.any(before.blur_px):
         shapes = [_shape_of(windows, edges, some, before.smeared(some)) for some in own]
         stretch = float(np.exp(np.mean(np.log([one.stretch for one in shapes]))))
@@ -75,7 +92,50 @@ def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Bl
         shapes = [_shape_of(windows, edges, some, start) for some in own] if len(own) > 1 else [start]
         stretch = start.stretch
     blur, smear = _between(angle, own, shapes)
-    return Blur(blur, smear, stretch)
+    return Blur(blur, smear, stretch, np.zeros(len(blur)))
+
+
+def with_coma(windows: Windows, course: Course, blur: Blur, fits: Profiles, size: tuple[int, int]) -> Blur | None:
+    """The same of a lens with coma, whose light is drawn out ever farther towards the picture's rim; None of others.
+
+    It leans outwards, or inwards: windows must say which, since what is only blurred more at the rim suits either as
+    well. Then two shapes are tried, that grow with the radius or its square: what is drawn out along the radius alone,
+    as by lateral colour, and coma's own, of which lines in all directions have the third moment of a shift along it.
+
+    Args:
+        fits: by an even blur. size: of the picture, height and width.
+    """
+    # Standard deviations; of half the diagonal; windows that tell whether it is worth while, and the length that is.
+    surely, outer, few, least_px = 4.5, 0.2, 50, 1.6
+    offsets = (course.pixels - 0.5 * (np.array(size[::-1]) - 1.0)) / (0.5 * np.hypot(*size))
+    across, radius = np.sum(offsets * course.normals, axis=1), np.linalg.norm(offsets, axis=1)
+    rows = _some(np.flatnonzero(np.isfinite(fits.offset_px) & (np.abs(across) > outer)))
+    if len(rows) < _FEWEST_IN_SECTOR or _coma_shape(windows, course, blur, _some(rows, few), across)[1] < least_px:
+        return None
+    inwards, outwards = (_drawn_out(windows, course, blur, rows, lean * across) for lean in (-1.0, 1.0))
+    more = inwards[1] - outwards[1]
+    told = float(np.mean(more)) / max(float(np.std(more)), 1e-9) * len(more) ** 0.5
+    if abs(told) < surely:
+        return None
+    out = np.copysign(1.0, told)
+    shapes = product((across, np.cbrt(across * radius**2)), (0.0, 1.0))
+    every = [_drawn_out(windows, course, blur, rows, out * shape * radius**power) for shape, power in shapes]
+    coma, left = min(every, key=lambda one: float(np.mean(one[1])))
+    return coma if float(np.mean(left)) < float(np.mean(np.log(fits.noise[rows]))) else None
+
+
+def _drawn_out(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, Array]:
+    """What is drawn out by as much and to where `along` (N,) says, and the logarithms (R,) of what it leaves."""
+    drawn, _ = _coma_shape(windows, course, blur, rows, along)
+    return drawn, np.log(drawn.take(rows).fitted(windows.take(rows), course.take(rows)).noise)
+
+
+def _coma_shape(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, float]:
+    """The same, and how far the farthest is drawn out, px."""
+    start = EdgeShape(min(blur.usual_px, 1.0), blur.stretch, 3.0)
+    shape = fit_shape(windows.take(rows), course.edges[rows], start, along=along[rows])
+    smear = shape.smear_px * np.abs(along)
+    return Blur(np.full(len(along), shape.blur_px), smear, shape.stretch, np.sign(along)), float(np.max(smear[rows]))
 
 
 def _by_direction(angle: Array, bright: Array, rows: Indices) -> list[Indices]:
@@ -114,6 +174,10 @@ def _doubled(angle: Array) -> Array:
 
 
 def _shape_of(windows: Windows, edges: Array, rows: Indices, start: EdgeShape) -> EdgeShape:
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _WINDOWS)).astype(int)]
-    some = Windows(windows.values[rows], windows.distance[rows], windows.inside[rows])
-    return fit_shape(some, edges[rows], start)
+    rows = _some(rows)
+    return fit_shape(windows.take(rows), edges[rows], start)
+
+
+def _some(rows: Indices, most: int = _WINDOWS) -> Indices:
+    """Of many rows as many as tell a blur, evenly."""
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)])

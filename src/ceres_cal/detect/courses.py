@@ -37,6 +37,11 @@ class Course:
         """These places only."""
         return Course(**{name: column[rows] for name, column in vars(self).items()})
 
+    @property
+    def edges(self) -> Array:
+        """(N, 2) px along the normal from the paint's middle to its edges."""
+        return np.column_stack([-0.5 * self.width_px, 0.5 * self.width_px])
+
 
 def predict(
     target: Target, camera: Camera, curves: Collection[str], spacing_px: float, margin_px: float = 0.0

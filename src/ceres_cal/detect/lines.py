@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
-from ceres_cal.detect.blur import blur_of, no_blur
+from ceres_cal.detect.blur import blur_of, no_blur, with_coma
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import Profiles, Windows, cut_windows, fit_profiles
+from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
 from ceres_cal.detect.sampling import drawn_aside
 
 HALF_WIDTH_PX = 3  # of a window, along the line
@@ -44,6 +44,8 @@ _NEARBY = 4  # places to each side that a place is compared with
 _FAR, _FAR_PX = 5.0, 0.25
 # Times the spread of its neighbours. Of line centres 0.2 % go at half of it and come at double.
 _WANDERING = 4.0
+# Of what coma draws lines aside, what is left once it is measured; all places of a line err alike.
+_OF_COMA = 0.15
 # Places between those whose scatter is looked at: on a line that is nearly level, errors follow its place in the pixel
 # and are alike over less. And what may be found of it, px.
 _APART = 3
@@ -189,14 +191,17 @@ def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | fl
         if _AS_FAR * np.max(blur.blur_px) <= beyond:
             break
         beyond = _AS_FAR * float(np.max(blur.blur_px))
-    edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
-    fits = fit_profiles(windows, blur.stretch * edges, blur.blur_px, 1.5, blur.smear_px)
+    even = fits = blur.fitted(windows, course)
+    coma = with_coma(windows, course, blur, fits, (grey.shape[0], grey.shape[1]))
+    if coma is not None:
+        blur, fits = coma, coma.fitted(windows, course)
+    drawn = _OF_COMA * np.nan_to_num(fits.offset_px - even.offset_px) * np.sqrt(np.bincount(course.curve)[course.curve])
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     offset = rough + fits.offset_px
     found = _is_paint(course, fits, contrast, medians(windows.values))
     found = _goes_on(course, found, offset, fits.sigma_px)
     aside, remains = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
-    offset, sigma = offset - aside, np.hypot(fits.sigma_px, remains)
+    offset, sigma = offset - aside, np.hypot(np.hypot(fits.sigma_px, drawn), remains)
     sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
     found = _goes_on(course, found, offset, sigma)
     return Lines(

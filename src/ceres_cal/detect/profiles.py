@@ -11,7 +11,9 @@ nor slope pulls c aside: all are even about it. Nothing is interpolated, so the 
 made it, and the curvature of the least squares tells the standard deviation of c.
 
 A camera that moves while the shutter is open smears that over m along the normal: Phi becomes its mean from t - m / 2
-to t + m / 2. That is even about c, too, and its two ends tell c much better than a Gaussian as wide would.
+to t + m / 2. That is even about c, too, and its two ends tell c much better than a Gaussian as wide would. A lens with
+coma smears it, too, but more at one end: the weights 1 + q (1 - 2 u), u from 0 to 1 along the smear, lean to one side
+by q from -1 to 1. Then c is where their mean lies. Only means are seen at one place by lines of every direction.
 """
 
 from __future__ import annotations
@@ -20,12 +22,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Mask
+from ceres_cal.base.arrays import Array, Array32, Indices, Mask
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
 _SHAPE_RANGE = (np.log([LEAST_BLUR_PX, 0.4, LEAST_SMEAR_PX]), np.log([MOST_BLUR_PX, 2.5, MOST_SMEAR_PX]))
 _SHAPE_SIGMA = np.array([1.0, 0.3, 1.0])  # of the logarithms of blur, stretch and smear, beforehand
+_HELD = 0.1  # of that of the stretch, where coma takes its part
 _MOST_STEP_PX = 0.7
 # Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
 # the pixels alone tell such a step and the line's place hardly apart.
@@ -48,6 +51,10 @@ class Windows:
     distance: Array
     inside: Mask
 
+    def take(self, rows: Indices) -> Windows:
+        """These places only."""
+        return Windows(self.values[rows], self.distance[rows], self.inside[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
@@ -65,11 +72,15 @@ class Profiles:
     heights: Array
     noise: Array
 
+    def take(self, rows: Indices) -> Profiles:
+        """These places only."""
+        return Profiles(self.offset_px[rows], self.sigma_px[rows], self.heights[rows], self.noise[rows])
+
 
 @dataclass(frozen=True)
 class EdgeShape:
     """What a picture makes of edges: blur_px, the Gaussian's standard deviation; stretch, a factor on the edges'
-    distances; smear_px, how far a camera that moved smears them, 0 of one that did not.
+    distances; smear_px, how far a camera that moved, or coma at the image's corner, smears them, 0 of none.
     """
 
     blur_px: float
@@ -117,17 +128,21 @@ def cut_windows(
 
 
 def fit_profiles(
-    windows: Windows, edges: Array, blur_px: Array | float, reach_px: float, smear_px: Array | float = 0.0
+    windows: Windows,
+    edges: Array,
+    blur_px: Array | float,
+    reach_px: float,
+    smear_px: Array | float = 0.0,
+    lean: Array | float = 0.0,
 ) -> Profiles:
     """Fit the model to every window.
 
     Args:
         edges: (N, E) px: where the steps are, relative to c. blur_px: (N,) or one, the Gaussian's standard deviation.
-        reach_px: a c farther from the place than this is none. smear_px: (N,) or one, of a camera that moved.
+        reach_px: a c farther from the place than this is none. smear_px: (N,) or one, of what smears. lean: of it.
     """
     offset = np.zeros(len(windows.values))
-    blur, smear = (np.broadcast_to(np.asarray(one, dtype=float), offset.shape) for one in (blur_px, smear_px))
-    steps = _Steps(edges, blur, smear)
+    steps = _Steps(edges, *(np.broadcast_to(np.asarray(one, float), offset.shape) for one in (blur_px, smear_px, lean)))
     normal, right = _normal(_columns(windows, steps, offset, None), windows.values)
     heights = _solve(normal, right)[:, 2:]
     squares = np.sum(windows.values**2, axis=1)
@@ -159,7 +174,9 @@ def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Arr
     )
 
 
-def fit_shape(windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8) -> EdgeShape:
+def fit_shape(
+    windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8, along: Array | None = None
+) -> EdgeShape:
     """What all windows share: the blur, the factor on the edges' distances that suits them best, and the smear.
 
     Each is pulled towards where it starts, by as much as one window in good light would outweigh: of a line that is
@@ -167,13 +184,17 @@ def fit_shape(windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8)
 
     Args:
         start: where to start; without a smear none is looked for.
+        along: (N,) of coma, -1 to 1: how long each window's smear is beside that of the shape, and which way it leans;
+            the edges' distances are held then, as what leans may be wide.
     """
-    begin = start.logarithms
+    begin, sigma = start.logarithms, _SHAPE_SIGMA * (1.0, 1.0 if along is None else _HELD, 1.0)
+    ones = np.ones(len(windows.values))
+    length, lean = (ones, 0.0 * ones) if along is None else (np.abs(along), np.sign(along))
     shape, offset, free = begin.copy(), np.zeros(len(windows.values)), len(begin)
     heights = None
     for _ in range(rounds):
         now = np.exp(shape)
-        steps = _Steps(edges * now[1], np.full(len(offset), now[0]), np.full(len(offset), now[2] if free > 2 else 0.0))
+        steps = _Steps(edges * now[1], now[0] * ones, (now[2] if free > 2 else 0.0) * length, lean)
         if heights is None:
             heights = _solve(*_normal(_columns(windows, steps, offset, None), windows.values))[:, 2:]
         columns = _columns(windows, steps, offset, heights, free=free)
@@ -185,7 +206,7 @@ def fit_shape(windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8)
         away = np.linalg.solve(own + _ridge(own), cross)
         schur = normal[:, -free:, -free:] - np.matmul(np.swapaxes(cross, 1, 2), away)
         left = right[:, -free:] - np.einsum("npq,np->nq", cross, solution)
-        pull = np.diag(1.0 / _SHAPE_SIGMA[:free] ** 2)
+        pull = np.diag(1.0 / sigma[:free] ** 2)
         change = np.linalg.solve(
             np.sum(schur / noise[:, None, None], axis=0) + pull,
             np.sum(left / noise[:, None], axis=0) + pull @ (begin - shape),
@@ -214,11 +235,12 @@ def normal_step(x: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Steps at `edges` (N, E) beside each c, blurred by `blur` (N,) and smeared over `smear` (N,) px."""
+    """Steps at `edges` (N, E) beside each c, blurred by `blur` (N,), smeared over `smear` (N,) px that `lean` (N,)."""
 
     edges: Array
     blur: Array
     smear: Array
+    lean: Array
 
     def rise(self, number: int, distance: Array) -> tuple[Array, Array, Array, Array]:
         """(N, K) how high step `number` is at distances from c, and the derivatives of that by the distance and by the
@@ -228,12 +250,21 @@ class _Steps:
         if not np.any(self.smear):
             high, bell = normal_step(away / blur)
             return high, bell / blur, -bell * away / blur, np.zeros_like(high)
-        smear = np.maximum(self.smear, LEAST_SMEAR_PX)[:, None]
-        ends = away - 0.5 * smear, away + 0.5 * smear
-        (low, low_bell), (high, high_bell) = (normal_step(end / blur) for end in ends)
-        by_blur = (high_bell - low_bell) * blur / smear
-        rise = (ends[1] * high - ends[0] * low) / smear + by_blur
-        return rise, (high - low) / smear, by_blur, 0.5 * (low + high) - rise
+        length, lean = np.maximum(self.smear, LEAST_SMEAR_PX)[:, None] / blur, self.lean[:, None]
+        mean = 0.5 - lean / 6.0
+        first, last = (_antiderivatives(away / blur + part * length) for part in (mean, mean - 1.0))
+        ends = [((1.0 + lean) * one - (1.0 - lean) * other) / length for one, other in zip(first, last, strict=True)]
+        between = [2.0 * lean * (one - other) / length**2 for one, other in zip(first, last, strict=True)]
+        by_blur, slope, rise = (ends[n] - between[n + 1] for n in range(3))
+        moved = (1.0 + lean) * mean * first[1] + (1.0 - lean) * (1.0 - mean) * last[1]
+        moved -= 2.0 * lean * (mean * first[2] + (1.0 - mean) * last[2]) / length
+        return rise, slope / blur, by_blur, moved + between[3] - rise
+
+
+def _antiderivatives(x: Array) -> tuple[Array, Array, Array, Array]:
+    """The normal density, its integral Phi, and the integrals of that, once and twice."""
+    high, bell = normal_step(x)
+    return bell, high, x * high + bell, 0.5 * ((x * x + 1.0) * high + x * bell)
 
 
 def _columns(windows: Windows, steps: _Steps, offset: Array, heights: Array | None, *, free: int = 0) -> Array:

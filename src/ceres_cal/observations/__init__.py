@@ -4,10 +4,20 @@ A view is what one frame shows of one target; a sight is what one camera at one 
 all its views, and so what one pose projects (see `observations.sights`).
 """
 
-from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Columns, Curves, Points, Prior, View, taken
+from ceres_cal.observations.columns import (
+    NO_CURVES,
+    NO_POINTS,
+    Columns,
+    Curves,
+    Points,
+    Prior,
+    View,
+    prior_from_json,
+    prior_to_json,
+    taken,
+)
 from ceres_cal.observations.files import FORMAT, VERSION
 from ceres_cal.observations.observations import Observations, combine
-from ceres_cal.observations.prior_files import prior_from_json, prior_to_json
 
 __all__ = [
     "FORMAT",

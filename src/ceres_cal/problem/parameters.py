@@ -42,7 +42,7 @@ class Options:
     Attributes:
         lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
             choice, as "radial" does, which powers alone stand for; () for (2, 3), of "spline" for as many as the
-            residuals ask for from there on (`calibration.lens_growing`).
+            residuals ask for from there on (`calibration.solving`).
         coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect: whether fy / fx is free, with nothing known of it (True), or held (False) at 1 or what `fixed`

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import Auto, SearchResult, SeveralWaysError, search
-from ceres_cal.detect.strokes import are_darker
+from ceres_cal.detect.strokes import lengths_of_signs
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
@@ -114,16 +114,17 @@ def detect_field(
             )
     results: dict[str, SearchResult] = {}
     last: Followed | None = None
-    darker = None  # whether the lines are; a start that is near finds light ones sooner than strokes tell
+    darker: bool | None = None  # whether the lines are, where a picture told it
     for number, path in enumerate(paths, start=1):
         grey = _without(read_light(path), options.left_out, path)
-        if darker is None and not isinstance(start, Camera):
-            darker = are_darker(grey)
-        given = (drawn, painted, start if last is None else last, (path, options))
-        result = _looked_for(negative(grey) if darker else grey, *given)
-        if result.followed is None and not darker and isinstance(start, Camera) and are_darker(grey):
-            result = _looked_for(negative(grey), *given)
-            darker = result.followed is not None
+        tried: list[SearchResult] = []
+        for dark in [darker] if darker is not None else _signs(grey, is_near=isinstance(start, Camera)):
+            plane = negative(grey) if dark else grey
+            tried.append(_looked_for(plane, drawn, painted, start if last is None else last, (path, options)))
+            if tried[-1].followed is not None:
+                darker = dark
+                break
+        result = tried[0] if darker is None else tried[-1]
         results[str(path)] = result
         if result.followed is None and options.refused is not None:
             options.refused(path, result)
@@ -143,6 +144,18 @@ def detect_field(
     lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
     priors = {(one.name, one.quantity): one for one in sorted((*every.priors, *lengths), key=lambda one: one.sigma)}
     return FieldDetections(replace(every, priors=tuple(priors.values())), followed, missed, searched)
+
+
+def _signs(grey: Array32, *, is_near: bool) -> Iterator[bool]:
+    """Whether a photograph's lines are darker than its floor: the likelier first, the other where it may be, too."""
+    nearly = 0.5  # of the strokes' length: seams and cables may be longer than the lines
+    if is_near:
+        yield False  # a start that is near finds light ones sooner than strokes tell
+    light, dark = lengths_of_signs(grey)
+    if not is_near:
+        yield dark > light
+    if (dark > light) if is_near else min(dark, light) > nearly * max(dark, light):
+        yield is_near or dark <= light
 
 
 def _found(prior: Prior, followed: Followed) -> Prior:

@@ -1,44 +1,98 @@
-"""Targets: rigid things of known geometry, one module for each kind of them, and the table of the kinds."""
+"""Targets: rigid things of known geometry; the table of their kinds, and the target that a file describes."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.lazy import names_of
+from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.lazy import LazyTable, names_of
 from ceres_cal.scene.curves import SIDES as SIDES
 from ceres_cal.scene.curves import Arc as Arc
 from ceres_cal.scene.curves import Curve as Curve
 from ceres_cal.scene.curves import Segment as Segment
 from ceres_cal.scene.targets.painted_fields import painted_field as painted_field
 from ceres_cal.scene.targets.painted_fields import ssl_field as ssl_field
-from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS
-from ceres_cal.scene.targets.registry import target_from_spec as target_from_spec
-from ceres_cal.scene.targets.registry import target_named as target_named
-from ceres_cal.scene.targets.registry import targets_by_name as targets_by_name
-from ceres_cal.scene.targets.registry import targets_from_specs as targets_from_specs
+from ceres_cal.scene.targets.painted_fields import templates
 from ceres_cal.scene.targets.target import Grid as Grid
 from ceres_cal.scene.targets.target import Target as Target
 from ceres_cal.scene.targets.target import TargetKind as TargetKind
+from ceres_cal.scene.targets.target import require_size
 
 if TYPE_CHECKING:
-    from ceres_cal.scene.targets.april_grids import april_grid as april_grid
-    from ceres_cal.scene.targets.checkerboards import checkerboard as checkerboard
-    from ceres_cal.scene.targets.circle_grids import circle_grid as circle_grid
     from ceres_cal.scene.targets.custom_targets import custom as custom
+    from ceres_cal.scene.targets.grids import april_grid as april_grid
+    from ceres_cal.scene.targets.grids import checkerboard as checkerboard
+    from ceres_cal.scene.targets.grids import circle_grid as circle_grid
+    from ceres_cal.scene.targets.grids import tape_grid as tape_grid
     from ceres_cal.scene.targets.marker_targets import Marker as Marker
     from ceres_cal.scene.targets.marker_targets import markers as markers
     from ceres_cal.scene.targets.ring_sheets import rings as rings
-    from ceres_cal.scene.targets.tape_grids import tape_grid as tape_grid
 
+_MODULES = {
+    "tape-grid": "grids",
+    "checkerboard": "grids",
+    "circle-grid": "grids",
+    "april-grid": "grids",
+    "markers": "marker_targets",
+    "rings": "ring_sheets",
+    "custom": "custom_targets",
+}
 __getattr__: Callable[[str], Any] = names_of(
     __name__,
     {
-        "april_grid": "april_grids",
-        "checkerboard": "checkerboards",
-        "circle_grid": "circle_grids",
+        "april_grid": "grids",
+        "checkerboard": "grids",
+        "circle_grid": "grids",
         "custom": "custom_targets",
         "Marker": "marker_targets",
         "markers": "marker_targets",
         "rings": "ring_sheets",
-        "tape_grid": "tape_grids",
+        "tape_grid": "grids",
     },
 )
+
+
+TARGET_KINDS: LazyTable[TargetKind] = LazyTable(
+    __name__, {**{name: template.as_kind() for name, template in templates().items()}, **_MODULES}, TargetKind
+)
+
+
+def target_from_spec(spec: Any, where: str) -> Target:
+    """The target that a file describes.
+
+    Args:
+        spec: `{"kind": ..., ...}`.
+        where: how to name the place in messages, such as 'obs.json: target "field"'.
+
+    Raises:
+        InputError: unknown kind, or a description that does not fit its kind.
+    """
+    kind = spec.get("kind") if isinstance(spec, dict) else None
+    if not isinstance(kind, str) or kind not in TARGET_KINDS:
+        missing = '; its description has no "kind"' if kind is None else ""
+        raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}{missing}")
+    with naming(where):
+        return TARGET_KINDS[kind].from_spec(spec, where)
+
+
+def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, Target]:
+    """The targets that a file describes, by name; InputError as `target_from_spec`, or where they are too large."""
+    targets: dict[str, Target] = {}
+    for name, spec in specs.items():
+        targets[name] = target_from_spec(spec, f"{where}target {name!r}")
+        features = sum(len(target.points) + len(target.curves) for target in targets.values())
+        require_size(features, f"{where}targets up to {name!r}")
+    return targets
+
+
+def target_named(name: str) -> Target | None:
+    """One of `targets_by_name`, without making the others; None where there is none of the name."""
+    every = (kind.examples() for kind in TARGET_KINDS.values() if name != kind.name)
+    return next((examples[name] for examples in every if name in examples), None)
+
+
+def targets_by_name() -> dict[str, Target]:
+    """The targets of any kind that exist in the world, such as ssl-a."""
+    every = ((kind, *example) for kind in TARGET_KINDS.values() for example in kind.examples().items())
+    return {name: target for kind, name, target in every if name != kind.name}
