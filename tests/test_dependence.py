@@ -352,3 +352,10 @@ def test_places_far_apart_have_no_correlation_at_all() -> None:
     assert np.min(kernel[kernel > 0.0]) > 1e-31
     values, vectors = np.linalg.eigh(kernel)
     assert values[0] > 0.01 and np.max(np.abs((vectors * values) @ vectors.T - kernel)) < 1e-14  # 1.3e-15 measured
+
+
+def test_rounding_widens_nothing_that_priors_alone_know() -> None:
+    """A direction of which observations say 3e-10 of all: a score's covariance is rounded by as much."""
+    seen = Information((Key("camera", "one", "phi", "px"), Key("camera", "one", "cx", "px")), np.diag([1.0, 3e-10]))
+    rounded = Scatter(np.eye(2), np.eye(2) - np.diag([0.0, 2.9e-10]), Dependence())
+    np.testing.assert_allclose(rounded.widened(seen).matrix, seen.matrix, atol=1e-12)

@@ -78,7 +78,7 @@ def test_evidence_is_the_restricted_likelihood(seed: int, known_noise: bool, sca
     root = size * np.random.default_rng(seed + 1).standard_normal((5, 2))
     found = effects_of(left, columns, residuals, known_noise)
     roots = np.stack([np.zeros((5, 2)), root])
-    logs = found.log_evidence(found.modes(roots), np.array([0.0, scatter]))
+    logs = found.log_evidence(found.modes(roots), np.array([0.0, scatter]))[:, 0]
     freedom = None if known_noise else 26
     for hypothesis, own in enumerate(roots):
         for place, tau in enumerate((0.0, scatter)):
@@ -113,7 +113,7 @@ def test_likeliest_sizes_are_the_maximum_of_the_evidence() -> None:
     one = RandomEffects.of(normal, slope, 1e-12)
 
     def evidence(sigmas: Array) -> float:
-        return float(one.log_evidence(one.modes(np.diag(np.repeat(sigmas, 60)))[None])[0, 0])
+        return float(one.log_evidence(one.modes(np.diag(np.repeat(sigmas, 60)))[None])[0, 0, 0])
 
     best = evidence(sigmas)
     for factor in (0.9, 1.1):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 
 NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
@@ -101,12 +101,16 @@ class Spread(Struct, frozen=True, eq=False):
             limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
         """
         scale, scaled = _scaled(np.asarray(information, dtype=float), limits)
+        # A file has the lower triangle, and says the same to the last digit.
+        inverse = _regular_inverses(np.tril(scaled) + np.tril(scaled, -1).T)
+        if inverse is not None:
+            return cls(inverse * scale[:, None] * scale, np.empty((len(scale), 0)), scale)
         values, vectors = np.linalg.eigh(scaled)
         lost = values <= _nothing(len(values))
         half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
         return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)
 
-    def depends(self, jacobian: Array) -> Array:
+    def depends(self, jacobian: Array) -> Mask:
         """(..., m) whether functions with derivatives (..., m, n) depend on an unknown direction."""
         if not self.unknown.shape[1]:
             return np.zeros(jacobian.shape[:-1], dtype=bool)
@@ -120,8 +124,11 @@ class Spread(Struct, frozen=True, eq=False):
         """
         # In one product of matrices: many of a few rows each take up to four times as long.
         along = np.tensordot(jacobian, self.covariance, axes=1)
-        covariances = along @ np.swapaxes(jacobian, -1, -2)
-        lost = self.depends(jacobian)
+        return self._marked(along @ np.swapaxes(jacobian, -1, -2), self.depends(jacobian))
+
+    @staticmethod
+    def _marked(covariances: Array, lost: Mask) -> Array:
+        """Covariances (..., m, m) with infinity and NaN where functions (..., m) depend on an unknown direction."""
         if np.any(lost):
             variances = np.where(lost, np.inf, np.diagonal(covariances, axis1=-2, axis2=-1))
             covariances = np.where(np.logical_or(lost[..., :, None], lost[..., None, :]), np.nan, covariances)
@@ -132,7 +139,7 @@ class Spread(Struct, frozen=True, eq=False):
     @property
     def matrix(self) -> Array:
         """(n, n) covariance of the numbers themselves, with infinity and NaN as `through` gives them."""
-        return self.through(np.eye(len(self.scale)))
+        return self._marked(self.covariance, self.depends(np.eye(len(self.scale))))
 
     @property
     def sd(self) -> Array:

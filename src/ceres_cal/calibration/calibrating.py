@@ -23,7 +23,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
-from ceres_cal.posterior.assess import with_other_lenses
+from ceres_cal.posterior.assess import is_possible, with_other_lenses
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import gather_priors
@@ -87,7 +87,8 @@ def calibrate(
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options) -> Calibration:
-    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be.
+    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be;
+    without what is then known of its numbers, where its phi is that of a lens.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -98,7 +99,10 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(start, observations, sights, options, Watched(bends=False)).redrawn()
+        found = _of_lens(start, observations, sights, options, Watched(knows=False))
+        if not is_possible(found.cameras[name]):  # phi ran along its valley, which what is known looks through
+            found = _of_lens(start, observations, sights, options, Watched())
+        return found.redrawn()
 
 
 def _measured(

@@ -67,12 +67,12 @@ class Watched:
 
     Attributes:
         progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
-        bends: whether it matters how the uncertainty bends.
+        knows: whether it is asked what is then known of the numbers.
     """
 
     progress: Callable[[Progress], None] | None = None
     settle: Callable[..., Settled] | None = None
-    bends: bool = True
+    knows: bool = True
 
 
 def solved_from(
@@ -108,8 +108,8 @@ def solved_from(
     explanations = settled.explanations if settled else seen.explanations
     warnings = (*(one.warning for one in explanations), *(one.warning for one in seen.effects))
     posterior = None
-    if assessed:
-        seen, posterior = _known(seen, observations, conflicts, again, watched)
+    if assessed and watched.knows:
+        seen, posterior = _known(seen, observations, conflicts, again)
         alike = seen_alike(seen.others, seen.end.solution.estimate, posterior.half_width)
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
         strange = (
@@ -214,10 +214,10 @@ def _of_targets(
 
 
 def _known(
-    seen: _Explained, observations: Observations, conflicts: Conflicts, again: Again | None, watched: Watched
+    seen: _Explained, observations: Observations, conflicts: Conflicts, again: Again | None
 ) -> tuple[_Explained, Posterior]:
     """What is known of every number, with what the lens hides and whatever else may be."""
-    end, posterior = _assess(seen, observations, again, watched.bends)
+    end, posterior = _assess(seen, observations, again)
     if again is None:
         require_lens_told(end.solution.estimate, posterior)
     if again is None:
@@ -225,9 +225,7 @@ def _known(
     return replace(seen, end=end), with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
-def _assess(
-    seen: _Explained, observations: Observations, again: Again | None, bends: bool
-) -> tuple[RobustSolution, Posterior]:
+def _assess(seen: _Explained, observations: Observations, again: Again | None) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
     Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
@@ -244,7 +242,7 @@ def _assess(
         return measure_scatter(observations, known, found, there, says)
 
     freedom = end.inliers.degrees_of_freedom
-    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, seen.shifts_at, bends=bends)
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, seen.shifts_at)
     return (end if assessed is estimate else end.moved_to(assessed, observations, seen.problem)), posterior
 
 

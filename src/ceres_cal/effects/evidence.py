@@ -102,7 +102,7 @@ LEAST_PX = 1e-3
 """Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
 _Name = TypeVar("_Name", bound=Hashable)
-_NO_SCATTER = np.zeros(1)
+_NO_SCATTER, _AS_IS = np.zeros(1), np.ones(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +123,17 @@ class RandomEffects:
 
     @classmethod
     def of(
-        cls, normal: Array, slope: Array, least: float, rest: float = 0.0, freedom: float | None = None
+        cls,
+        normal: Array,
+        slope: Array,
+        least: float,
+        rest: float = 0.0,
+        freedom: float | None = None,
+        share: float = 0.0,
     ) -> RandomEffects:
-        """From V (Q, Q) and u (Q,), without directions whose S is at most `least`."""
+        """From V (Q, Q) and u (Q,), without directions whose S is at most `least`, or that share of the largest."""
         size, turn = np.linalg.eigh(normal)
-        kept = size > least
+        kept = size > max(least, share * float(size[-1]))
         size, turn = size[kept], turn[:, kept]
         return cls(size, (turn.T @ slope) / np.sqrt(size), turn, rest, freedom)
 
@@ -135,26 +141,31 @@ class RandomEffects:
         """(..., R, Z) what roots (..., Q, Z) do to w."""
         return np.asarray(np.sqrt(self.size)[:, None] * (self.turn.T @ root))
 
-    def log_evidence(self, modes: Array | None = None, scatter: Array = _NO_SCATTER) -> Array:
-        """(H, T) logarithm of the restricted likelihood, up to a constant.
+    def log_evidence(self, modes: Array | None = None, scatter: Array = _NO_SCATTER, sizes: Array = _AS_IS) -> Array:
+        """(H, A, T) logarithm of the restricted likelihood, up to a constant.
 
         Args:
             modes: (H, R, Z) of the roots of each hypothesis (see `modes`); none for that of scatter alone.
-            scatter: (T,) tau, in standard deviations of the noise.
+            scatter: (T,) tau, in standard deviations of the noise. sizes: (A,) factors on the modes.
         """
         modes = np.zeros((1, len(self.size), 0)) if modes is None else modes
         precision, normal, slope = self._precisions(modes, scatter)
-        explained = np.sum(self.value**2) - precision @ self.value**2
+        weighted, aside = precision @ self.value**2, sizes[:, None, None]
+        explained = np.broadcast_to(np.sum(self.value**2) - weighted, (len(modes), len(sizes), len(scatter)))
         logs = 0.5 * np.sum(np.log(precision), axis=1)
-        if modes.shape[2]:
-            inner = np.eye(modes.shape[2]) + normal
-            explained = explained + np.sum(slope * np.linalg.solve(inner, slope[..., None])[..., 0], axis=-1)
-            logs = logs - 0.5 * np.linalg.slogdet(inner)[1]
+        if width := modes.shape[2]:
+            # The last pivot of (1 + N, n; n^T, c) is c - n^T (1 + N)^-1 n, at least half of this c.
+            whole = np.empty((*explained.shape, width + 1, width + 1))
+            whole[..., :-1, :-1] = np.eye(width) + aside[..., None] ** 2 * normal[:, None]
+            whole[..., :-1, -1] = whole[..., -1, :-1] = aside * slope[:, None]
+            whole[..., -1, -1] = bound = 2.0 * weighted + np.finfo(float).tiny
+            pivots = np.diagonal(np.linalg.cholesky(whole), axis1=-2, axis2=-1)
+            explained = explained + bound - pivots[..., -1] ** 2
+            logs = logs - np.sum(np.log(pivots[..., :-1]), axis=-1)
         if self.freedom is None:
-            return np.broadcast_to(logs + 0.5 * explained, (len(modes), len(scatter)))
+            return np.asarray(logs + 0.5 * explained)
         left = self.rest + np.sum(self.value**2) - explained
-        fit = -0.5 * self.freedom * np.log(left / max(self.freedom, 1.0))
-        return np.broadcast_to(logs + fit, (len(modes), len(scatter)))
+        return np.asarray(logs - 0.5 * self.freedom * np.log(left / max(self.freedom, 1.0)))
 
     def scatter_under(self, prior: SizePrior) -> tuple[float, float]:
         """Root of the mean variance of the numbers, where they scatter at all, and the probability that they do.
@@ -162,7 +173,7 @@ class RandomEffects:
         Few numbers leave their variance open: its mean then goes far beyond the likeliest, and what is solved for is
         held by little.
         """
-        logs = self.log_evidence(scatter=prior.scatter)[0]
+        logs = self.log_evidence(scatter=prior.scatter)[0, 0]
         weight = prior.probabilities * np.exp(logs - logs.max())
         variances = prior.scatter[1:] ** 2
         return float(np.sqrt(weight[1:] @ variances / weight[1:].sum())), float(1.0 - weight[0] / weight.sum())
@@ -296,8 +307,7 @@ class RepeatedAmounts:
             return float(np.sqrt(np.mean(np.square(prior.sizes)))), 1.0 - prior.absent
         within = max(within, 1.0)
         score, information = self._beside(numbers, others, sigmas)
-        least = tells * float(np.linalg.eigvalsh(information)[-1]) / within
-        effects = RandomEffects.of(information / within, score / within, least, self.rest)
+        effects = RandomEffects.of(information / within, score / within, 0.0, self.rest, share=tells)
         effects = replace(effects, freedom=self.spare + len(effects.size))
         sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))
         return float(sigma * np.sqrt(self.noise)), probability
@@ -306,14 +316,24 @@ class RepeatedAmounts:
         self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior]
     ) -> dict[_Name, tuple[float, float]]:
         """Sigma and probability of each effect by name, beside those of the others that are likely."""
-        sweeps = 2  # over the effects, each beside the others
+        sweeps, no_change = 2, 0.1  # over the effects, each beside the others; of the logarithm of one of their sigmas
         found: dict[_Name, tuple[float, float]] = {}
-        for name, own in [*numbers.items()] * sweeps if self.spare >= _FEWEST else ():
-            others = [one for one, (_, probability) in found.items() if one != name and probability > LIKELY]
-            at = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[one] for one in others)])
-            sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[one]), found[one][0]) for one in others)])
-            found.pop(name, None)  # the last one looked at stands last
-            found[name] = self.size(own, at, sigmas, priors[name])
+        asked: dict[_Name, dict[_Name, float]] = {}
+        each = sorted(numbers.items(), key=lambda one: len(one[1]))  # what takes longest is asked when others are known
+        for name, own in each * sweeps if self.spare >= _FEWEST else ():
+            before = found.pop(name, None)  # the last one looked at stands last
+            beside = {one: sigma for one, (sigma, probability) in found.items() if probability > LIKELY}
+            known = asked.get(name, {})
+            if (
+                before
+                and known.keys() == beside.keys()
+                and all(abs(np.log(known[one] / beside[one])) < no_change for one in beside)
+            ):
+                found[name] = before
+                continue
+            at = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[one] for one in beside)])
+            sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[one]), of) for one, of in beside.items())])
+            found[name], asked[name] = self.size(own, at, sigmas, priors[name]), beside
         return found
 
 
@@ -348,7 +368,7 @@ class Offsets:
     def _log_evidence(self, modes: Array, count: int) -> Array:
         """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
         sizes, scatter = self.prior.sizes[: None if count else 1], OFFSETS_SCATTER.scatter
-        logs = np.stack([self.effects.log_evidence(aside * modes, scatter) for aside in sizes], axis=1)
+        logs = self.effects.log_evidence(modes, scatter, np.array(sizes))
         priors = np.tile(OFFSETS_SCATTER.probabilities / len(sizes), len(sizes))
         total = logsum(logs.reshape(len(modes), -1) + np.log(priors))
         return np.asarray(total + count * np.log((1.0 - self.prior.absent) / len(self.modes)))

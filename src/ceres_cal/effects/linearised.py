@@ -276,7 +276,7 @@ def equation_weights(
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> Linearised:
     """The linear model of a calibration, its priors included."""
     keys = free_keys(estimate, problem.layout, problem.private)
-    blank, columns = without_shared(problem, estimate, equations, weights)
+    blank, columns = without_shared(problem, estimate, equations, weights, keys)
     rest = blank.beyond_private(columns)
     prior_rows, prior_values = prior_equations(problem, estimate, keys)
     inside = rest[weights.used]
@@ -302,9 +302,15 @@ def linearise_within(
     Args:
         known: of the shared numbers, by all equations and priors. `step` is 0: the whole is at its optimum.
     """
-    blank, columns = without_shared(problem, estimate, equations, weights)
-    root = known_root(known)
-    return replace(blank, shared=blank.beyond_private(columns) @ root, root=root, step=np.zeros(root.shape[1]))
+    root, built = known_root(known), np.array([key.is_structure for key in known.keys], dtype=bool)
+    blank, columns = without_shared(
+        problem, estimate, equations, weights, [k for k in known.keys if not k.is_structure]
+    )
+    shared = blank.beyond_private(columns) @ root[~built]
+    if built.any():  # of a board's thousand corners, each of which moves two equations a view, no matrix is made
+        moved = equations.built_along(estimate.structure, root[built]) * blank.weight[:, None]
+        shared += blank.beyond_private(moved)
+    return replace(blank, shared=shared, root=root, step=np.zeros(root.shape[1]))
 
 
 def known_root(shared: Information) -> Array:
@@ -325,13 +331,13 @@ def known_root(shared: Information) -> Array:
 
 
 def without_shared(
-    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights
+    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights, keys: Sequence[Key]
 ) -> tuple[Linearised, Array]:
-    """The model of private placements alone, and the columns (E, P) of the shared numbers, in standard deviations."""
+    """The model of private placements alone, and the columns (E, P) of shared numbers, in standard deviations."""
     used, weight = weights.used, weights.inverse_sigma
     score = np.where(used, weights.robust * weight * equations.residual, 0.0)
     private, count = _private_basis(equations, problem, weight, used)
-    columns = shared_columns(equations, estimate, free_keys(estimate, problem.layout, problem.private))
+    columns = shared_columns(equations, estimate, keys)
     shared, root = np.zeros((len(equations), 0)), np.zeros((columns.shape[1], 0))
     blank = Linearised(equations, weight, used, score, private, shared, root, np.zeros(0), count, 0)
     return blank, columns * weight[:, None]

@@ -50,8 +50,6 @@ def assess(
     degrees_of_freedom: float,
     scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
     shifts_at: ShiftsAt | None = None,
-    *,
-    bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
@@ -66,7 +64,6 @@ def assess(
         scatter_at: how the data scatter at an estimate, of which the problem says so much.
         shifts_at: numbers, and shifts by which they scatter besides, at an estimate. Along a valley the profile is as
             much wider, and what is across it with phi held.
-        bends: whether weak directions are followed, which takes a solve for each end.
 
     Raises:
         SolutionError: no possible lens fits.
@@ -85,11 +82,11 @@ def assess(
     astray = problem  # with phi held of the cameras that went astray, while others are looked at
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         camera = estimate.cameras[name]
-        if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
+        if is_possible(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
         nodes = valleys[name] = valley(name, astray, estimate, _inflation(posterior, name))
         rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
-        if not _is_lens(camera) or rise < width**2:
+        if not is_possible(camera) or rise < width**2:
             estimate = _usual(name, nodes)
             astray = astray.holding(name, 0)
     if astray is not problem:
@@ -97,7 +94,7 @@ def assess(
         posterior = known(estimate, reduced)
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
     posterior = replace(posterior, mixtures=mixtures)
-    return estimate, _with_bends(posterior, problem, estimate) if bends else posterior
+    return estimate, _with_bends(posterior, problem, estimate)
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
@@ -150,7 +147,8 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
     return along.with_information(lambda across: posterior.wider(across, scattered))
 
 
-def _is_lens(camera: Camera) -> bool:
+def is_possible(camera: Camera) -> bool:
+    """Whether lenses have such a phi."""
     unit = unit_px(camera)
     return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
 

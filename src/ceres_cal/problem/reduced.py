@@ -211,7 +211,7 @@ class _InformationSums:
         world = self._estimate.stations[key.station].cam_from_world
         lead = np.concatenate([self._owned("camera", key.camera), self._owned("structure", "")])
         station = self._owned("station", key.station)
-        stacks = []
+        stacks, reduced = [], np.zeros((2, len(lead), len(lead)))
         for poses, normals in self._normals(sights):
             chain = from_placement(poses, world)
             back = np.swapaxes(chain, 1, 2)  # the chain is orthogonal
@@ -220,30 +220,31 @@ class _InformationSums:
             inverse = known_inverses(own, _limits(own))
             covariance = chain @ inverse @ back
             follows = covariance @ whole[:, -6:, :-6]
-            self._add_reduced(lead, normals, covariance, follows)
+            self._add_reduced(reduced, normals, covariance, follows)
             gain = back @ follows
             if len(station):  # the placement makes up for whatever its station does
                 gain = np.concatenate([gain, back @ from_station(poses, world)], axis=2)
             stacks.append((own, inverse, gain))
+        self._matrices[:, lead[:, None], lead] += reduced
         own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
         names = tuple(str(key.placement) for key in sights.keys)
         return Eliminated(names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station])))
 
-    def _add_reduced(self, lead: Indices, normals: dict[int, Array], covariance: Array, follows: Array) -> None:
-        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, summed over the sights.
+    def _add_reduced(self, sums: Array, normals: dict[int, Array], covariance: Array, follows: Array) -> None:
+        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, added to the sums (2, K, K).
 
         Args:
             covariance: (S, 6, 6) of each pose with everything shared held. follows: (S, 6, K) less what V has for it.
         """
-        rows = 6 * len(follows)
-        flat = follows.reshape(rows, len(lead))
+        rows, size = 6 * len(follows), follows.shape[2]
+        flat = follows.reshape(rows, size)
         for kind, normal in normals.items():
             coupling = normal[:, -6:, :-6]
-            reduced = np.sum(normal[:, :-6, :-6], axis=0) - coupling.reshape(rows, len(lead)).T @ flat
+            sums[kind] += np.sum(normal[:, :-6, :-6], axis=0)
+            sums[kind] -= coupling.reshape(rows, size).T @ flat
             if len(normals) > 1:  # of all kinds together the placements are at their best, not of each
                 left = coupling - normal[:, -6:, -6:] @ follows
-                reduced -= flat.T @ left.reshape(rows, len(lead))
-            self._matrices[kind][np.ix_(lead, lead)] += reduced
+                sums[kind] -= flat.T @ left.reshape(rows, size)
             self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 
     def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:

@@ -242,6 +242,12 @@ class Equations:
             columns[moved, slots[moved, k]] += self.built[moved, k]
         return columns if structure.mixing is None else columns @ structure.mixing
 
+    def built_along(self, structure: Structure, directions: Array) -> Array:
+        """(E, P) px that directions (Q, P) of the structure's numbers move the equations: its columns times these."""
+        offsets = directions if structure.mixing is None else structure.mixing @ directions
+        moves, slots = np.vstack([offsets, np.zeros((1, directions.shape[1]))]), self.slots(structure)
+        return np.asarray(sum(self.built[:, k, None] * moves[slots[:, k]] for k in range(slots.shape[1])))
+
 
 def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
     """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""

@@ -93,16 +93,16 @@ def solve_as_built(
         if built.every:
             end, explanations = compete(problem, observations, solved(now), solver)
         return end, problem, explanations, ()
-    before, rounds, at_rest = now, 1, _alike(now.every, built.every)
+    before, rounds, change = now, 1, _change(now.every, built.every)
     end = solved(before)
-    while not at_rest and rounds < _MOST_ROUNDS:
+    while change > 2.0 * _AT_REST and rounds < _MOST_ROUNDS:  # the next one is less than half of it
         now = estimate_as_built(problem, observations, _freed(end, problem, freed(before)))
-        at_rest = not now.every or _alike(now.every, before.every)
-        if not at_rest:
+        change = _change(now.every, before.every) if now.every else 0.0
+        if change > _AT_REST:
             before, rounds = now, rounds + 1
             end = solved(before)
     every, structure = before.every, freed(before)
-    if not _alike(every, built.every):
+    if _change(every, built.every) > _AT_REST:
         end, explanations = compete(_held(problem, before, observations), observations, end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
@@ -155,12 +155,12 @@ def taking_part(problem: Problem, observations: Observations, explanations: Sequ
     return replace(part, layout=part.layout.of(part.sights.keys))
 
 
-def _alike(some: Sequence[AsBuilt], others: Sequence[AsBuilt]) -> bool:
-    """Whether they are of the same kinds, at nearly the same sigmas."""
+def _change(some: Sequence[AsBuilt], others: Sequence[AsBuilt]) -> float:
+    """By how much the logarithm of a sigma is another one at most; infinite where they are not of the same kinds."""
     sigmas = {(one.target, one.kind): one.sigma_m for one in others}
-    return {(one.target, one.kind) for one in some} == set(sigmas) and all(
-        abs(np.log(one.sigma_m / sigmas[one.target, one.kind])) < _AT_REST for one in some
-    )
+    if {(one.target, one.kind) for one in some} != set(sigmas):
+        return np.inf
+    return max((abs(float(np.log(one.sigma_m / sigmas[one.target, one.kind]))) for one in some), default=0.0)
 
 
 def _measured(every: Sequence[AsBuilt], structure: Structure, observations: Observations) -> Iterator[AsBuilt]:
@@ -337,6 +337,8 @@ def _likely(
     """The kinds that more likely scatter than not, each beside those of the others that do."""
     extents = {target: float(np.max(np.ptp(observations.targets[target].box, axis=0))) for target, _ in kinds}
     priors = {of: AS_BUILT.times(extents[of[0]]) for of in kinds}
-    for (target, kind), (sigma, probability) in repeats.sizes(kinds, priors).items():
+    sizes = repeats.sizes(kinds, priors)
+    for target, kind in kinds:
+        sigma, probability = sizes.get((target, kind), (0.0, 0.0))
         if probability > LIKELY:
             yield AsBuilt(target, kind, sigma, probability)

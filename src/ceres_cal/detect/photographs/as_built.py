@@ -238,7 +238,7 @@ class _CurveNumbers:
         best, most, scatter_m = frozenset[int](), -np.inf, float(scatters_m[0])
         for _ in range(_MOST + 1):
             sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
-            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), scatters_m)
+            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), scatters_m)[:, 0]
             score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
             order = np.argsort(-score)
             if score[order[0]] > most:

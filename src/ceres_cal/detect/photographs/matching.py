@@ -226,13 +226,17 @@ def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: 
 
 def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
     tells_px = 40.0  # of a line, as much as one place on it tells
-    floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
-    pixels = stroke_map.centre.astype(np.float32) + np.float32(stroke_map.unit_px) * upright.offsets(floor)
+    floor = (places.grid.T[:, None] - hypotheses.T[1:, :, None]) / hypotheses[:, 0, None]
+    offsets = np.moveaxis(upright.offsets(np.moveaxis(floor, 0, -1)), -1, 0)
+    x, y = (
+        np.float32(c) + np.float32(stroke_map.unit_px) * one for c, one in zip(stroke_map.centre, offsets, strict=True)
+    )
+    width, height = stroke_map.image_size
     with np.errstate(invalid="ignore"):
-        inside = np.all((pixels > -0.5) & (pixels < np.array(stroke_map.image_size) - 0.5), axis=2)
-    step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
+        inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
+        step = np.sqrt(sum(np.diff(one, axis=1, prepend=one[:, :1]) ** 2 for one in (x, y)))
     step = np.where(inside & ~places.first & np.isfinite(step), np.minimum(step, tells_px), 0.0)
-    near = stroke_map.near.at(pixels[..., 0], pixels[..., 1])
+    near = stroke_map.near.at(x, y)
     covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
     enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
     return np.where(enough, stroke_map.likelihood(covered, shown), 0.0)

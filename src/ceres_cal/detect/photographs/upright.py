@@ -69,13 +69,13 @@ class Upright:
 
     def offsets(self, floor: Array) -> Array:
         """(..., 2) of places (..., 2) on the floor: the other way; NaN behind the camera."""
-        x, y, z = self.rotation.T.astype(floor.dtype)
-        d = floor[..., :1] * x + floor[..., 1:] * y - z
+        u, v = floor[..., 0], floor[..., 1]
+        across, down, ahead = (u * x + v * y - z for x, y, z in self.rotation.astype(floor.dtype))
         with np.errstate(divide="ignore", invalid="ignore"):
-            ideal = self.phi * np.where(d[..., 2:] > 0.0, d[..., :2] / d[..., 2:], np.nan)
+            ideal = self.phi / np.where(ahead > 0.0, ahead, np.nan) * np.stack([across, down])
             # p = ideal (1 + c p^2): the root that is near ideal for small c.
-            root = np.sqrt(1.0 - 4.0 * self.bend * np.sum(ideal**2, axis=-1, keepdims=True))
-            return np.asarray(2.0 * ideal / (1.0 + root))
+            root = np.sqrt(1.0 - 4.0 * self.bend * (ideal[0] ** 2 + ideal[1] ** 2))
+            return np.moveaxis(2.0 * ideal / (1.0 + root), 0, -1)
 
 
 def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0) -> list[Upright]:
@@ -126,11 +126,11 @@ def _normals(optics: Upright, ends: Array) -> Array:
 def _score(normals: Array, weights: Array, rotations: Array, tolerance: float, least: float) -> Array:
     """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
     single = np.float32  # twice as fast, and good enough for a share
-    off = np.matmul(normals.astype(single), rotations[:, :, :2].astype(single)) / single(tolerance)
-    along, weight = np.exp(-(off**2)), (weights / weights.sum()).astype(single)  # (B, N, 2), (N,)
-    shares = np.einsum("bnk,n->bk", along, weight)
-    both = np.einsum("bn,n->b", along.max(axis=2), weight)
-    return np.asarray(np.where(shares.min(axis=1) > least, both, 0.0))
+    axes = np.moveaxis(rotations[:, :, :2].astype(single), 2, 0).reshape(-1, 3)
+    off = (axes @ normals.T.astype(single) / single(tolerance)).reshape(2, len(rotations), -1)
+    along, weight = np.exp(-(off**2)), (weights / weights.sum()).astype(single)  # (2, B, N), (N,)
+    least_share = np.minimum(*(along @ weight))
+    return np.asarray(np.where(least_share > least, np.maximum(*along) @ weight, 0.0))
 
 
 def _penalty(optics: Upright) -> float:
