@@ -21,7 +21,7 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
-from ceres_cal.detect.photographs import Clicks, FieldOptions, detect_field, follow, load_clicks
+from ceres_cal.detect.photographs import Clicks, FieldDetections, FieldOptions, detect_field, follow, load_clicks
 from ceres_cal.detect.photographs.clicks import FORMAT, clicks_from_json
 from ceres_cal.detect.photographs.field import _signs
 from ceres_cal.observations import Observations
@@ -380,8 +380,8 @@ def test_command(tmp_path: Path, shot: script.Shot, capsys: pytest.CaptureFixtur
         assert message in capsys.readouterr().err
 
 
-def test_the_real_photograph(real_data: Path) -> None:
-    figures = {row.what: row for row in script.real_rows(real_data, None)}
+def test_the_real_photograph(real_data: Path, tigers_field: tuple[Path, FieldDetections]) -> None:
+    figures = {row.what: row for row in script.real_rows(real_data, None, tigers_field)}
     followed = {name: row.value for name, row in figures.items() if name.startswith("share of")}
     assert (
         len(followed) == 10 and min(followed.values()) > 0.5
