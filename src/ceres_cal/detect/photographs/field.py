@@ -125,7 +125,7 @@ def detect_field(
         grey, where = _without(read_light(path), options.left_out, path), (path, options)
         result = _looked_for(grey, drawn, painted, places or [start], where)
         if result.followed is None and places and elsewhere:
-            # reads: why it is not where the field was seen before
+            # reads: "its lines were not found ...", where others show them
             other = attempt(partial(_looked_for, grey, drawn, painted, [start], where), InputError)
             elsewhere = isinstance(other, SearchResult) and other.followed is not None
             result = other if isinstance(other, SearchResult) and elsewhere else result
@@ -138,7 +138,7 @@ def detect_field(
         grey = _without(read_light(path), options.left_out, path)  # later ones told where it is
         results[str(path)] = _looked_for(grey, drawn, painted, places, (path, options))
     if not places and len(paths) > 1:
-        # reads: why the first one shows none
+        # reads: "no field in any of ... images"
         together = attempt(partial(_together, paths, drawn, painted, start, options), InputError)
         results = results if isinstance(together, CalibrationError) else together
     results = _of_one_place(results)
