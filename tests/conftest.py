@@ -15,6 +15,7 @@ from hypothesis import settings
 from photos.real_data import real_place
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
+from ceres_cal.detect.photographs import FieldDetections
 from ceres_cal.moves.refit_plan import MIRRORED, relabelled
 from ceres_cal.scene.targets import checkerboard
 
@@ -69,6 +70,14 @@ def sony_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Bo
     """What is detected in BoofCV's 13 photographs."""
     images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
     return made_once(tmp_path_factory, "sony", lambda: detect_boards(images, checkerboard(4, 6, 0.03)))
+
+
+@pytest.fixture(scope="session")
+def tigers_field(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FieldDetections]:
+    """A real photograph of a field, and what is detected in it."""
+    from photos.shots import real_detection
+
+    return made_once(tmp_path_factory, "tigers", lambda: real_detection(real_data))
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from scenes import LENSES, camera
 
 from ceres_cal import Calibration, Camera
 from ceres_cal.base.arrays import Array
-from ceres_cal.formats.import_format import ImportedCameras
+from ceres_cal.formats.format import ImportedCameras
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import overhead_pose

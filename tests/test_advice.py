@@ -26,7 +26,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.diagnostics.advice import Advice, Errors, Measurement, Promise, advise, promised
-from ceres_cal.diagnostics.advice.measurements import Ground, _observed, together
+from ceres_cal.diagnostics.advice.candidates import Ground, _observed, together
 from ceres_cal.diagnostics.advice.ranking import _chosen, _prepared, _weighting
 from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.sights import gather_sights
@@ -180,7 +180,7 @@ def test_what_cannot_be_projected_tells_nothing(monkeypatch: pytest.MonkeyPatch)
             raise SolutionError("an observation cannot be projected")
         return information(problem, estimate)
 
-    monkeypatch.setattr("ceres_cal.diagnostics.advice.measurements.information", of_tape_alone)
+    monkeypatch.setattr("ceres_cal.diagnostics.advice.candidates.information", of_tape_alone)
     advice = advise(calibrated("whole field, 8 deg"))
     told = {one.measurement.kind for one in advice.promises if one.after.worst_mm < 0.9 * advice.before.worst_mm}
     assert told == {"tape"} and {one.measurement.kind for one in advice.promises} == KINDS

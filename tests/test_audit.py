@@ -14,7 +14,7 @@ from ceres_cal import Calibration, Camera, InputError, Observations, audit, cali
 from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.formats import export
-from ceres_cal.formats.import_format import ImportedCameras
+from ceres_cal.formats.format import ImportedCameras
 from ceres_cal.simulate import simulate
 
 

@@ -23,8 +23,7 @@ from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.cli import main
 from ceres_cal.cli.batch import _of_calibration
 from ceres_cal.cli.files import finishing
-from ceres_cal.cli.jobs import RESULTS, Job, Outcome, remember, remembered, run_jobs
-from ceres_cal.cli.plan import read_plan
+from ceres_cal.cli.jobs import RESULTS, Job, Outcome, read_plan, remember, remembered, run_jobs
 from ceres_cal.diagnostics.advice.ranking import _prepared
 from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.moves.contrast import Contrast, NormalDistribution, contrast
+from ceres_cal.moves.agreement import Contrast, NormalDistribution, contrast
 from ceres_cal.problem.information import Information, Key
 
 KEYS = tuple(Key("camera", "a", name, "px") for name in ("phi", "cx", "cy"))

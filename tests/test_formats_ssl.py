@@ -29,6 +29,7 @@ from ceres_cal.formats import Group, Heard, export, import_calibration, publish,
 from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.camera import in_image
+from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import Segment, custom, ssl_field
 
 # name, number, type as published; F is a required float, f an optional one
@@ -137,6 +138,14 @@ def test_our_packet_calibrates_vision_processor(lens: str, tmp_path: Path) -> No
         points, pixels = places(camera)
         assert np.abs(field_to_image(calib, 1e3 * points) - pixels).max() < 1e-3  # float32; measured 2e-4
         assert loss.field_mm[0.15][1] < 1e-3 and exported.warnings == ()
+
+
+def test_what_loses_less_is_named(tmp_path: Path) -> None:
+    """A lens that one coefficient does not hold: OpenCV's model does."""
+    exported = export(over_field(with_lens(KannalaBrandt((-0.03, 0.002, 0.0, 0.0)))), "ssl-vision", tmp_path / "a.pb")
+    worst = max(worst for _, worst in exported.losses[0].field_mm.values())
+    (said,) = [text for text in exported.warnings if "one coefficient does not hold this lens" in text]
+    assert worst > 10.0 and f"{worst:.3g} mm are lost at most" in said and "--to opencv (0 mm at most)" in said
 
 
 def test_a_negative_distortion_is_said_out_loud(tmp_path: Path) -> None:

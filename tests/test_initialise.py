@@ -174,6 +174,17 @@ def test_the_principal_point_starts_at_its_prior(
     assert start_of(observations, fixed).estimate.cameras["camera"].principal_point == (655.0, 465.0)
 
 
+@pytest.mark.parametrize(
+    "centre, starts", [(CAMERA.principal_point, (639.5, 479.5)), ((330.0, 700.0), (0.28 * 1280, 0.72 * 960))]
+)
+def test_a_part_of_a_sensor_starts_in_its_quarter(centre: tuple[float, float], starts: tuple[float, float]) -> None:
+    scene = alone(overhead_pose(0.0, 0.0, 5.0, 3.0, 2.0))
+    scene = replace(scene, cameras={"camera": replace(CAMERA, principal_point=centre)})
+    start = start_of(simulate(scene, NOISE).observations)
+    assert start.estimate.cameras["camera"].principal_point == pytest.approx(starts)
+    assert start.estimate.camera_at("up").phi == pytest.approx(CAMERA.phi, rel=0.5)
+
+
 # ---- wrong labels ---------------------------------------------------------------------------------------------------
 
 

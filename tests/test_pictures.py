@@ -21,6 +21,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.images import encoded, read_grey
+from ceres_cal.detect.photographs import FieldDetections
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.parameters import Station as Posed
 from ceres_cal.problem.structure import Tolerance, make_structure
@@ -285,8 +286,8 @@ def test_the_model_of_a_field_is_where_the_camera_sees_it(shot: script.Shot, tmp
     assert frame_by_name(calibration, frame.station, "any") == Frame("any", frame.station, (("field", None),))
 
 
-def test_the_real_field_s_overlay_lies_on_the_paint(real_data: Path) -> None:
-    path, found = script.real_detection(real_data)
+def test_the_real_field_s_overlay_lies_on_the_paint(tigers_field: tuple[Path, FieldDetections]) -> None:
+    path, found = tigers_field
     calibration = calibrate(found.observations, Options(lens="radial", tolerances={"field": Tolerance(0.03, 0.03)}))
     (frame,) = frames_of(found.observations)
     model = model_of(calibration, frame)

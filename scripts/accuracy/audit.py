@@ -18,7 +18,7 @@ from runner import Row, over, script, share_error
 from ceres_cal import CalibrationError, Camera, Options, audit, calibrate
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats import export, import_calibration
-from ceres_cal.formats.import_format import ImportedCameras
+from ceres_cal.formats.format import ImportedCameras
 from ceres_cal.moves.audits import resized
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import ssl_field

@@ -24,7 +24,7 @@ from ceres_cal.cli import main as ceres_cal
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.lens import Brown
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
-from ceres_cal.simulate.photography import Photography
+from ceres_cal.simulate.scene import Photography
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "honest.jpg"
 RADIAL, LENGTHS = "radial", ["--estimate", "length,width"]

@@ -317,9 +317,13 @@ def real_detection(folder: Path) -> tuple[Path, FieldDetections]:
     return path, detect_field([path], target, Clicks(TIGERS_CLICKS), painted)
 
 
-def real_rows(folder: Path, picture: Path | None) -> Iterator[Row]:
-    """A real photograph of a field of unknown size: lines followed, and their spread when the size is freed."""
-    path, found = real_detection(folder)
+def real_rows(folder: Path, picture: Path | None, seen: tuple[Path, FieldDetections] | None = None) -> Iterator[Row]:
+    """A real photograph of a field of unknown size: lines followed, and their spread when the size is freed.
+
+    Args:
+        seen: what `real_detection` found in it before.
+    """
+    path, found = seen or real_detection(folder)
     followed = found.found[str(path)]
     lines, names = followed.lines, real_target().curve_names
     for number in np.unique(lines.course.curve):

@@ -15,7 +15,7 @@ from ceres_cal.base.files import make_folder, write_bytes
 from ceres_cal.detect.images import encoded
 from ceres_cal.observations import taken
 from ceres_cal.simulate.files import write_simulation
-from ceres_cal.simulate.photography import Photography
+from ceres_cal.simulate.scene import Photography
 from ceres_cal.simulate.simulation import Simulation, Truth
 from rendering.photograph import Photograph, frames, photograph
 

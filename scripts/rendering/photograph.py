@@ -12,8 +12,7 @@ from ceres_cal.base.arrays import Array, Array32, Image8, Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.simulate.photography import Photography
-from ceres_cal.simulate.scene import Scene
+from ceres_cal.simulate.scene import Photography, Scene
 from rendering import render
 from rendering.ground import Ground, ground_of
 from rendering.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline

@@ -89,7 +89,7 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
     Raises:
         InputError: the plan cannot be read, or a row is wrong usage of its command; it says which.
     """
-    from ceres_cal.cli.plan import read_plan
+    from ceres_cal.cli.jobs import read_plan
 
     base = plan if plan.is_dir() else plan.parent
     try:

@@ -17,8 +17,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes
 from ceres_cal.base.native import kept_signals
 from ceres_cal.base.transforms import Pose
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera
 

@@ -19,7 +19,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
 from ceres_cal.formats.colmap import read_model
-from ceres_cal.formats.import_format import ImportFormat, ImportRequest
+from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.observations import Curves, Observations, Points, View

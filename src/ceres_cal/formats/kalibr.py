@@ -14,8 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, require_rotation
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera

@@ -20,7 +20,7 @@ from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
 from ceres_cal.base.words import HEIGHTS_M
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportLoss, ExportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
 
 if TYPE_CHECKING:

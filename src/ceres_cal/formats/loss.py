@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import HEIGHTS_M, at_height
-from ceres_cal.formats.export_format import ExportLoss
+from ceres_cal.formats.format import ExportLoss
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid
 
@@ -107,10 +107,13 @@ def as_foreign(
 
 
 def loss_words(loss: ExportLoss) -> list[str]:
-    """What is lost, a line each, for files that have room for it."""
-    lines = []
-    if loss.image_px is not None:
-        lines.append("{}: {:.3g} px rms, {:.3g} px at most, over the image".format(loss.station, *loss.image_px))
-    for height_m, (rms, worst) in loss.field_mm.items():
-        lines.append(f"{loss.station}: {rms:.3g} mm rms, {worst:.3g} mm at most, {at_height(height_m)}")
-    return lines
+    """What is lost, a line each, for files that have room for it: on the field first, where it counts."""
+    field = [
+        f"{loss.station}: {rms:.3g} mm rms, {worst:.3g} mm at most, {at_height(height_m)}"
+        for height_m, (rms, worst) in loss.field_mm.items()
+    ]
+    shown = [] if loss.image_px is None else [loss.image_px]
+    return [
+        *field,
+        *(f"{loss.station}: {rms:.3g} px rms, {worst:.3g} px at most, over the image" for rms, worst in shown),
+    ]

@@ -15,8 +15,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
 from ceres_cal.base.transforms import Pose
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera

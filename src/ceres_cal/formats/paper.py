@@ -10,8 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, euler_from_rotation
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.camera import Camera

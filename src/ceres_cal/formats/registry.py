@@ -12,8 +12,7 @@ from ceres_cal.base.files import read_bytes
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such
 from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration

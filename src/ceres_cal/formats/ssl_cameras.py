@@ -18,8 +18,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.base.words import HEIGHTS_M
-from ceres_cal.formats.export_format import ExportLoss, ExportRequest
-from ceres_cal.formats.loss import Box, camera_loss, field_pixels
+from ceres_cal.formats.format import ExportLoss, ExportRequest
+from ceres_cal.formats.loss import Box, as_foreign, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.foreign import LARGEST
@@ -71,8 +71,24 @@ def to_entries(
         written = to_camera(entry)
         entries[number] = entry
         losses.append(camera_loss(name, camera, written.project, box_m))
-        warnings += [f"station {name!r}: {text}" for text in reader_traps(entry)]
+        warnings += [
+            f"station {name!r}: {text}" for text in (*_less_lost(camera, losses[-1], box_m), *reader_traps(entry))
+        ]
     return entries, losses, warnings
+
+
+def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]:
+    """What holds a camera better, where one coefficient loses much of it."""
+    much_mm = 10.0  # anywhere on the field: the width of a line
+    worst = max((worst for _, worst in loss.field_mm.values()), default=0.0)
+    if not worst > much_mm:
+        return []
+    other = as_foreign(camera, loss.station, camera.opencv_models, box_m)[1]
+    left = max(worst for _, worst in other.field_mm.values())
+    return [
+        f"one coefficient does not hold this lens, {worst:.3g} mm are lost at most: to lose less, read --to opencv "
+        f"({left:.2g} mm at most) or --to table in your own software, or let more cameras see less of the field each"
+    ]
 
 
 def as_before(entry: Mapping[str, Any], before: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ceres_cal.base.errors import InputError, attempt
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import SslOptions, as_before, reader_traps, to_camera, to_entries
 from ceres_cal.formats.ssl_fields import field_of, target_of

@@ -20,7 +20,7 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import read_bytes
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.base.written import note
-from ceres_cal.formats.export_format import Exported, ExportRequest
+from ceres_cal.formats.format import Exported, ExportRequest
 from ceres_cal.formats.ssl_cameras import SslOptions
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import geometry_of, read_geometry

@@ -13,8 +13,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import escape
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
-from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, reader_traps, to_camera, to_entries
 from ceres_cal.formats.ssl_fields import target_of

@@ -23,15 +23,17 @@ from ceres_cal.moves.agreement import (
     FALSE_ALARMS,
     Agreement,
     Agreements,
+    Contrast,
     MapChange,
     Misfit,
+    NormalDistribution,
     change_of,
+    contrast,
     field_grids,
     matched,
     require_posterior,
     require_stations,
 )
-from ceres_cal.moves.contrast import Contrast, NormalDistribution, contrast
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights

@@ -15,8 +15,15 @@ from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves.agreement import FALSE_ALARMS, Agreement, Agreements, ImageDifference, change_of
-from ceres_cal.moves.contrast import NormalDistribution, contrast
+from ceres_cal.moves.agreement import (
+    FALSE_ALARMS,
+    Agreement,
+    Agreements,
+    ImageDifference,
+    NormalDistribution,
+    change_of,
+    contrast,
+)
 from ceres_cal.posterior.maps import FieldGrid, field_map
 from ceres_cal.posterior.uncertainty import field_grid
 from ceres_cal.problem.information import Key

@@ -3,50 +3,30 @@
 A scene also says how photographs of it look (`Photography`); scripts/rendering draws them.
 """
 
-from ceres_cal.problem.parameters import Station
-from ceres_cal.simulate.built_in import built_in_scene, scene_names
-from ceres_cal.simulate.compose import (
-    BoardRanges,
-    board_placements,
-    board_pose,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    rings_scene,
-    well_inside,
-)
-from ceres_cal.simulate.files import load_scene, scene_from_json, scene_to_json, truth_to_json, write_simulation
-from ceres_cal.simulate.photography import Photography
-from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
-from ceres_cal.simulate.simulation import CLEAN, OUTLIER, WRONG_LABEL, Simulation, Truth, simulate
-
-__all__ = [
-    "CLEAN",
-    "OUTLIER",
-    "WRONG_LABEL",
-    "BoardRanges",
-    "Disturbance",
-    "Photography",
-    "Scene",
-    "Simulation",
-    "Station",
-    "Truth",
-    "ViewPlan",
-    "board_placements",
-    "board_pose",
-    "board_scene",
-    "built_in_scene",
-    "field_scene",
-    "join",
-    "load_scene",
-    "overhead_pose",
-    "rings_scene",
-    "scene_from_json",
-    "scene_names",
-    "scene_to_json",
-    "simulate",
-    "truth_to_json",
-    "well_inside",
-    "write_simulation",
-]
+from ceres_cal.problem.parameters import Station as Station
+from ceres_cal.simulate.built_in import built_in_scene as built_in_scene
+from ceres_cal.simulate.built_in import scene_names as scene_names
+from ceres_cal.simulate.compose import BoardRanges as BoardRanges
+from ceres_cal.simulate.compose import board_placements as board_placements
+from ceres_cal.simulate.compose import board_pose as board_pose
+from ceres_cal.simulate.compose import board_scene as board_scene
+from ceres_cal.simulate.compose import field_scene as field_scene
+from ceres_cal.simulate.compose import join as join
+from ceres_cal.simulate.compose import overhead_pose as overhead_pose
+from ceres_cal.simulate.compose import rings_scene as rings_scene
+from ceres_cal.simulate.compose import well_inside as well_inside
+from ceres_cal.simulate.files import load_scene as load_scene
+from ceres_cal.simulate.files import scene_from_json as scene_from_json
+from ceres_cal.simulate.files import scene_to_json as scene_to_json
+from ceres_cal.simulate.files import truth_to_json as truth_to_json
+from ceres_cal.simulate.files import write_simulation as write_simulation
+from ceres_cal.simulate.scene import Disturbance as Disturbance
+from ceres_cal.simulate.scene import Photography as Photography
+from ceres_cal.simulate.scene import Scene as Scene
+from ceres_cal.simulate.scene import ViewPlan as ViewPlan
+from ceres_cal.simulate.simulation import CLEAN as CLEAN
+from ceres_cal.simulate.simulation import OUTLIER as OUTLIER
+from ceres_cal.simulate.simulation import WRONG_LABEL as WRONG_LABEL
+from ceres_cal.simulate.simulation import Simulation as Simulation
+from ceres_cal.simulate.simulation import Truth as Truth
+from ceres_cal.simulate.simulation import simulate as simulate

@@ -13,8 +13,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate.compose import BoardRanges, board_scene, field_scene, join, overhead_pose, rings_scene
-from ceres_cal.simulate.photography import Photography
-from ceres_cal.simulate.scene import Disturbance, Scene
+from ceres_cal.simulate.scene import Disturbance, Photography, Scene
 
 _WORKDAY = Disturbance(
     points_sigma_px=0.5,

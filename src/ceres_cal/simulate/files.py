@@ -19,8 +19,7 @@ from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
 from ceres_cal.scene.targets import targets_from_specs
-from ceres_cal.simulate.photography import Photography
-from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
+from ceres_cal.simulate.scene import Disturbance, Photography, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
 
 SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1

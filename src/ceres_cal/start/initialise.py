@@ -8,16 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, numerical
+from ceres_cal.base.errors import attempt
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
@@ -57,9 +61,38 @@ class Start:
 def initialise(observations: Observations, sights: Sights, options: Options) -> Start:
     """A start for everything the observations show.
 
+    A camera over a field alone, of whose principal point nothing is stated, may show a part of a sensor: where a start
+    from the picture's middle leaves much, those from its quarters are tried, too. Boards tell it by themselves.
+
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
     """
+    least_px, share, better = 0.3, 0.22, 0.5  # that is left; of the picture's size, from its middle; times as much left
+    start = _initialised(observations, sights, options)
+    for name, size in observations.cameras.items():
+        own = sights.numbers(camera=name)
+        stated = [one.quantity for one in (*observations.priors, *options.priors) if one.name == name]
+        known = {"principal_point", "cx", "cy"} & {*stated, *options.fixed}
+        if known or any(sights.keys[number].placement is not None for number in own):
+            continue
+        least, given = better * _left_px(observations, sights.take(own), start), options
+        for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_px else ():
+            there = Prior("camera", name, "principal_point", (x * size[0], y * size[1]), (1.0, 1.0))
+            moved = replace(given, priors=(*given.priors, there))
+            other = attempt(partial(_initialised, observations, sights, moved))  # quiet: it is one of five
+            if isinstance(other, Start) and (left := _left_px(observations, sights.take(own), other)) < least:
+                start, least, options = other, left, moved
+    return start
+
+
+def _left_px(observations: Observations, sights: Sights, start: Start) -> float:
+    """The median of what a start leaves of all that these sights hold."""
+    left = residuals(observations, sights, start.estimate).lengths
+    rows = zip(left, (sights.point_rows, sights.curve_rows), strict=True)
+    return float(np.median(np.nan_to_num(np.concatenate([one[own] for one, own in rows]), nan=np.inf)))
+
+
+def _initialised(observations: Observations, sights: Sights, options: Options) -> Start:
     posed = posed_sights(observations, sights, options)
     stations, placements = chained_poses(observations, sights, posed.numbers, posed.poses, open_numbers=posed.open)
     structure = make_structure(observations.targets, options.tolerances, options.dimensions)

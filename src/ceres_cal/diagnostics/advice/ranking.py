@@ -18,8 +18,7 @@ from ceres_cal.base.threads import single_threaded_blas
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, still
-from ceres_cal.diagnostics.advice.measurements import Ground, Measurement
+from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, still
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information
