@@ -20,7 +20,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
@@ -76,17 +76,9 @@ def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask]) -> in
     # Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
     explained = 3.0
     farthest = seen.options.reject_sigma
-
-    def lengths(there: Estimate) -> tuple[tuple[Array, Mask, int], ...]:
-        points, curves = seen.in_sigmas(there)
-        return (np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)
-
-    # quiet: it is solved for. What the normal equations have farther off than an outlier no solve brings that near.
-    promised = attempt(lambda: lengths(other.estimate))
-    if not isinstance(promised, CalibrationError) and not any(np.any(off[own] < farthest) for off, own, _ in promised):
-        return 0
+    points, curves = seen.in_sigmas(seen.solved_near(other))
     count = 0
-    for off, own, equations in lengths(seen.solved_near(other)):
+    for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
         count += equations * int(np.count_nonzero(own & (off < explained)))
         count -= equations * int(np.count_nonzero(~own & (off > farthest)))
     return count
