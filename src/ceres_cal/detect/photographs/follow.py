@@ -336,8 +336,8 @@ class _Tracker:
                     fits.append((found.fit.curve_scale * len(lines.found) / found.fit.curves, found, own))
             near = min(fits, key=lambda fit: fit[0])[1].station() if fits else near
         order = sorted(fits, key=lambda fit: (fit[1].station().folds, fit[0]))
-        # quiet: the next one is taken; of where phi may be only the one that is taken is asked, which takes longer
-        asked = (
+        asked = (  # of where phi may be only the one that is taken: that takes longer
+            # quiet: the next one is taken
             one if one.posterior is not None else attempt(partial(calibrate_near, one.station(), observations, own))
             for _, one, own in order
         )
