@@ -166,7 +166,8 @@ def test_what_each_number_moves() -> None:
     "tolerances, message",
     [
         ({"pitch": Tolerance(lines_m=0.01)}, "a tolerance: there is no target 'pitch'"),
-        ({"field": Tolerance(warp_m=0.01)}, "a warp is for checkerboards"),
+        ({"field": Tolerance(warp_m=0.01)}, "a warp or heights are for checkerboards"),
+        ({"field": Tolerance(heights_m=0.01)}, "does not bow"),
     ],
 )
 def test_tolerances_that_do_not_fit(tolerances: dict[str, Tolerance], message: str) -> None:

@@ -1,9 +1,10 @@
 """Targets that are not where they are drawn: python scripts/run.py as_built [--help]
 
-Boards whose corners are off, that are bent, or that are as drawn, simulated with independent noise. How often something
-is found, the sigma that is estimated over the true one, how many of the 95 % intervals of the camera's numbers hold the
-truth, and the squared error over that of targets as drawn. Then real sets: the error at which views are predicted that
-were left out, over that of targets as drawn. Exits with 1 when a figure is missed by more than two standard errors.
+Boards whose corners are off in the plane or in height, that are bent, or that are as drawn, simulated with independent
+noise. How often something is found, the sigma that is estimated over the true one, how many of the 95 % intervals of
+the camera's numbers hold the truth, and the squared error over that of targets as drawn. Then real sets: the error at
+which views are predicted that were left out, over that of targets as drawn. Exits with 1 when a figure is missed by
+more than two standard errors.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from runner import Row, mean_and_error, over, script, share_error
 
 from accuracy.scenes import RADIAL
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -40,11 +42,12 @@ class Board:
     """How a board is built, and how often it is seen.
 
     Attributes:
-        points_m, bow_m: standard deviations. views: of it. columns, rows: of its corners.
+        points_m, bow_m, heights_m: standard deviations. views: of it. columns, rows: of its corners.
     """
 
     points_m: float = 0.0
     bow_m: float = 0.0
+    heights_m: float = 0.0
     views: int = 12
     columns: int = 9
     rows: int = 6
@@ -71,16 +74,21 @@ def built(drawn: Target, board: Board, seed: int) -> Target:
     relative = (2.0 * places[:, :2] - low - high) / (high - low)
     places[:, :2] += board.points_m * rng.standard_normal((len(places), 2))
     places[:, 2] += (1.0 - relative**2) @ (board.bow_m * rng.standard_normal(2))
+    places[:, 2] += board.heights_m * rng.standard_normal(len(places))
     return replace(drawn, points=dict(zip(drawn.point_names, map(tuple, places.tolist()), strict=True)))
 
 
 def sigmas_off(calibration: Calibration, scene: Scene) -> Array:
     """(K,) errors of the camera's numbers, in their standard deviations."""
-    posterior = calibration.uncertainty.posterior
-    keys = [key for key in posterior.keys if key.kind == "camera"]
+    keys = [key for key in calibration.uncertainty.posterior.keys if key.kind == "camera"]
     truth = replace(calibration.estimate, cameras=scene.cameras)
-    spread = np.array([posterior.sd_of(key.kind, key.owner, key.quantity) for key in keys])
-    return np.asarray(difference(calibration.estimate, truth, keys) / spread)
+    return np.asarray(difference(calibration.estimate, truth, keys) / _spread(calibration))
+
+
+def _spread(calibration: Calibration) -> Array:
+    """(K,) standard deviations of the camera's numbers."""
+    posterior = calibration.uncertainty.posterior
+    return posterior.sd[[number for number, key in enumerate(posterior.keys) if key.kind == "camera"]]
 
 
 def _both(board: Board, seed: int) -> tuple[Scene, Calibration, Calibration]:
@@ -92,20 +100,26 @@ def _both(board: Board, seed: int) -> tuple[Scene, Calibration, Calibration]:
 def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
     """The figures of one kind of board."""
     found, offs, squares, spreads = [], [], [], []
-    sigmas: dict[str, list[float]] = {"points": [], "warp": []}
+    sigmas: dict[str, list[float]] = {"points": [], "warp": [], "heights": []}
     for scene, as_built, drawn in over(partial(_both, board), range(runs)):
         found.append(bool(as_built.as_built))
         offs.append(sigmas_off(as_built, scene))
-        widths = np.array([np.sqrt(np.diagonal(one.uncertainty.posterior.covariance)[:5]) for one in (as_built, drawn)])
+        widths = np.array([_spread(one) for one in (as_built, drawn)])
         spreads.append(float(np.mean(widths[0] / widths[1])))
         errors = [offs[-1] * widths[0], sigmas_off(drawn, scene) * widths[1]]
         squares.append([float(np.mean((error / widths[1]) ** 2)) for error in errors])
         for one in as_built.as_built:
             sigmas[one.kind].append(one.sigma_m)
-    flat = board.points_m == board.bow_m == 0.0
+    flat = board.points_m == board.bow_m == board.heights_m == 0.0
     share, note = float(np.mean(found)), f"{runs} boards of {board.views} views"
     yield Row(case, "share found not as drawn", share, share_error(share, runs), 0.0, 0.1 if flat else 1.0, note)
-    for kind, truth in (("points", board.points_m), ("warp", board.bow_m)):
+    held = np.mean(np.abs(offs) < NORMAL_95, axis=1)
+    own, other = np.transpose(squares)
+    ratios = own / np.mean(other)
+    yield Row(case, "95 % intervals of the camera's numbers", *mean_and_error(held), note=note)
+    yield Row(case, "squared error over as drawn", *mean_and_error(ratios), note=note)
+    yield Row(case, "sd over as drawn", *mean_and_error(spreads), note=note)
+    for kind, truth in (("points", board.points_m), ("warp", board.bow_m), ("heights", board.heights_m)):
         if truth and sigmas[kind]:
             ratios = np.array(sigmas[kind]) / truth
             yield Row(case, f"sigma of {kind} over the true one", *mean_and_error(ratios), note=f"{len(ratios)} found")
@@ -134,6 +148,7 @@ CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "corners": partial(board_rows, "corners 0.1 mm off", Board(points_m=1e-4)),
     "bent": partial(board_rows, "bent by 1 mm", Board(bow_m=1e-3)),
     "both, few views": partial(board_rows, "both, few views", Board(2e-4, 1e-3, views=5)),
+    "heights": partial(board_rows, "corners 0.5 mm high or low", Board(heights_m=5e-4)),
     "real": real_rows,
 }
 

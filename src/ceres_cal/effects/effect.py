@@ -53,8 +53,8 @@ class AsBuilt:
     """By how much the features of one kind lie off a target's drawing.
 
     Attributes:
-        target, kind: "lines", "points" or "warp". sigma_m: the standard deviation that their offsets were solved for
-            under. probability: that they are off at all. rms_m: of the offsets.
+        target, kind: "lines", "points", "warp" or "heights". sigma_m: the standard deviation that their offsets were
+            solved for under. probability: that they are off at all. rms_m: of the offsets.
     """
 
     target: str
@@ -67,6 +67,8 @@ class AsBuilt:
     def words(self) -> str:
         """What it says, without the target."""
         amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
+        if self.kind == "heights":
+            return f"its points lie {amount} above or below it"
         return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
 
 

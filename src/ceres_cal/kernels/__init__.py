@@ -48,7 +48,7 @@ class Optics(NamedTuple):
     unit: float
 
 
-BUILT = 7
+BUILT = 8
 """Numbers at most that move an observation on its target: of a point x, y and what a board's warp is made of."""
 
 

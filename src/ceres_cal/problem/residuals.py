@@ -271,8 +271,8 @@ def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
 
 def whole_structure(targets: Mapping[str, Target]) -> Structure:
     """Everything that could be built otherwise than it is drawn."""
-    every = {name: Tolerance(1.0, 1.0, 1.0 if target.bows else 0.0) for name, target in targets.items()}
-    return make_structure(targets, every)
+    board, flat = Tolerance(1.0, 1.0, 1.0, 1.0), Tolerance(1.0, 1.0)
+    return make_structure(targets, {name: board if target.bows else flat for name, target in targets.items()})
 
 
 def write_equations(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:

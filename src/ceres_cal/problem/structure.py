@@ -2,8 +2,8 @@
 
 One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
 arc its centre's x and y and its radius, for each point its x and y, for each board its warp: two bows, a twist and two
-waves; all in metres, 0 is the nominal target. Behind them come dimensions of targets that are not known, such as a
-field's length: each moves the offsets of many features at once.
+waves, and the height of each of its points besides; all in metres, 0 is the nominal target. Behind them come dimensions
+of targets that are not known, such as a field's length: each moves the offsets of many features at once.
 
 The lengths that targets are drawn by, and how another value of one moves points and curves.
 """
@@ -26,7 +26,7 @@ from ceres_cal.problem.information import Key
 from ceres_cal.scene.curves import Curve
 from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
 
-Kind = Literal["lines", "points", "warp"]
+Kind = Literal["lines", "points", "warp", "heights"]
 """What a tolerance speaks of."""
 WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
 """What the warp of a board is made of: see `bends_of`."""
@@ -40,12 +40,14 @@ class Tolerance:
         lines_m: of the offset of each segment, and of each arc's centre and radius.
         points_m: of each point's x and y.
         warp_m: of each of WARP, where it is largest: a board's bow along each side, its twist, a wave along each side.
+        heights_m: of the height of each of a board's points, beside its warp.
         curve_m: name of a curve -> the same as lines_m, of that one in place of it.
     """
 
     lines_m: float = 0.0
     points_m: float = 0.0
     warp_m: float = 0.0
+    heights_m: float = 0.0
     curve_m: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -72,8 +74,8 @@ class Structure:
         names: (Z) "target/feature" or "target/feature.x": what each number moves; the last D are dimensions,
             "target/dimension". values: (Z,) offsets, m, and lengths of dimensions, m. sigma_m: (Z,) tolerance of each;
             infinite of a dimension, which has a prior, or none.
-        point_slots: (P, 2 + W) which offset moves each point of all targets: x, y and each of WARP; -1 for none.
-        bends: (P, W) how much of each of them a point gets, along +z.
+        point_slots: (P, 2 + W + 1) which offset moves each point of all targets: x, y, each of WARP and its own height;
+            -1 for none. bends: (P, W + 1) how much of each of them a point gets, along +z.
         track_slots: (T, 3) which offset moves each track: of a segment the offset, of an arc x, y and radius.
             These three are empty where nothing moves at all.
         slopes: (Q, D) by how much a dimension moves each of the Q offsets: the numbers' own, and those of features that
@@ -204,8 +206,8 @@ EXACT = Structure(
     (),
     np.empty(0),
     np.empty(0),
-    np.empty((0, 2 + len(WARP)), dtype=np.int32),
-    np.empty((0, len(WARP))),
+    np.empty((0, 3 + len(WARP)), dtype=np.int32),
+    np.empty((0, 1 + len(WARP))),
     np.empty((0, 3), dtype=np.int32),
 )
 """All targets as drawn."""
@@ -251,13 +253,16 @@ def _tolerated(name: str, target: Target, tolerances: Mapping[str, Tolerance]) -
     for curve_name, curve in target.curves.items():
         sigma_m = tolerance.curve_m.get(curve_name, tolerance.lines_m)
         yield from ((f"{name}/{curve_name}{part}", sigma_m) for part in _parts_of(curve))
-    if tolerance.warp_m > 0.0 and not target.bows:
+    if max(tolerance.warp_m, tolerance.heights_m) > 0.0 and not target.bows:
         raise InputError(
-            f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"
+            "a warp or heights are for checkerboards and boards like them: "
+            f"target {name!r}, of kind {target.kind!r}, does not bow"
         )
     yield from ((f"{name}/{part}", tolerance.warp_m) for part in WARP)
     for point_name in target.points:
         yield from ((f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy")
+    if tolerance.heights_m > 0.0:
+        yield from ((f"{name}/{point_name}.z", tolerance.heights_m) for point_name in target.points)
 
 
 def _parts_of(curve: Curve) -> tuple[str, ...]:
@@ -276,10 +281,11 @@ def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Ind
         track_slots += curves * 3  # the paint's centre and both edges move together
         warp = [place.get(f"{name}/{part}", none) for part in WARP]
         for point_name in target.points:
-            point_slots.append([place.get(f"{name}/{point_name}.{axis}", none) for axis in "xy"] + warp)
+            x, y, z = (place.get(f"{name}/{point_name}.{axis}", none) for axis in "xyz")
+            point_slots.append([x, y, *warp, z])
         bends.append(bends_of(target))
     return (
-        np.array(point_slots, dtype=np.int32).reshape(-1, 2 + len(WARP)),
+        np.array(point_slots, dtype=np.int32).reshape(-1, 3 + len(WARP)),
         np.concatenate(bends),
         np.array(track_slots, dtype=np.int32).reshape(-1, 3),
     )
@@ -295,7 +301,9 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
     for place, name in enumerate(targets):
         own = structure.point_slots[points[place] : points[place + 1]]
         tracks = structure.track_slots[curves[place] : curves[place + 1]]
-        kinds: tuple[tuple[Kind, Indices32], ...] = (("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:]))
+        kinds: tuple[tuple[Kind, Indices32], ...] = (
+            ("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:-1]), ("heights", own[:, -1:])
+        )  # fmt: skip
         every = {
             (name, kind): distinct(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)
             for kind, slots in kinds
@@ -305,16 +313,17 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
 
 
 def bends_of(target: Target) -> Array:
-    """(N, W) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a side,
-    x (1 - x^2) and y (1 - y^2) with 1 as their largest; 0 where it does not bow.
+    """(N, W + 1) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a
+    side, x (1 - x^2) and y (1 - y^2) with 1 as their largest, and 1 for a height; 0 where it does not bow.
     """
     if not target.bows or not target.points:
-        return np.zeros((len(target.points), len(WARP)))
+        return np.zeros((len(target.points), len(WARP) + 1))
     flat = target.point_array[:, :2]
     half = 0.5 * np.ptp(flat, axis=0)
     across = (flat - flat.min(axis=0) - half) / half
     bows = 1.0 - across**2
-    return np.column_stack([bows, across[:, 0] * across[:, 1], 1.5 * np.sqrt(3.0) * across * bows])
+    waves = 1.5 * np.sqrt(3.0) * across * bows
+    return np.column_stack([bows, across[:, 0] * across[:, 1], waves, np.ones(len(flat))])
 
 
 _STEP = 1e-3  # of a dimension: features move in proportion
