@@ -60,14 +60,14 @@ def wrapped(geometry: Mapping[str, Any]) -> bytes:
     return to_bytes("SSL_WrapperPacket", {"geometry": dict(geometry), "source": "SSL_SOURCE_OTHER"})
 
 
-def publish(packet: bytes, group: Group, times: int | None = None) -> int:
+def publish(packet: bytes, group: Group, times: int | None = None, period_s: float = 3.0) -> int:
     """Send a packet so many times, without end where None; how often it was sent. What ends it early learns of it by
     `base.written`.
 
     Raises:
         InputError: the network does not take it.
     """
-    ttl, period_s = 1, 3.0  # it stays in the local network; between packets
+    ttl = 1  # stays in the local network
     sent = 0
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
