@@ -13,7 +13,7 @@ from itertools import chain
 from pathlib import Path
 
 from photos.auto import auto_rows, real_auto_rows
-from photos.disturbed import disturbed_rows, wrong_rows
+from photos.disturbed import KINDS, disturbed_rows, wrong_rows
 from photos.real_data import real_folder
 from photos.shared import shared_rows
 from photos.shots import floor_rows, line_figures, real_rows, rings_rows, speed_rows, start_rows
@@ -28,7 +28,7 @@ CASES = (
 )
 
 
-def cases(real: Path | None, picture: Path | None) -> dict[str, Callable[[int], Iterable[Row]]]:
+def cases(real: Path | None, picture: Path | None, kinds: Sequence[str]) -> dict[str, Callable[[int], Iterable[Row]]]:
     """By name; those of real photographs where these are."""
     own: dict[str, Callable[[int], Iterable[Row]]] = {
         "lines": lambda runs: line_figures(range(runs)),
@@ -37,7 +37,7 @@ def cases(real: Path | None, picture: Path | None) -> dict[str, Callable[[int], 
         "auto": lambda runs: chain(auto_rows(runs), real_auto_rows(real) if real is not None else ()),
         "speed": lambda runs: speed_rows(min(runs, 20)),
         "rings": lambda runs: rings_rows(min(runs, 20)),
-        "disturbed": disturbed_rows,
+        "disturbed": lambda runs: disturbed_rows(runs, kinds),
         "wrong": wrong_rows,
         "templates": lambda runs: template_rows(min(runs, 20)),
     }
@@ -52,6 +52,7 @@ def cases(real: Path | None, picture: Path | None) -> dict[str, Callable[[int], 
 def main(arguments: Sequence[str] | None = None) -> int:
     options = parser(__doc__, (200, "photographs of each case"), CASES)
     options.add_argument("--real", type=Path, default=os.environ.get("CERES_CAL_REAL"), help="folder of real images")
+    options.add_argument("--kind", nargs="+", choices=KINDS, default=[*KINDS], help="of disturbed ones (default all)")
     options.add_argument("--picture", type=Path, help="draw what was found in the real photograph into this file")
     given = options.parse_args(arguments)
     real = None if given.real is None else Path(given.real)
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SystemExit("the photographs of another renderer are not there: name their folder in CERES_CAL_SHARED")
     if real is None and {"real", "straight"} & set(given.case or ()):
         real = real_folder()
-    return measured(cases(real, given.picture), given)
+    return measured(cases(real, given.picture, given.kind), given)
 
 
 if __name__ == "__main__":

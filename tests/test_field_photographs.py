@@ -289,6 +289,37 @@ def test_a_miss_among_hits_is_listed(tmp_path: Path, shot: script.Shot) -> None:
     assert [view.frame for view in found.observations.views] == ["1", "3"]
 
 
+@pytest.fixture(scope="module")
+def small() -> disturbed.Taken:
+    """A small photograph, and the camera that took it."""
+    return disturbed.taken("plain", 0, FIELD)
+
+
+def test_another_place_is_told_apart(tmp_path: Path, small: disturbed.Taken) -> None:
+    """A camera that was moved, or another one: what most pictures show is kept, in any order."""
+    moved = cv2.warpAffine(small.image, np.array([[1.0, 0.0, 10.0], [0.0, 1.0, 0.0]]), small.image.shape[1::-1])
+    paths = [tmp_path / f"{name}.png" for name in ("moved", "first", "second")]
+    for path, image in zip(paths, (moved, small.image, small.image), strict=True):
+        cv2.imwrite(str(path), image)
+    found = detect_field(paths, FIELD, small.camera, options=FieldOptions(keep_start=True))
+    assert list(found.found) == [str(path) for path in paths[1:]]
+    assert "it shows the field 10 px from where 2 show it" in dict(found.missed)[str(paths[0])]
+
+
+def test_pictures_that_show_too_little_are_taken_together(tmp_path: Path, shot: script.Shot) -> None:
+    """Noise hides the lines in each of them."""
+    rng, options = np.random.default_rng(2), FieldOptions(keep_start=True)
+    paths = [tmp_path / f"{number}.png" for number in range(3)]
+    for path in paths:
+        noisy = shot.picture.image + rng.normal(0.0, 60.0, shot.picture.image.shape)
+        cv2.imwrite(str(path), np.clip(noisy, 0.0, 255.0).astype(np.uint8))
+    with pytest.raises(InputError, match="no field in any of 1 images"):
+        detect_field(paths[:1], FIELD, shot.camera, options=options)
+    found = detect_field(paths, FIELD, shot.camera, options=options)
+    assert list(found.found) == [f"{paths[0]} and 2 more, together"]
+    assert [view.frame for view in found.observations.views] == ["0"]
+
+
 def test_clicks_that_cannot_be(tmp_path: Path, shot: script.Shot) -> None:
     path, good = saved(shot, tmp_path), script.clicks(shot, 0).points
     with pytest.raises(InputError, match="4 points are needed to start from, not 3"):

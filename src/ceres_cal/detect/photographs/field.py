@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array32, Mask
-from ceres_cal.base.errors import InputError, NothingShownError, naming, or_none
+from ceres_cal.base.errors import CalibrationError, InputError, NothingShownError, attempt, naming, or_none
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
-from ceres_cal.detect.images import filled, negative, read_light
+from ceres_cal.detect.images import filled, negative, read_colour, read_light
 from ceres_cal.detect.lines import Lines
+from ceres_cal.detect.median import MOST_PICTURES, merged
 from ceres_cal.detect.photographs.candidates import prepare_search
 from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
@@ -33,6 +36,9 @@ from ceres_cal.scene.targets import Target
 TARGET_NAME = "field"
 # Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
 _ABOUT = 0.15
+_SAME_PLACE_PX = (
+    3.0  # of the field in two pictures, at the median of its lines: farther, the camera did not stand still
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,24 +119,32 @@ def detect_field(
                 f"no painted line lies elsewhere with another {prior.quantity}: it cannot be found, leave it out"
             )
     results: dict[str, SearchResult] = {}
-    last: Followed | None = None
-    darker: bool | None = None  # whether the lines are, where a picture told it
+    places: list[SearchResult] = []  # one for each that a camera stood at, where the last picture was taken first
+    elsewhere = isinstance(start, Auto)  # whether it is looked for at another place, too: once in vain is enough
     for number, path in enumerate(paths, start=1):
-        grey = _without(read_light(path), options.left_out, path)
-        tried: list[SearchResult] = []
-        for dark in [darker] if darker is not None else _signs(grey, is_near=isinstance(start, Camera)):
-            plane = negative(grey) if dark else grey
-            tried.append(_looked_for(plane, drawn, painted, start if last is None else last, (path, options)))
-            if tried[-1].followed is not None:
-                darker = dark
-                break
-        result = tried[0] if darker is None else tried[-1]
+        grey, where = _without(read_light(path), options.left_out, path), (path, options)
+        result = _looked_for(grey, drawn, painted, places or [start], where)
+        if result.followed is None and places and elsewhere:
+            # reads: "its lines were not found ...", where others show them
+            other = attempt(partial(_looked_for, grey, drawn, painted, [start], where), InputError)
+            elsewhere = isinstance(other, SearchResult) and other.followed is not None
+            result = other if isinstance(other, SearchResult) and elsewhere else result
         results[str(path)] = result
-        if result.followed is None and options.refused is not None:
-            options.refused(path, result)
-        last = result.followed or last
+        if result.followed is not None:
+            places = [result, *(one for one in places if _apart_px(one, result) > _SAME_PLACE_PX)]
         if progress is not None:
             progress(number, len(paths), path.name)
+    for path in takewhile(lambda path: results[str(path)].followed is None, paths if places else ()):
+        grey = _without(read_light(path), options.left_out, path)  # later ones told where it is
+        results[str(path)] = _looked_for(grey, drawn, painted, places, (path, options))
+    if not places and len(paths) > 1:
+        # reads: "no field in any of ... images"
+        together = attempt(partial(_together, paths, drawn, painted, start, options), InputError)
+        results = results if isinstance(together, CalibrationError) else together
+    results = _of_one_place(results)
+    for name, result in results.items():
+        if result.followed is None and options.refused is not None:
+            options.refused(Path(name), result)
     followed = {path: result.followed for path, result in results.items() if result.followed is not None}
     missed = tuple((path, result.reason) for path, result in results.items() if result.followed is None)
     if not followed:
@@ -144,6 +158,54 @@ def detect_field(
     lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
     priors = {(one.name, one.quantity): one for one in sorted((*every.priors, *lengths), key=lambda one: one.sigma)}
     return FieldDetections(replace(every, priors=tuple(priors.values())), followed, missed, searched)
+
+
+def _apart_px(one: SearchResult, other: SearchResult) -> float:
+    """How far the floor that one picture shows lies from there in another, px, at the median of its lines' places."""
+    if one.followed is None or other.followed is None:
+        return np.inf
+    pixels = other.followed.lines.pixels[other.followed.lines.found]
+    floor = other.followed.camera.locate(pixels)
+    there = one.followed.camera.project(np.column_stack([floor, np.zeros(len(floor))]))
+    return float(np.median(np.nan_to_num(np.linalg.norm(there - pixels, axis=1), nan=np.inf)))
+
+
+def _of_one_place(results: Mapping[str, SearchResult]) -> dict[str, SearchResult]:
+    """The same without pictures that show the field elsewhere than most of them do."""
+    groups: list[list[str]] = []
+    for path, result in results.items():
+        near = [own for own in groups if _apart_px(results[own[0]], result) < _SAME_PLACE_PX]
+        if result.followed is not None:
+            near[0].append(path) if near else groups.append([path])
+    most = max(groups, key=len, default=[])
+    said = "{:.0f} px from where {} {} it: taken by another camera, or after this one was moved: give it on its own"
+    kept = dict(results)
+    for path in (path for own in groups if own is not most for path in own):
+        away, shown = _apart_px(results[most[0]], results[path]), "shows" if len(most) == 1 else "show"
+        reason = f"it shows the field {said.format(away, Path(most[0]).name if len(most) == 1 else len(most), shown)}"
+        kept[path] = SearchResult(None, reason, seen=results[path].followed)
+    return kept
+
+
+def _together(
+    paths: Sequence[Path],
+    target: Target,
+    painted: tuple[str, ...],
+    start: Camera | Clicks | Auto,
+    options: FieldOptions,
+) -> dict[str, SearchResult]:
+    """The field in the one picture of all of them, each of which shows too little of it.
+
+    Raises:
+        InputError: they make no one picture, or that shows no field either.
+    """
+    one = merged((str(path), read_colour(path)) for path in paths[:: -(-len(paths) // MOST_PICTURES)])
+    name = f"{one.used[0]} and {len(one.used) - 1} more, together"
+    grey = _without(one.picture, options.left_out, Path(name))
+    result = _looked_for(grey, target, painted, [start], (Path(name), options))
+    if result.followed is None:
+        raise InputError(result.reason)
+    return {name: result, **{path: SearchResult(None, reason) for path, reason in one.left_out}}
 
 
 def _signs(grey: Array32, *, is_near: bool) -> Iterator[bool]:
@@ -192,14 +254,35 @@ def _looked_for(
     grey: Array32,
     target: Target,
     painted: tuple[str, ...],
-    start: Camera | Clicks | Auto | Followed,
+    starts: Sequence[Camera | Clicks | Auto | SearchResult],
     where: tuple[Path, FieldOptions],
 ) -> SearchResult:
-    """The field from where the last image showed it, or from the start that was given, or from none.
+    """The field, by lines that are lighter or darker than the floor, from the first start that leads to it.
 
     Args:
-        where: the image's path, and what observations are to be.
+        starts: what pictures before showed, or the one that was given. where: the image's path, and what observations
+            are to be.
     """
+    tried: list[SearchResult] = []
+    for start in starts:
+        at = start.followed if isinstance(start, SearchResult) else start
+        signs = [start.darker] if isinstance(start, SearchResult) else _signs(grey, is_near=isinstance(start, Camera))
+        for dark in signs:
+            one = _looked_from(negative(grey) if dark else grey, target, painted, at, where)
+            tried.append(replace(one, darker=dark))
+            if one.followed is not None:
+                return tried[-1]
+    return tried[0]
+
+
+def _looked_from(
+    grey: Array32,
+    target: Target,
+    painted: tuple[str, ...],
+    start: Camera | Clicks | Auto | Followed | None,
+    where: tuple[Path, FieldOptions],
+) -> SearchResult:
+    """The field from where another image showed it, or from the start that was given, or from none."""
     path, options = where
     lengths = _tracked(options.lengths)
     if isinstance(start, Auto):
@@ -210,6 +293,7 @@ def _looked_for(
                 if options.refused is not None:
                     options.refused(path, SearchResult(None, str(error), seen=error.seen))
                 raise
+    assert start is not None  # an image that showed it
     target = start.target if isinstance(start, Followed) else target
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))

@@ -72,6 +72,7 @@ class SearchResult:
         seen: the best candidate, where none is the field.
         ways: in how many ways the photograph can be taken for the field; 0: none was looked for, a start was given.
             chosen_by: what chose one of them: "facing", "before", or nothing, where there is but one.
+        darker: whether its lines were looked for as darker ones than the floor.
     """
 
     followed: Followed | None
@@ -79,6 +80,7 @@ class SearchResult:
     ways: int = 0
     chosen_by: str = ""
     seen: Followed | None = None
+    darker: bool = False
 
 
 def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -> SearchResult:
