@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rendering.paper import Footprints, dark_share
 from test_boards import CAMERA, ideal_picture, photograph, write
 from test_cli import Say, refused, say
 
@@ -16,7 +17,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.report.sheet import sheet_pdf
 from ceres_cal.scene.targets import Target, checkerboard, circle_grid, rings, ssl_field, target_from_spec
-from ceres_cal.scene.targets.target import Disc, Footprints
+from ceres_cal.scene.targets.target import Disc
 
 __all__ = ["say"]
 PLAIN = circle_grid(7, 5, 0.03, 0.02)
@@ -34,7 +35,7 @@ def seen(board: Target, tilt: float, turn: float = 0.2) -> tuple[Array, Array]:
     def paint(places: Array) -> Array:
         still = np.zeros_like(places)
         inside = np.all((places > paper.low_m) & (places < paper.high_m), axis=1)
-        dark = paper.dark(Footprints(places, still + 1e-9, still + 1e-9)) > 0.5
+        dark = dark_share(board, Footprints(places, still + 1e-9, still + 1e-9)) > 0.5
         return np.where(inside, np.where(dark, 0.0, 1.0), 0.4)
 
     return ideal_picture(camera, 1.0, paint), camera.project(board.point_array)
@@ -115,7 +116,7 @@ def test_what_is_printed_is_what_a_camera_sees(board: Target) -> None:
         else:
             inside = np.all((plane > shape.corner_m) & (plane < np.add(shape.corner_m, shape.side_m)), axis=1)
         printed[inside] = shape.is_dark
-    np.testing.assert_array_equal(printed, np.round(paper.dark(Footprints(plane, *steps))))
+    np.testing.assert_array_equal(printed, np.round(dark_share(board, Footprints(plane, *steps))))
 
 
 def test_a_large_sheet_is_drawn_by_its_shapes() -> None:

@@ -78,8 +78,7 @@ def test_rings_have_the_size_that_the_model_says() -> None:
     sheet = rings([0.05, 0.1, 0.15])
     posed = camera("radial-2-3").at(Pose.exp((0.1, -0.05, 0.2, 0.01, 0.02, 0.4)))
     canvas = blank_canvas(posed.image_size)
-    assert sheet.paper is not None
-    print_sheet(canvas, sheet.paper, posed)
+    print_sheet(canvas, sheet, posed)
     printed = (0.9 - averaged(canvas).astype(float)) / (0.9 - 0.06)
     areas = []
     for curve in sheet.curves.values():

@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from data.write_schemas import FOLDER
+from data.write_schemas import FOLDER, file_schemas
 from foreign_cases import over_field, with_lens
 
 from ceres_cal import Calibration, InputError, Observations
-from ceres_cal.formats.schema import file_schemas
 
 ROOT = Path(__file__).parents[1]
 

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from ceres_cal.base.files import write_json
-from ceres_cal.formats.schema import file_schemas
+from ceres_cal.calibration import CalibrationFile
+from ceres_cal.observations.files import ObservationsFile
 
 FOLDER = Path(__file__).parents[2] / "src/ceres_cal/schemas"
+
+
+def file_schemas() -> dict[str, dict[str, Any]]:
+    """Name of the shipped file -> schema: of calibrations and of observations."""
+    kinds = {"calibration": CalibrationFile, "observations": ObservationsFile}
+    schemas = {f"{name}.schema.json": msgspec.json.schema(kind) for name, kind in kinds.items()}
+    plain: dict[str, dict[str, Any]] = msgspec.json.decode(msgspec.json.encode(schemas))  # defaults are tuples
+    return plain
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -169,7 +169,7 @@ def _painted(scene: Scene, shown: Mapping[str, str | None], camera: Camera) -> t
         target = scene.targets[name]
         before = camera.at(camera.cam_from_world @ scene.world_from_target(placement))
         if target.paper is not None:
-            paper |= render.print_sheet(canvas, target.paper, before)
+            paper |= render.print_sheet(canvas, target, before)
         else:
             render.paint_curves(canvas, target, before)
     return canvas, paper

@@ -17,7 +17,8 @@ from ceres_cal.base.arrays import Array, Array32, Image8, Indices
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Curve, Segment, curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.target import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.target import Paper
+from rendering.paper import Footprints, dark_share, share_inside
 
 Canvas = Array32
 """(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""
@@ -163,16 +164,17 @@ def sheet_outline(paper: Paper) -> Array:
     return np.column_stack([border, np.zeros(len(border))])
 
 
-def print_sheet(canvas: Canvas, paper: Paper, camera: Camera) -> Image8:
-    """Print a sheet onto a canvas, and the mask (height, width) of the pixels it covers."""
+def print_sheet(canvas: Canvas, target: Target, camera: Camera) -> Image8:
+    """Print a target's sheet onto a canvas, and the mask (height, width) of the pixels it covers."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
-    border = camera.project(sheet_outline(paper))
+    assert target.paper is not None
+    border = camera.project(sheet_outline(target.paper))
     if not np.all(np.isfinite(border)):
         return mask
     fill(mask, border)
     for squares in _squares(mask, camera, 0.0):
-        canvas[squares.rows, squares.columns] = PAPER + (INK - PAPER) * paper.dark(squares)
+        canvas[squares.rows, squares.columns] = PAPER + (INK - PAPER) * dark_share(target, squares)
     return mask
 
 

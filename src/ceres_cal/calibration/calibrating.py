@@ -23,7 +23,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
-from ceres_cal.posterior.assess import is_possible, with_other_lenses
+from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import gather_priors
@@ -86,9 +86,11 @@ def calibrate(
             raise SolutionError(words or _OTHERWISE) from None
 
 
-def calibrate_near(camera: Camera, observations: Observations, options: Options) -> Calibration:
-    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be;
-    without what is then known of its numbers, where its phi is that of a lens.
+def calibrate_near(camera: Camera, observations: Observations, options: Options, *, knows: bool = True) -> Calibration:
+    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be.
+
+    Args:
+        knows: whether it is asked what is then known of its numbers: else phi may be anywhere along its valley.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -99,10 +101,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        found = _of_lens(start, observations, sights, options, Watched(knows=False))
-        if not is_possible(found.cameras[name]):  # phi ran along its valley, which what is known looks through
-            found = _of_lens(start, observations, sights, options, Watched())
-        return found.redrawn()
+        return _of_lens(start, observations, sights, options, Watched(knows=knows)).redrawn()
 
 
 def _measured(

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 FOLDS = 5
-MOST_OBSERVATIONS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +146,6 @@ def choose(
     options: Options,
     k: int = FOLDS,
     *,
-    most: int = MOST_OBSERVATIONS,
     progress: StepProgress | None = None,
     executor: Executor | None = None,
 ) -> Choice:
@@ -156,12 +154,13 @@ def choose(
     All candidates are judged on the same observations: those that the calibration with any of them keeps.
 
     Args:
-        most: of more observations, evenly spread frames and rows take part. progress: called before each lens.
+        progress: called before each lens.
         executor: over which lenses and folds go; the same choice whatever it is.
 
     Raises:
         InputError: fewer than two frames. DegenerateError: no candidate can be calibrated.
     """
+    most = 10_000  # observations: of more evenly spread frames and rows take part
     few = thinned(observations, most)
     if len(frames_of(few)[0]) < 2:
         raise InputError("cross-validation by frame needs at least two frames: a single one cannot be held out")

@@ -62,7 +62,7 @@ def wrapped(geometry: Mapping[str, Any]) -> bytes:
 
 def publish(packet: bytes, group: Group, times: int | None = None, period_s: float = 3.0) -> int:
     """Send a packet so many times, without end where None; how often it was sent. What ends it early learns of it by
-    `base.words`.
+    `base.written`.
 
     Raises:
         InputError: the network does not take it.

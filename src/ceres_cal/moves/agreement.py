@@ -265,11 +265,11 @@ def require_stations(calibration: Calibration, observations: Observations) -> No
 # ---- what differs ---------------------------------------------------------------------------------------------------
 
 
-def field_grids(targets: Mapping[str, Target], heights_m: Sequence[float] = HEIGHTS_M) -> list[FieldGrid]:
-    """The grid of the map over the field, at some heights; none without a field."""
+def field_grids(targets: Mapping[str, Target]) -> list[FieldGrid]:
+    """The grid of the map over the field, at HEIGHTS_M; none without a field."""
     if all(target.movable for target in targets.values()):
         return []
-    return [FieldGrid(height_m, *field_grid(targets)) for height_m in heights_m]
+    return [FieldGrid(height_m, *field_grid(targets)) for height_m in HEIGHTS_M]
 
 
 def change_of(

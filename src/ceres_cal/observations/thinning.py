@@ -7,7 +7,6 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Indices, distinct
 from ceres_cal.observations.observations import Observations
 
-FEWEST_FRAMES = 40
 MANY = 2_000_000
 """Observations of the world from which on a part decides, and the rest answers with sums."""
 
@@ -33,7 +32,7 @@ def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
 
 
-def thinned(observations: Observations, most: int, fewest_frames: int = FEWEST_FRAMES) -> Observations:
+def thinned(observations: Observations, most: int, fewest_frames: int = 40) -> Observations:
     """Evenly spread frames, and of these evenly spread observations, about `most` in all."""
     total = len(observations.points) + len(observations.curves)
     if total <= most:

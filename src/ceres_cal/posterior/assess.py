@@ -82,11 +82,11 @@ def assess(
     astray = problem  # with phi held of the cameras that went astray, while others are looked at
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         camera = estimate.cameras[name]
-        if is_possible(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
+        if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
         nodes = valleys[name] = valley(name, astray, estimate, _inflation(posterior, name))
         rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
-        if not is_possible(camera) or rise < width**2:
+        if not _is_lens(camera) or rise < width**2:
             estimate = _usual(name, nodes)
             astray = astray.holding(name, 0)
     if astray is not problem:
@@ -147,8 +147,7 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
     return along.with_information(lambda across: posterior.wider(across, scattered))
 
 
-def is_possible(camera: Camera) -> bool:
-    """Whether lenses have such a phi."""
+def _is_lens(camera: Camera) -> bool:
     unit = unit_px(camera)
     return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
 

@@ -9,7 +9,7 @@ moves on a target by `built`, the camera by `pose`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -269,10 +269,12 @@ def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
     return first, second
 
 
-def whole_structure(targets: Mapping[str, Target]) -> Structure:
-    """Everything that could be built otherwise than it is drawn."""
-    board, flat = Tolerance(1.0, 1.0, 1.0, 1.0), Tolerance(1.0, 1.0)
-    return make_structure(targets, {name: board if target.bows else flat for name, target in targets.items()})
+def whole_structure(targets: Mapping[str, Target], in_waves: Collection[str] | None = None) -> Structure:
+    """Everything that could be built otherwise than it is drawn; heights of the points of some boards, or of all."""
+    boards = {name for name, target in targets.items() if target.bows}
+    waves = boards if in_waves is None else boards & set(in_waves)
+    every = {name: Tolerance(1.0, 1.0, float(name in boards), float(name in waves)) for name in targets}
+    return make_structure(targets, every)
 
 
 def write_equations(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:

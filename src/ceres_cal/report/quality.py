@@ -99,22 +99,20 @@ class Seam(Struct, frozen=True, eq=False):
     measured: Disagreement
 
 
-def quality_of(calibration: Calibration, observations: Observations, diagnosis: Diagnosis | None = None) -> Quality:
+def quality_of(calibration: Calibration, observations: Observations) -> Quality:
     """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised. Where
     that fails, the verdict says so.
     """
     diagnosed = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
     observations = calibration.drawn_alike(observations)
     if not calibration.rounds:
-        return Quality(calibration, observations, diagnosis)
-    if diagnosis is None:
-        few = thinned(observations, diagnosed)
-        # reads: "Its residuals could not be judged, so nothing says whether the model is right: ..."
-        found = attempt(lambda: diagnose(calibration, few, new_data=few is not observations))
-        if isinstance(found, CalibrationError):
-            return Quality(calibration, observations, None, str(found))
-        diagnosis = found
-    return Quality(calibration, observations, diagnosis)
+        return Quality(calibration, observations, None)
+    few = thinned(observations, diagnosed)
+    # reads: "Its residuals could not be judged, so nothing says whether the model is right: ..."
+    found = attempt(lambda: diagnose(calibration, few, new_data=few is not observations))
+    if isinstance(found, CalibrationError):
+        return Quality(calibration, observations, None, str(found))
+    return Quality(calibration, observations, found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
-from ceres_cal.effects.evidence import AS_BUILT, LIKELY, RepeatedAmounts, agreement
+from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
@@ -247,17 +247,21 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
     structure, tolerances = whole_structure(observations.targets), problem.options.tolerances
     dimensions = problem.options.dimensions
     stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.solution.estimate.structure)
-    as_stated = structure.carrying(stated)
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
-        return Built((), as_stated)
+        return Built((), structure.carrying(stated))
     sights = _some(end.problem.sights, most_screened)
     equations, weights = _equations(stated, observations, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
-    # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved.
-    if not any(agreement(scores[:, numbers]) > _REPEATS for numbers in kinds.values()):
-        return Built((), as_stated)
+    repeat = {of for of, numbers in kinds.items() if agreement(scores[:, numbers]) > _REPEATS}
+    if not repeat:
+        return Built((), structure.carrying(stated))
+    # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved. But
+    # heights, as many as points, took up what a wrong floor left of eight views of a board: they repeat by themselves.
+    structure = whole_structure(observations.targets, {target for target, kind in repeat if kind == "heights"})
+    numbered = numbers_by_kind(structure, observations.targets)
+    kinds, as_stated = {of: numbered[of] for of in kinds if of in numbered}, structure.carrying(stated)
     equations, weights = _equations(stated, observations, end, _some(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
@@ -336,7 +340,7 @@ def _likely(
 ) -> Iterator[AsBuilt]:
     """The kinds that more likely scatter than not, each beside those of the others that do."""
     extents = {target: float(np.max(np.ptp(observations.targets[target].box, axis=0))) for target, _ in kinds}
-    priors = {of: AS_BUILT.times(extents[of[0]]) for of in kinds}
+    priors = {of: (HEIGHTS if of[1] == "heights" else AS_BUILT).times(extents[of[0]]) for of in kinds}
     sizes = repeats.sizes(kinds, priors)
     for target, kind in kinds:
         sigma, probability = sizes.get((target, kind), (0.0, 0.0))

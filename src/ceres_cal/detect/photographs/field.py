@@ -14,6 +14,7 @@ from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import CalibrationError, InputError, NothingShownError, attempt, naming, or_none
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
+from ceres_cal.base.threads import single_threaded_blas
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_colour, read_light
@@ -84,6 +85,7 @@ class FieldOptions:
     refused: Callable[[Path, SearchResult], None] | None = None
 
 
+@single_threaded_blas()
 def detect_field(
     images: Sequence[Path],
     target: Target,

@@ -315,7 +315,7 @@ class _Tracker:
         A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
         does so where nothing was measured.
         """
-        lines, fits = followed.lines, list[tuple[float, Calibration]]()
+        lines, fits = followed.lines, list[tuple[float, Calibration, Options]]()
         known = tuple(prior for prior in self.free.priors if prior.dimension)
         observations = self._observed(lines, followed.camera)
         near = followed.camera
@@ -325,18 +325,25 @@ class _Tracker:
                 continue  # a few lines do not tell a lens without a formula
             powers = (lens.trial_powers or ((),))[-1]
             own = Options(lens=kind, powers=powers, priors=known, as_built="as drawn")  # which is judged beside it
+            # The first one comes to rest where phi is usual, should its valley be open, and the others start there.
             # From square pixels lines of a stretched picture are taken out instead; one lens shows how it is stretched.
             for camera in [near] if fits else stretched:  # of which the first is as it is
                 if camera is not near and fits and fits[0][1].fit.curves > _KEPT * len(lines.found):
                     break
                 # quiet: where none fits these lines, they are judged as found
-                found = attempt(partial(calibrate_near, camera, observations, own))
+                found = attempt(partial(calibrate_near, camera, observations, own, knows=not fits))
                 if isinstance(found, Calibration):
-                    fits.append((found.fit.curve_scale * len(lines.found) / found.fit.curves, found))
+                    fits.append((found.fit.curve_scale * len(lines.found) / found.fit.curves, found, own))
             near = min(fits, key=lambda fit: fit[0])[1].station() if fits else near
-        if not fits:
+        order = sorted(fits, key=lambda fit: (fit[1].station().folds, fit[0]))
+        asked = (  # of where phi may be only the one that is taken: that takes longer
+            # quiet: the next one is taken
+            one if one.posterior is not None else attempt(partial(calibrate_near, one.station(), observations, own))
+            for _, one, own in order
+        )
+        best = next((one for one in asked if isinstance(one, Calibration)), None)
+        if best is None:
             return followed
-        best = min(fits, key=lambda fit: (fit[1].station().folds, fit[0]))[1]
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
         moved = moved_px(followed.camera, camera, lines.course.pixels)

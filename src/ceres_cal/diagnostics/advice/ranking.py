@@ -14,6 +14,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.shown import brief, text_of
+from ceres_cal.base.threads import single_threaded_blas
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.calibration import Calibration, Fit
@@ -87,6 +88,7 @@ class Advice:
 
 @checked
 @numerical("the advice")
+@single_threaded_blas()
 def advise(
     calibration: Calibration,
     station: str | None = None,

@@ -8,13 +8,11 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Curve, Segment
 from ceres_cal.scene.targets.target import (
     Disc,
-    Footprints,
     Grid,
     Paper,
     Square,
@@ -22,7 +20,6 @@ from ceres_cal.scene.targets.target import (
     TargetKind,
     from_arguments,
     require_size,
-    share_inside,
 )
 
 
@@ -52,27 +49,13 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
     paper = Paper(
         (-2.0 * grid.spacing_m, -2.0 * grid.spacing_m),
         ((grid.columns + 1) * grid.spacing_m, (grid.rows + 1) * grid.spacing_m),
-        partial(_dark_squares, grid),
         partial(_squares, grid),
     )
     return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper)
 
 
-def _dark_squares(grid: Grid, footprints: Footprints) -> Array:
-    """The square between "0,0" and "1,1" is dark, and so is, beyond the outer corners, one more square each way."""
-    sign, within = np.full(len(footprints.plane), 1.0), np.full(len(footprints.plane), 1.0)
-    for axis, count in enumerate((grid.columns, grid.rows)):
-        place = footprints.plane[:, axis] / grid.spacing_m
-        step = np.hypot(footprints.along_x[:, axis], footprints.along_y[:, axis]) / grid.spacing_m
-        line = np.round(place)
-        wave = 2.0 * share_inside(place - line, step) - 1.0
-        sign *= np.where(line % 2 == 0, wave, -wave)
-        within *= share_inside(place + 1.0, step) * share_inside(count - place, step)
-    return np.asarray(within * (0.5 + 0.5 * sign))
-
-
 def _squares(grid: Grid) -> Iterator[Square]:
-    """The dark ones of `_dark_squares`."""
+    """The dark ones: that between "0,0" and "1,1", and so on, one more each way beyond the outer corners."""
     for row, column in product(range(-1, grid.rows), range(-1, grid.columns)):
         if (row + column) % 2 == 0:
             yield Square((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
@@ -128,25 +111,9 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
     paper = Paper(
         (-border, -border),
         (float(flat[:, 0].max() + border), float(flat[:, 1].max() + border)),
-        partial(_dark_circles, size, 0.5 * float(diameter_m), asymmetric),
         partial(_discs, places, 0.5 * float(diameter_m)),
     )
     return Target(spec, places, {}, movable=True, bows=True, grid=None if asymmetric else size, paper=paper)
-
-
-def _dark_circles(grid: Grid, radius_m: float, asymmetric: bool, footprints: Footprints) -> Array:
-    """Of the two rows around a place the nearer circle decides: circles do not meet."""
-    step, x, y = (2.0 if asymmetric else 1.0), *(footprints.plane.T / grid.spacing_m)
-    offs = []
-    for below in (0.0, 1.0):
-        row = np.clip(np.floor(y) + below, 0, grid.rows - 1)
-        aside = row % 2 if asymmetric else 0.0
-        column = np.clip(np.round((x - aside) / step), 0, grid.columns - 1)
-        offs.append(np.column_stack([x - step * column - aside, y - row]) * grid.spacing_m)
-    away = np.array([np.hypot(off[:, 0], off[:, 1]) for off in offs])
-    off, nearest = np.where((away[0] <= away[1])[:, None], *offs), away.min(axis=0)
-    direction = off / np.maximum(nearest, 1e-12)[:, None]
-    return share_inside(radius_m - nearest, footprints.step_m(direction))
 
 
 def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) -> Iterator[Disc]:

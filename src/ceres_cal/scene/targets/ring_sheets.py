@@ -7,19 +7,16 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.target import (
     Disc,
-    Footprints,
     Paper,
     Square,
     Target,
     TargetKind,
     from_arguments,
-    share_inside,
 )
 
 
@@ -35,19 +32,8 @@ def rings(radii_m: Sequence[float]) -> Target:
         raise InputError(f"rings: radii_m must increase and be positive, not {radii}")
     arcs: dict[str, Curve] = {f"ring_{i}": Arc((0.0, 0.0, 0.0), r) for i, r in enumerate(radii, start=1)}
     border = 1.05 * radii[-1]
-    paper = Paper(
-        (-border, -border), (border, border), partial(_dark_rings, np.array(radii)), partial(_shapes, radii, border)
-    )
+    paper = Paper((-border, -border), (border, border), partial(_shapes, radii, border))
     return Target({"kind": "rings", "radii_m": radii}, {"centre": (0.0, 0.0, 0.0)}, arcs, movable=True, paper=paper)
-
-
-def _dark_rings(radii: Array, footprints: Footprints) -> Array:
-    """The disc inside the first ring is dark, and from then on every other ring."""
-    away = np.maximum(np.hypot(footprints.plane[:, 0], footprints.plane[:, 1]), 1e-12)
-    step = footprints.step_m(footprints.plane / away[:, None])
-    inner = np.searchsorted(0.5 * (radii[1:] + radii[:-1]), away)  # the nearest edge
-    outside = share_inside(away - radii[inner], step)
-    return np.where(inner % 2 == 0, 1.0 - outside, outside)
 
 
 def _shapes(radii: Sequence[float], border: float) -> Iterator[Square | Disc]:
