@@ -21,7 +21,7 @@ from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.images import light
 from ceres_cal.detect.lines import SPACING_PX, measure
 from ceres_cal.detect.photographs import Auto, Facing, detect_field
-from ceres_cal.detect.photographs.candidates import candidates, prepare_search
+from ceres_cal.detect.photographs.candidates import candidates, off_centre, prepare_search
 from ceres_cal.detect.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
 from ceres_cal.detect.photographs.follow import refine
 from ceres_cal.detect.photographs.grid import grid_of
@@ -314,3 +314,10 @@ def test_strokes_of_striped_floors_are_not_alone() -> None:
     ends = np.stack([np.column_stack([np.zeros(6), y]), np.column_stack([np.full(6, 24.0), y])], axis=1)
     strokes = Strokes(np.concatenate([ends, [[[300.0, 0.0], [300.0, 24.0]]]]), np.ones(7))
     assert np.allclose(alone(strokes, 45.0), 1.0 / (1.0 + np.array([2, 3, 4, 4, 3, 2, 0]) ** 2))
+
+
+def test_the_middle_of_the_lens_is_told_by_its_strokes() -> None:
+    """A part of a sensor: about its own quarter strokes are straighter than about the picture's middle."""
+    problem = prepare_search(light(disturbed.taken("cropped", 14, FIELD).image), FIELD, FIELD.curve_names)
+    centre = off_centre(problem).stroke_map.centre
+    assert np.allclose(centre, (0.28 * 780.0, 0.72 * 580.0))

@@ -34,7 +34,7 @@ def test_a_boundary_line_is_no_touch_line_though_a_camera_is_bent_to_it() -> Non
     """Four lines 10 px outside of the field's own are fitted as if they were those."""
     shot = disturbed.taken("boundary", 9, FIELD)
     start = replace(shot.camera, lens=Radial((0.0, 1.0e-6, 0.0, 1.4e-12), (2, 3, 4, 5)))
-    free = unknown_optics(start.image_size, start.phi, None)
+    free = unknown_optics(start, None)
     course = predict(FIELD, shot.camera, NAMES, 12.0, 20.0)
     aside = np.array([10.0 * (NAMES[number] in OUTER) for number in course.curve])
     middle = 0.5 * (np.array(start.image_size) - 1.0)

@@ -49,7 +49,7 @@ def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> Field
     offset = np.random.default_rng(3).normal(0.0, noise_px, len(course))
     every = np.ones(len(course), dtype=bool)
     lines = Lines(course, every, offset, np.full(len(course), noise_px), np.full(len(course), 50.0), 0.8, 1.0)
-    return as_built(lines, CAMERA, asked, unknown_optics(CAMERA.image_size, CAMERA.phi, None).priors)
+    return as_built(lines, CAMERA, asked, unknown_optics(CAMERA, None).priors)
 
 
 def moved(aside_m: dict[str, tuple[float, float]]) -> Target:
@@ -87,7 +87,7 @@ def test_lines_that_are_bent_as_by_no_lens_are_another_field_s() -> None:
     for wave_px, is_other in ((0.15, False), (1.0, True)):
         wave = wave_px * np.sin(course.pixels @ np.array([0.05, 0.04]))
         lines = Lines(course, every, wave, np.full(len(course), 0.1), np.full(len(course), 50.0), 0.8, 1.0)
-        built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA.image_size, CAMERA.phi, None).priors)
+        built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA, None).priors)
         assert built.is_other == is_other, built.misfit
         assert is_other == any("bent as by no lens" in words for words in built.words())
 

@@ -117,7 +117,7 @@ def _fitted(target: Target, shown: Shown, start: Camera, base: Camera, weighting
     """The camera that suits best what was shown, with as much of it free as that can tell."""
     wanted: tuple[str, ...] = next((names for least, names in reversed(_FREED) if shown.equations >= least), ())
     free = tuple(name for name in wanted if name in intrinsic_names(base.lens))
-    optics, hints = unknown_optics(base.image_size, base.phi, None), _hints(target, shown, base)
+    optics, hints = unknown_optics(base, None), _hints(target, shown, base)
     observed = observations_of(target, base.image_size, *NOTHING, hints)
     fitted = refit_camera(start, observed, free, optics.priors, weighting)
     return None if fitted is None else fitted[0]

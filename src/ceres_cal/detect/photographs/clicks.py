@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -113,21 +113,24 @@ def starts_from_clicks(
         shown = observations_of(target, image_size, *NOTHING, hints)
         refitted = (refit_camera(camera, shown) for camera in fitting)
         fitting = [one[0] if one is not None else camera for one, camera in zip(refitted, fitting, strict=True)]
-    return fitting, unknown_optics(image_size, phi, hints, lengths)
+    return fitting, unknown_optics(replace(fitting[0], phi=phi), hints, lengths)
 
 
-def unknown_optics(
-    image_size: tuple[int, int], phi: float, hints: PointHints | None, lengths: tuple[Prior, ...] = ()
-) -> FreeIntrinsics:
+def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prior, ...] = ()) -> FreeIntrinsics:
     """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are; and
     of lengths of the target.
+
+    Args:
+        camera: far from the middle of whose picture its principal point is about right.
     """
-    # A standard deviation of fy / fx where a picture was stretched one way.
-    stretch = 0.03
-    middle = 0.5 * (np.array(image_size) - 1.0)
+    # A standard deviation of fy / fx where a picture was stretched one way; and of the principal point, of the width.
+    stretch, off = 0.03, 0.04
+    size, centre = np.array(camera.image_size), 0.5 * (np.array(camera.image_size) - 1.0)
+    if np.any(np.abs(camera.principal_point - centre) > 3.0 * off * size):
+        centre, off = np.array(camera.principal_point), 2.0 * off
     priors = (
-        Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
-        Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
+        Prior("camera", CAMERA, "phi", (camera.phi,), (0.5 * camera.phi,)),
+        Prior("camera", CAMERA, "principal_point", tuple(centre), (off * size[0],) * 2),
         Prior("camera", CAMERA, "aspect", (1.0,), (stretch,)),
     )
     return FreeIntrinsics(_FREED, (*priors, *lengths), hints)

@@ -9,7 +9,15 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.photographs.candidates import BUDGET_S, FieldSearch, alike, candidates, narrowed, prepare_search
+from ceres_cal.detect.photographs.candidates import (
+    BUDGET_S,
+    FieldSearch,
+    alike,
+    candidates,
+    narrowed,
+    off_centre,
+    prepare_search,
+)
 from ceres_cal.detect.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.detect.photographs.facing import (
     Facing,
@@ -97,6 +105,16 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     """
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves, auto.lengths)
+    result = _search_about(problem, auto)
+    moved = off_centre(problem) if result.followed is None else problem
+    if moved is problem:
+        return result
+    about = _search_about(moved, auto)
+    return about if about.followed is not None else result
+
+
+def _search_about(problem: FieldSearch, auto: Auto) -> SearchResult:
+    """The same about one middle of the lens."""
     good, seen, reason = _looked(problem, problem, auto)
     if not good:
         good, other, against = _looked(problem, narrowed(problem), auto)
@@ -107,7 +125,7 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     if not good:
         return SearchResult(None, reason, seen=seen)
     best = max(good, key=likelihood)
-    problem = replace(problem, grid=grid_of(best.target, curves))
+    problem = replace(problem, grid=grid_of(best.target, problem.curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
     if problem.is_out_of_time:  # it may look alike in ways that nobody looked at
@@ -170,7 +188,7 @@ def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
     pixels = camera.project(target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
     hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
-    return unknown_optics(camera.image_size, camera.phi, hints, auto.lengths)
+    return unknown_optics(camera, hints, auto.lengths)
 
 
 # ---- which way round ------------------------------------------------------------------------------------------------

@@ -105,6 +105,11 @@ def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0)
     return chosen
 
 
+def best_score(ends: Array, weights: Array, own_share: float) -> float:
+    """How many of the strokes the best answer straightens, less what speaks against it: see `find_upright`."""
+    return max((one.share - _penalty(one) for one in find_upright(ends, weights, 1, own_share)), default=0.0)
+
+
 def _rotations() -> Array:
     """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
     rolls = np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))
