@@ -67,7 +67,8 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
     """
-    least_px, share, better = 0.3, 0.22, 0.5  # that is left; of the picture's size, from its middle; times as much left
+    least_sigmas, better = 5.0, 0.5  # that are left; times as much left
+    share = 0.22  # of the picture's size, from its middle
     start = _initialised(observations, sights, options)
     for name, size in observations.cameras.items():
         own = sights.numbers(camera=name)
@@ -75,21 +76,21 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
         known = {"principal_point", "cx", "cy"} & {*stated, *options.fixed}
         if known or any(sights.keys[number].placement is not None for number in own):
             continue
-        least, given = better * _left_px(observations, sights.take(own), start), options
-        for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_px else ():
+        least, given = better * _left(observations, sights.take(own), start), options
+        for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_sigmas else ():
             there = Prior("camera", name, "principal_point", (x * size[0], y * size[1]), (1.0, 1.0))
             moved = replace(given, priors=(*given.priors, there))
             other = attempt(partial(_initialised, observations, sights, moved))  # quiet: it is one of five
-            if isinstance(other, Start) and (left := _left_px(observations, sights.take(own), other)) < least:
+            if isinstance(other, Start) and (left := _left(observations, sights.take(own), other)) < least:
                 start, least, options = other, left, moved
     return start
 
 
-def _left_px(observations: Observations, sights: Sights, start: Start) -> float:
-    """The median of what a start leaves of all that these sights hold."""
-    left = residuals(observations, sights, start.estimate).lengths
-    rows = zip(left, (sights.point_rows, sights.curve_rows), strict=True)
-    return float(np.median(np.nan_to_num(np.concatenate([one[own] for one, own in rows]), nan=np.inf)))
+def _left(observations: Observations, sights: Sights, start: Start) -> float:
+    """The median of what a start leaves of all that these sights hold, in stated sigmas."""
+    points, curves = residuals(observations, sights, start.estimate).lengths
+    points, curves = points[sights.point_rows] / sights.sigma_px, curves[sights.curve_rows] / sights.curve_sigma_px
+    return float(np.median(np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)))
 
 
 def _initialised(observations: Observations, sights: Sights, options: Options) -> Start:
