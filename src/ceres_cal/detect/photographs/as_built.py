@@ -86,6 +86,12 @@ class FieldAsBuilt:
         elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
         return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
 
+    @property
+    def may_be_stretched(self) -> bool:
+        """Whether it looks like another field, if not surely: what a picture that was stretched one way makes of it."""
+        changes = [abs(length / self.drawn[name] - 1.0) for name, length in self.dimensions.items()]
+        return self.is_other or max(changes, default=0.0) > _OTHER
+
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""
         dimensions = [

@@ -74,7 +74,7 @@ def follow(
             again = tracker.refined(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
-    return best if best.is_field else tracker.stretched(best)
+    return best if best.is_field and not best.built.may_be_stretched else tracker.stretched(best)
 
 
 def approach(
@@ -121,7 +121,7 @@ def refine(
     """
     tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
     refined = tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
-    return refined if refined.is_field else tracker.stretched(refined)
+    return refined if refined.is_field and not refined.built.may_be_stretched else tracker.stretched(refined)
 
 
 @dataclass(frozen=True, eq=False)
