@@ -33,7 +33,7 @@ class Blur:
     Attributes:
         blur_px: (N,) standard deviation of a Gaussian, lens and pixel together. smear_px: (N,) how far beside it a
             camera that moved, or coma, smears them. stretch: the paint's width over what the target says. lean: (N,) of
-        the smear, to which end it holds more.
+            the smear, to which end it holds more.
     """
 
     blur_px: Array

@@ -108,12 +108,10 @@ def as_foreign(
 
 def loss_words(loss: ExportLoss) -> list[str]:
     """What is lost, a line each, for files that have room for it: on the field first, where it counts."""
-    field = [
+    lines = [
         f"{loss.station}: {rms:.3g} mm rms, {worst:.3g} mm at most, {at_height(height_m)}"
         for height_m, (rms, worst) in loss.field_mm.items()
     ]
-    shown = [] if loss.image_px is None else [loss.image_px]
-    return [
-        *field,
-        *(f"{loss.station}: {rms:.3g} px rms, {worst:.3g} px at most, over the image" for rms, worst in shown),
-    ]
+    if loss.image_px is not None:
+        lines.append("{}: {:.3g} px rms, {:.3g} px at most, over the image".format(loss.station, *loss.image_px))
+    return lines

@@ -37,9 +37,8 @@ from ceres_cal.scene.targets import Target
 TARGET_NAME = "field"
 # Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
 _ABOUT = 0.15
-_SAME_PLACE_PX = (
-    3.0  # of the field in two pictures, at the median of its lines: farther, the camera did not stand still
-)
+# Of the field in two pictures, at the median of its lines: farther, the camera did not stand still.
+_SAME_PLACE_PX = 3.0
 
 
 @dataclass(frozen=True, eq=False)

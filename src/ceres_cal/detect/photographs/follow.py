@@ -74,7 +74,7 @@ def follow(
             again = tracker.refined(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
-    return best if best.is_field and not best.built.may_be_stretched else tracker.stretched(best)
+    return tracker.stretched(best)
 
 
 def approach(
@@ -121,7 +121,7 @@ def refine(
     """
     tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
     refined = tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
-    return refined if refined.is_field and not refined.built.may_be_stretched else tracker.stretched(refined)
+    return tracker.stretched(refined)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +259,11 @@ class _Tracker:
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
     def stretched(self, other: Followed) -> Followed:
-        """What does not hold with square pixels, or the field in a picture that was stretched one way."""
+        """What is the field as drawn; what does not hold with square pixels, or the field in a picture that was
+        stretched one way.
+        """
+        if other.is_field and not other.built.may_be_stretched:
+            return other
         names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
         free = replace(self.free, names=("aspect", *names))
         anew = replace(self.lacking(other.lacks_wholly), free=free, reached=[])
