@@ -64,7 +64,7 @@ def test_the_heights_of_corners_are_solved_for() -> None:
         scene, observations = observed(Board(heights_m=1e-3), seed)
         as_built, drawn = calibrate(observations, BUILT), calibrate(observations, DRAWN)
         assert of_kind(as_built, "heights").sigma_m == pytest.approx(1e-3, rel=0.3)  # 0.81 to 0.99 measured
-        assert "above or below" in of_kind(as_built, "heights").words
+        assert "surface is uneven" in of_kind(as_built, "heights").words
         assert np.max(np.abs(sigmas_off(as_built, scene))) < 4.5  # 2.8 measured
         errors.append([abs(phi_of(one) - CAMERAS["camera"].phi) for one in (as_built, drawn)])
     assert np.mean(errors, axis=0)[0] < 0.4 * np.mean(errors, axis=0)[1]  # 0.23 measured

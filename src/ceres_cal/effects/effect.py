@@ -68,7 +68,7 @@ class AsBuilt:
         """What it says, without the target."""
         amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
         if self.kind == "heights":
-            return f"its points lie {amount} above or below it"
+            return f"its surface is uneven by {amount}"
         return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
 
 
