@@ -201,5 +201,5 @@ def join(*scenes: Scene) -> Scene:
         together("stations"),
         together("placements"),
         tuple(plan for scene in scenes for plan in scene.views),
-        next((scene.photography for scene in scenes if scene.photography is not None), None),
+        next((scene.photography for scene in scenes if scene.photography), {}),
     )
