@@ -147,10 +147,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             for name, station in scene.stations.items()
         },
         "placements": {
-            name: {
-                "translation_m": pose.translation.tolist(),
-                "rotation_vector": rotation_log(pose.rotation).tolist(),
-            }
+            name: {"translation_m": pose.translation.tolist(), "rotation_vector": rotation_log(pose.rotation).tolist()}
             for name, pose in scene.placements.items()
         },
         "views": [
