@@ -260,11 +260,7 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
 
 
 def _choose_phi(
-    sights: Sights,
-    homographies: Homographies,
-    unit: float,
-    options: Options,
-    priors: Sequence[Prior],
+    sights: Sights, homographies: Homographies, unit: float, options: Options, priors: Sequence[Prior]
 ) -> tuple[float, str]:
     """phi from r1 . r2 = 0 and |r1| = |r2| over all sights, with what is known beforehand, by a one-dimensional search.
 
