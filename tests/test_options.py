@@ -43,7 +43,6 @@ class Form:
     options: type[FormOptions] = FormOptions
 
 
-@dataclass(frozen=True, kw_only=True)
 class Every(QuietArguments):
     """One field of each kind."""
 

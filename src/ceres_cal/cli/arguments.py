@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -87,7 +86,6 @@ def frames_option() -> Any:
     return option("how many photographs to take out of a video, the sharpest of as many stretches", "N", 30)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ReportArguments(QuietArguments):
     """Of a command that may write what it made, and a page."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +28,6 @@ def _share(text: str) -> float:
     return value
 
 
-@dataclass(frozen=True, kw_only=True)
 class CheckArguments(InputArguments):
     """What is held against a calibration, and how sure the answer is to be."""
 

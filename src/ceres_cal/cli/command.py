@@ -1,6 +1,6 @@
 """What every command has: a name, arguments, and a document that it answers, for people or for scripts.
 
-The options of a command: fields of a frozen dataclass, each with its help, from which the parser is made.
+The options of a command: fields of a subclass of `Arguments`, each with its help, from which the parser is made.
 
 A field is made by `option`, `switch` or `argument`; its type says the rest: an argument that is a tuple takes any
 number, of a Literal one is chosen, and Path, int and float are read as such.
@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields
 from types import NoneType
-from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.lazy import LazyTable
@@ -67,14 +67,22 @@ def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
     return field(default_factory=dict, metadata={"forms": forms})
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arguments:
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+class _Fields:
+    """Makes each class below it a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
+
+
+class Arguments(_Fields):
     """What every command takes."""
 
     json: bool = switch("print one JSON object")
 
 
-@dataclass(frozen=True, kw_only=True)
 class QuietArguments(Arguments):
     """Of a command that shows how far it is."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, kw_only=True)
 class BoardArguments(QuietArguments, DetectArguments):
     """Photographs, and the board in them."""
 
@@ -138,7 +136,6 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-@dataclass(frozen=True, kw_only=True)
 class RingsArguments(DetectArguments):
     """A photograph of rings, and the rings."""
 

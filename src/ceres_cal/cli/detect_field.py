@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,16 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import images_and_videos
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import (
-    estimate_option,
-    not_painted_option,
-    output_option,
-    parse_estimates,
-    parse_names,
-    parse_numbers,
-    station_option,
-    timeout_option,
-)
+from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, argument, command, option, switch
 from ceres_cal.cli.files import finishing, json_object, read_target, require_observations_output
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
@@ -37,7 +27,6 @@ _CORNER = "TopLeftCorner=102,88"
 _FACING = "LeftGoalLine=top"
 
 
-@dataclass(frozen=True, kw_only=True)
 class FieldArguments(QuietArguments):
     """Photographs, the field in them, and where to start."""
 
@@ -71,16 +60,16 @@ class FieldArguments(QuietArguments):
         "NAME=SIDE",
         repeatable=True,
     )
-    estimate: tuple[str, ...] = estimate_option()
-    not_painted: str = not_painted_option("lines of the target that this field does not have")
+    estimate: tuple[str, ...] = arguments.estimate_option()
+    not_painted: str = arguments.not_painted_option("lines of the target that this field does not have")
     mask: Path | None = option("a picture of the same size: what is black in it is left out (hall, people)", "FILE")
     picture: Path | None = option("draw what was seen in the first photograph that is refused", "FILE")
     edges: bool = switch("both edges of each line instead of its middle")
     lines_only: bool = switch("no corners and crossings")
     camera: str | None = option("name of the camera; default: that of the calibration, or camera", "NAME")
-    station: str | None = station_option("name of the station, to start from and to write; default: likewise")
-    output: Path = output_option("the observations (.json or .npz)")
-    timeout: float | None = timeout_option()
+    station: str | None = arguments.station_option("name of the station, to start from and to write; default: likewise")
+    output: Path = arguments.output_option("the observations (.json or .npz)")
+    timeout: float | None = arguments.timeout_option()
 
 
 @command(
@@ -112,8 +101,8 @@ def _run(args: FieldArguments) -> Document:
         start=start,
         auto=args.auto,
         facing=dict(map(_facing, args.facing)),
-        not_painted=parse_names(args.not_painted),
-        estimate=parse_estimates(args.estimate, {"field": target}),
+        not_painted=arguments.parse_names(args.not_painted),
+        estimate=arguments.parse_estimates(args.estimate, {"field": target}),
         mask=args.mask,
         edges=args.edges,
         lines_only=args.lines_only,
@@ -191,7 +180,7 @@ def _corners(specs: Sequence[str]) -> Clicks:
     for spec in specs:
         where = f"--corner {spec!r}"
         name, equals, place = spec.partition("=")
-        numbers = parse_numbers(place, where) if equals else ()
+        numbers = arguments.parse_numbers(place, where) if equals else ()
         if len(numbers) != 2:
             raise InputError(f"{where}: write NAME=X,Y, such as {_CORNER}")
         if name.strip() in points:

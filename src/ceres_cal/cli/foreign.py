@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImportArguments(Arguments):
     """A file of another program."""
 
@@ -66,7 +64,6 @@ def _import(args: ImportArguments) -> Document:
 # ---- over the network -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
 class GroupArguments(Arguments):
     """Where the league's messages are."""
 
@@ -81,7 +78,6 @@ def _group(args: GroupArguments) -> Group:
     return Group(args.address, args.port, args.interface)
 
 
-@dataclass(frozen=True, kw_only=True)
 class PublishArguments(GroupArguments):
     """What is sent, and how often."""
 
@@ -117,7 +113,6 @@ def _publish(args: PublishArguments) -> Document:
     return Document((Section("published", [words], data), *losses(exported)))
 
 
-@dataclass(frozen=True, kw_only=True)
 class ListenArguments(GroupArguments):
     """What is written, and how long to wait for it."""
 
@@ -153,7 +148,6 @@ def _listen(args: ListenArguments) -> Document:
 # ---- targets --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
 class TargetsImportArguments(Arguments):
     """A file with a field in it."""
 

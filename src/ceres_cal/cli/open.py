@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from ceres_cal.cli.page.state import Sitting, State
 
 
-@dataclass(frozen=True, kw_only=True)
 class OpenArguments(Arguments):
     """What is looked at, and where results go."""
 

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ceres_cal.cli import files
 from ceres_cal.cli.arguments import PriorNames, ReportArguments, output_option, parse_names, parse_prior, prior_option
 from ceres_cal.cli.command import command, option, switch
-from ceres_cal.cli.files import (
-    read_calibration,
-    read_observations,
-    report_page,
-    report_photographs,
-    require_outputs,
-    write_results,
-)
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -25,7 +17,6 @@ if TYPE_CHECKING:
     from ceres_cal.detect.photographs import KnownDetections
 
 
-@dataclass(frozen=True, kw_only=True)
 class RefitArguments(InputArguments, ReportArguments):
     """What was seen after a move, and what may have changed."""
 
@@ -55,15 +46,15 @@ class RefitArguments(InputArguments, ReportArguments):
 def _run(args: RefitArguments) -> Document:
     images = photographs_in(args)
     # To replace the old calibration is what many want.
-    require_outputs(args, images or args.inputs)
-    calibration = read_calibration(args.calibration)
+    files.require_outputs(args, images or args.inputs)
+    calibration = files.read_calibration(args.calibration)
     detections = _photographed(args, calibration, images) if images else None
-    observations = read_observations(args.inputs) if detections is None else detections.require()
+    observations = files.read_observations(args.inputs) if detections is None else detections.require()
     from ceres_cal.moves.refit_plan import RefitOptions
     from ceres_cal.moves.refits import movements, refit
     from ceres_cal.report.quality import quality_of
 
-    photographs = report_photographs(args, observations, calibration, images)
+    photographs = files.report_photographs(args, observations, calibration, images)
     priors = tuple(parse_prior(spec, observations, PriorNames(("height_m",))) for spec in args.prior)
     result = refit(
         calibration,
@@ -74,14 +65,14 @@ def _run(args: RefitArguments) -> Document:
     )
     from ceres_cal.report.summary import calibration_sections
 
-    page, unmade = report_page(args, result, observations, photographs)
+    page, unmade = files.report_page(args, result, observations, photographs)
     answer = tuple(calibration_sections(quality_of(result, observations), args.inputs))
     about = result.refitted
     assert about is not None
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(calibration, result).items()}
     explained = {"what": about.what, "explanation": about.explanation, "moved": moves}
     first = Section("refit", about.explanation.split("; "), explained)
-    sections = (first, shown(detections), *answer, unmade, write_results(args, result.save, page))
+    sections = (first, shown(detections), *answer, unmade, files.write_results(args, result.save, page))
     return Document(sections, 1 if unmade.data else 0)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
 
 
-@dataclass(frozen=True, kw_only=True)
 class SimulateArguments(Arguments):
     """A scene, and where its observations go."""
 
