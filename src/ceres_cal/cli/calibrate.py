@@ -222,8 +222,8 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
         "terms": tuple(arguments.parse_names(args.terms)),
     }  # powers alone make radial
     lengths, drawn = arguments.parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
-    names = arguments.PriorNames(("height_m", "position_m"), (*Options(**parsed).intrinsic_names, "principal_point"))
-    priors = [arguments.parse_prior(spec, observations, names) for spec in args.prior]
+    owners = {"station": observations.stations, "camera": observations.cameras}
+    priors = arguments.parse_priors(args.prior, owners, Options(**parsed))
     priors += [one for one in lengths if not one.is_open or one.value[0] != drawn[one.dimension]]
     parsed |= {
         "priors": tuple(priors),

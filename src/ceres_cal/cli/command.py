@@ -36,6 +36,7 @@ def option(
     repeatable: bool = False,
     group: str = "",
     alone: str = "",
+    beside: tuple[str, ...] = (),
 ) -> Any:
     """A field that is an option, --like-this where its name is like_this.
 
@@ -43,18 +44,17 @@ def option(
         help: what it does; a function where that takes an import. Its default, where it has one, is added.
         flags: how it is typed, where otherwise. read: a value from its text, where its type does not say it.
         repeatable: whether it may be given again and again; the field is a tuple.
-        group: title in the help. alone: of options of the same word one may be given.
+        group: title in the help. alone: of options of the same word one may be given. beside: names of options of which
+            one has to be given, too.
     """
     given = {"flags": flags, "read": read, "repeatable": repeatable, "group": group, "alone": alone}
-    about = {"help": help, "metavar": metavar, **given}
+    about = {"help": help, "metavar": metavar, "beside": beside, **given}
     return field(default=() if repeatable and default is None else default, metadata=about)
 
 
-def switch(
-    help: str, default: bool | None = False, *, flags: tuple[str, ...] = (), group: str = "", alone: str = ""
-) -> Any:
-    """A field that is an option without a value, which makes it the contrary of its default."""
-    return option(help, default=default, flags=flags, group=group, alone=alone)
+def switch(help: str, default: bool | None = False, **about: Any) -> Any:
+    """A field that is an option without a value, which makes it the contrary of its default; about: see `option`."""
+    return option(help, default=default, **about)
 
 
 def argument(metavar: str, help: str | Callable[[], str], default: Any = REQUIRED) -> Any:
@@ -126,13 +126,17 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def given_of(args: Arguments, group: str) -> list[str]:
-    """The options of a group that were given, as they are typed."""
-    return [
-        flag(one.name)
-        for one in fields(args)
-        if one.metadata.get("group") == group and getattr(args, one.name) != one.default
-    ]
+def given(args: Arguments) -> dict[str, Mapping[str, Any]]:
+    """What was given, by name, with what was said of each where it is defined."""
+    return {one.name: one.metadata for one in fields(args) if getattr(args, one.name) != one.default}
+
+
+def _require_beside(args: Arguments) -> None:
+    """Raise InputError for an option without the one that it belongs to."""
+    every = given(args)
+    for name, about in every.items():
+        if (others := about.get("beside", ())) and every.keys().isdisjoint(others):
+            raise InputError(f"{flag(name)} needs {' or '.join(map(flag, others))}: give both, or leave it out")
 
 
 def _frozen(value: Any) -> Any:
@@ -240,7 +244,9 @@ class Command:
         """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
         parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
         self.fill(parser)
-        return filled(self.arguments, parser.parse_intermixed_args(arguments))
+        args = filled(self.arguments, parser.parse_intermixed_args(arguments))
+        _require_beside(args)
+        return args
 
     @property
     def about(self) -> dict[str, Any]:

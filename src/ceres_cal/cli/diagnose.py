@@ -23,8 +23,10 @@ class DiagnoseArguments(arguments.ReportArguments):
         "lens predicts best",
     )
     strict: bool = switch("exit with 1 for any finding, also one that does no harm")
-    folds: int = option("parts into which frames go for --held-out", "K", 5)
-    jobs: int = arguments.jobs_option("folds, for --held-out,", 1)
+    folds: int = option(
+        "parts into which frames go for --held-out", "K", 5, read=arguments.whole(2), beside=("held_out",)
+    )
+    jobs: int = arguments.jobs_option("folds, for --held-out,", 1, beside=("held_out",))
     false_alarms: float = option(
         "probability of any finding where nothing is wrong", "P", 0.01, read=arguments.number("--false-alarms")
     )
@@ -67,7 +69,5 @@ def _require_fitting(args: DiagnoseArguments) -> None:
     files.require_ending(args.output, "the table is", ".csv", ".json", ".npz")
     if not 0.0 < args.false_alarms < 1.0:
         raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms:g}")
-    if args.folds < 2:
-        raise InputError(f"--folds must be at least 2, not {args.folds}")
     if args.held_out and args.new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")

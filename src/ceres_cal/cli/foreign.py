@@ -11,7 +11,7 @@ from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
 from ceres_cal.cli.command import Arguments, argument, command, option, options_of, switch
 from ceres_cal.cli.export import format_options, import_forms, listed, losses
-from ceres_cal.cli.files import finishing, read_calibration, require_output
+from ceres_cal.cli.files import finishing, read_calibration, require_ending, require_output
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -130,8 +130,7 @@ def _listen(args: ListenArguments) -> Document:
     from ceres_cal.formats import geometry_content, received_geometry
 
     require_output(args.output, [])
-    if args.output.suffix not in (".json", ".pb", ".yml", ".yaml"):
-        raise InputError(f"{args.output}: a field is written as .json, .pb or .yml: give one of these endings")
+    require_ending(args.output, "a field is", ".json", ".pb", ".yml", ".yaml")
     heard = received_geometry(_group(args), args.seconds)
     if args.output.suffix == ".json":
         return _write_target(heard.field, args.output, heard.sender)

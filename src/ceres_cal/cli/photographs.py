@@ -11,7 +11,7 @@ from ceres_cal.base.images import image_files
 from ceres_cal.base.native import interruptibly
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
-from ceres_cal.cli.command import Arguments, QuietArguments, argument, option
+from ceres_cal.cli.command import Arguments, QuietArguments, argument
 from ceres_cal.cli.files import finishing, require_different, require_output
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
@@ -40,7 +40,7 @@ class DetectArguments(Arguments):
     """What `detect board` and `detect rings` share."""
 
     timeout: float | None = arguments.timeout_option()
-    camera: str = option("name of the camera", "NAME", "camera")
+    camera: str = arguments.camera_option()
     station: str | None = arguments.station_option("name of the station; default: that of the camera")
     output: Path = arguments.output_option("the observations (.json or .npz)")
 
