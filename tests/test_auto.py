@@ -1,7 +1,6 @@
 """The field without any start: strokes, how the camera looks, which way round, what is refused, and the command."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +10,7 @@ from photos import auto as auto_script
 from photos import disturbed as disturbed
 from photos import shots as script
 from rendering.photograph import photograph
+from rendering.photography import taken_as
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
@@ -175,7 +175,7 @@ def test_a_quarter_turn_that_looks_alike_too() -> None:
     optics = Camera((640, 480), 350.0, (320.0, 240.0), Radial((0.0, 0.0), (2, 3)))
     pose = overhead_pose(-0.1, 0.3, 1.6, 15.0, 4.0, 80.0)  # sees circle and cross only
     stations = {"overhead": Station("overhead", pose)}
-    scene = replace(field_scene(FIELD, {"overhead": optics}, stations), photography=script.varied(0))
+    scene = taken_as(field_scene(FIELD, {"overhead": optics}, stations), script.varied(0))
     picture = photograph(scene, "overhead", "0001", seed=3)
     near = script.Shot(scene, scene.camera_at("overhead"), FIELD, picture, True)
     with pytest.raises(InputError, match="alike in 4 ways"):  # only two of them by what the strokes tell alone

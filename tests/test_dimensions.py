@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from rendering.photograph import photograph
+from rendering.photography import Photography, taken_as
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import DegenerateError, InputError
@@ -35,7 +36,6 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import (
     Disturbance,
-    Photography,
     Scene,
     Station,
     board_scene,
@@ -162,7 +162,7 @@ def test_what_is_typed() -> None:
 @cache
 def picture() -> Image:
     photography = Photography(robots=3, carpet_texture=0.05)
-    return photograph(replace(scene(), photography=photography), "s", "0001", seed=1).image
+    return photograph(taken_as(scene(), photography), "s", "0001", seed=1).image
 
 
 def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:

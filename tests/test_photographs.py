@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rendering.album import take_album
 from rendering.photograph import frames, photograph
+from rendering.photography import Photography, photography_of, taken_as
 from rendering.render import SUBPIXELS, averaged, blank_canvas, fill, paint_curves, print_sheet
 from rendering.simulate_photographs import main as simulate_photographs
 from rendering.things import BALL_RADIUS_M, Ball, Robot, outline
@@ -26,7 +27,6 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
     BoardRanges,
-    Photography,
     Scene,
     Station,
     board_scene,
@@ -114,7 +114,7 @@ def tilted_field(how: Photography) -> Scene:
     scene = field_scene(
         ssl_field("B"), {"overhead": camera("radial-2-3")}, {"overhead": Station("overhead", pose)}, 2, spacing_m=0.02
     )
-    return replace(scene, photography=how)
+    return taken_as(scene, how)
 
 
 def test_what_falls_on_the_ground_and_how_the_camera_takes_it() -> None:
@@ -233,9 +233,9 @@ def test_scene_files_carry_photography() -> None:
     assert scene_from_json(scene_to_json(scene, disturbance), "scene")[0].photography == scene.photography
     data = scene_to_json(scene)
     with pytest.raises(InputError, match="photography: 'robotts' is unknown: there are blur_px"):
-        scene_from_json(data | {"photography": {"robotts": 1}}, "scene")
+        photography_of(scene_from_json(data | {"photography": {"robotts": 1}}, "scene")[0])
     with pytest.raises(InputError, match=r"wear is a share and at most 1, not 1\.5"):
-        scene_from_json(data | {"photography": {"wear": 1.5}}, "scene")
+        photography_of(scene_from_json(data | {"photography": {"wear": 1.5}}, "scene")[0])
 
 
 def test_command_writes_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -71,6 +71,8 @@ def test_swapped_pixels_of_boards_are_no_reason_for_distrust(case: Callable[[str
     assert phi.value == pytest.approx(800.0, abs=2.0 * phi.sd) and phi.sd < 3.0
     quality = quality_of(calibration, observations)
     assert quality.observed_px < 5.0 and judge_quality(quality).level != "no"  # 3.4 measured
+    (warning,) = calibration.warnings  # at (479, 638), the middle of a picture of 960 x 1280
+    assert "principal point lies 226 px from the middle" in warning and "is x, not y, the first?" in warning
 
 
 @pytest.mark.parametrize("share, off_px", [(0.0, 74.0), (0.0, 8.0), (0.2, 20.0)])

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from rendering.photograph import photograph
+from rendering.photography import Photography
 from scenes import RADIAL, camera, rings_and_field
 
 from ceres_cal.base.arrays import Array
@@ -18,7 +19,7 @@ from ceres_cal.detect.rings import RingsDetection, detect_rings
 from ceres_cal.observations import Observations, combine
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, rings
-from ceres_cal.simulate import Photography, Scene, built_in_scene, simulate
+from ceres_cal.simulate import Scene, built_in_scene, simulate
 
 RADII = tuple(i / 100 for i in range(1, 37))
 HARSH = Photography(blur_px=1.1, vignetting=0.4, unevenness=0.4, read_noise=4.0, jpeg_quality=80)

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from rendering.album import take_album
+from rendering.photography import Photography, taken_as
 
 import ceres_cal as cc
 from ceres_cal.calibration import Calibration
@@ -24,7 +24,6 @@ from ceres_cal.cli import main as ceres_cal
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.lens import Brown
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
-from ceres_cal.simulate.scene import Photography
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "honest.jpg"
 RADIAL, LENGTHS = "radial", ["--estimate", "length,width"]
@@ -37,7 +36,7 @@ HOW = Photography(robots=8, balls=1, shadows=1, wear=0.06, sun=0.4, strips=0.1, 
 
 def rendered(folder: Path) -> None:
     scene = field_scene(PAINTED, {"camera": TRUE}, {"camera": Station("camera", POSE)}, frames=4)
-    take_album(simulate(replace(scene, photography=HOW), seed=3), "jpg").write(folder)
+    take_album(simulate(taken_as(scene, HOW), seed=3), "jpg").write(folder)
 
 
 def calibrated(folder: Path, *how: str) -> Calibration:

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rendering.photograph import photograph
+from rendering.photography import taken_as
 from runner import Row
 
 from ceres_cal.base.errors import InputError
@@ -85,7 +86,7 @@ def take_view(name: str, view: Callable[[np.random.Generator], tuple[float, ...]
     pose = overhead_pose(x, y, height, *tilts, yaw)
     field = ssl_field("B")
     scene = field_scene(field, {"overhead": optics}, {"overhead": Station("overhead", pose)})
-    scene = replace(scene, photography=varied(seed))
+    scene = taken_as(scene, varied(seed))
     picture = photograph(scene, "overhead", "0001", seed=seed)
     return Shot(scene, scene.camera_at("overhead"), field, picture, seed % 2 == 0)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rendering.photograph import photograph
+from rendering.photography import Photography, taken_as
 from runner import Row, mean_and_error, over, root_and_error, script
 
 from ceres_cal.base.errors import CalibrationError
@@ -26,7 +27,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Photography, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
 
 CAMERA = Camera((1280, 960), 600.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 KNOWN = {
@@ -61,7 +62,7 @@ def photographed(seed: int, names: tuple[str, ...], folder: Path) -> tuple[dict[
     """The same through a rendered photograph, in which the field is found without a start."""
     rng = np.random.default_rng([12, seed])
     true = odd_field(names, rng, 0.08)
-    scene = replace(scene_of(true, rng), photography=Photography(robots=4, unevenness=0.15, carpet_texture=0.05))
+    scene = taken_as(scene_of(true, rng), Photography(robots=4, unevenness=0.15, carpet_texture=0.05))
     path = folder / f"{seed}.png"
     cv2.imwrite(str(path), photograph(scene, "s", "0001", seed=seed).image)
     open_ = tuple(Prior("target", "field", name, (FIELD.dimensions[name],), (np.inf,)) for name in names)

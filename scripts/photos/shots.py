@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rendering.photograph import Photograph, photograph
+from rendering.photography import Photography, taken_as
 from runner import Row
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
@@ -30,7 +31,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track, nearest_on_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, ssl_field
-from ceres_cal.simulate import Photography, Scene, Station, built_in_scene, field_scene, overhead_pose
+from ceres_cal.simulate import Scene, Station, built_in_scene, field_scene, overhead_pose
 
 LENSES: tuple[tuple[float, Lens], ...] = (
     (868.0, Radial((-5.2e-5, 6.1e-7), (2, 3))),
@@ -107,7 +108,7 @@ def take(seed: int) -> Shot:
     pose = overhead_pose(-2.27, -0.12, 4.02, tilt_x, tilt_y, 90.0 + rng.uniform(-5.0, 5.0))
     field = ssl_field("B")
     scene = field_scene(field, {"overhead": optics}, {"overhead": Station("overhead", pose)})
-    scene = replace(scene, photography=varied(seed))
+    scene = taken_as(scene, varied(seed))
     picture = photograph(scene, "overhead", "0001", seed=seed)
     return Shot(scene, scene.camera_at("overhead"), field, picture, seed % 2 == 0)
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 from rendering.photograph import photograph
+from rendering.photography import Photography, taken_as
 from runner import Row
 
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, tape_grid, targets_by_name
-from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
+from ceres_cal.simulate import Station, field_scene, overhead_pose
 from photos.auto import rows_for, searched, whole
 from photos.shots import LENSES, Shot, varied
 
@@ -65,7 +66,7 @@ def take_field(name: str, target: Target, seed: int) -> Shot:
     tilts = float(tilt * np.cos(direction)), float(tilt * np.sin(direction))
     pose = overhead_pose(float(middle[0]), float(middle[1]), scale * height, *tilts, yaw)
     scene = field_scene(target, {"overhead": optics}, {"overhead": Station("overhead", pose)})
-    scene = replace(scene, photography=floored(name, target, seed))
+    scene = taken_as(scene, floored(name, target, seed))
     picture = photograph(scene, "overhead", "0001", seed=seed)
     return Shot(scene, scene.camera_at("overhead"), target, picture, seed % 2 == 0)
 

@@ -15,9 +15,9 @@ from ceres_cal.base.files import make_folder, write_bytes
 from ceres_cal.detect.images import encoded
 from ceres_cal.observations import taken
 from ceres_cal.simulate.files import write_simulation
-from ceres_cal.simulate.scene import Photography
 from ceres_cal.simulate.simulation import Simulation, Truth
 from rendering.photograph import Photograph, frames, photograph
+from rendering.photography import photography_of
 
 FOLDER = "photographs"
 ENDINGS = ("png", "jpg")
@@ -63,7 +63,7 @@ def take_album(
     if ending not in ENDINGS:
         raise InputError(f"images are written as {' or '.join(ENDINGS)}, not as {ending!r}")
     scene, every = simulation.scene, frames(simulation.scene)
-    how = scene.photography or Photography()
+    how = photography_of(scene)
     taken = replace(how, jpeg_quality=0) if ending == "jpg" else how  # not compressed twice
     images, truth = {}, {}
     points = np.ones(len(simulation.observations.points), dtype=bool)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.scene.camera import Camera
-from ceres_cal.simulate.scene import Photography
+from rendering.photography import Photography
 
 _PERIOD_M, _SUNNY = (0.7, 2.0), (0.2, 0.6)  # of stripes of sun, and the share of it that is in the sun
 _STRIP_M, _SEAM_M, _SEAM = (0.8, 2.0), 0.012, (-0.5, 0.8)  # wide: strips and seams; how much brighter a seam is

@@ -12,9 +12,10 @@ from ceres_cal.base.arrays import Array, Array32, Image8, Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.simulate.scene import Photography, Scene
+from ceres_cal.simulate.scene import Scene
 from rendering import render
 from rendering.ground import Ground, ground_of
+from rendering.photography import Photography, photography_of
 from rendering.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
 
 Stretches = Mapping[str, tuple[tuple[float, float], ...]]
@@ -79,7 +80,7 @@ def photograph(
     Args:
         photography: the scene's own by default.
     """
-    how = photography or scene.photography or Photography()
+    how = photography or photography_of(scene)
     number = frames(scene).index((station, frame))
     rng = np.random.default_rng([seed, number])
     camera = scene.camera_at(station)

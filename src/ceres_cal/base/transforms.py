@@ -27,6 +27,13 @@ def skew(v: ArrayLike) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def skews(v: Array) -> Array:
+    """(K, 3, 3) of each of many, (K, 3)."""
+    zero = np.zeros(len(v))
+    x, y, z = v.T
+    return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
+
+
 def rotation_exp(rotation_vector: ArrayLike) -> Array:
     """Rotation matrix of a rotation vector (axis times angle, rad): Rodrigues' formula."""
     w = np.asarray(rotation_vector, dtype=float)

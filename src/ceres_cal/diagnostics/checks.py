@@ -4,11 +4,11 @@ not hold on new observations; and what a diagnosis is about.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ceres_cal.base.tails import log_chi2_tail, log_f_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words, Wrong
+from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import Selection
 from ceres_cal.effects.table.target import feature_of
@@ -171,64 +171,51 @@ class TestResults:
     rate: float
 
 
-class Check(ABC):
+class Check(NamedTuple):
     """A kind of finding that is no column over the equations.
 
     Attributes:
-        kind: its name. wrong: see `Finding`.
+        findings: those whose probability is at most the selection's level. tests: how many tests it makes of a case:
+            they share the rate of false alarms with the effects.
     """
 
-    kind: str
-    wrong: ClassVar[Wrong] = "observations"
-
-    @abstractmethod
-    def tests(self, case: DiagnosisCase) -> int:
-        """How many tests it makes: they share the rate of false alarms with the effects."""
-
-    @abstractmethod
-    def findings(self, tested: TestResults) -> Iterator[Finding]:
-        """Those whose probability is at most the selection's level."""
+    findings: Callable[[TestResults], Iterator[Finding]]
+    tests: Callable[[DiagnosisCase], int]
 
 
-class WrongLabel(Check):
-    """A label that stands for another feature, over all its frames."""
+def wrong_labels(tested: TestResults) -> Iterator[Finding]:
+    """Labels that stand for another feature, over all its frames."""
+    groups: dict[tuple[bool, str, int, int], list[Mislabelled]] = defaultdict(list)
+    for label in tested.case.labels:
+        if label.log_p <= tested.selection.log_level:
+            name = tested.case.observations.views[label.view].target
+            groups[label.is_curve, name, label.feature, label.instead].append(label)
+    for (_, target, _, _), labels in groups.items():
+        yield _wrong_label(tested, target, labels)
 
-    kind = "wrong label"
 
-    def tests(self, case: DiagnosisCase) -> int:
-        return case.labels_tried
-
-    def findings(self, tested: TestResults) -> Iterator[Finding]:
-        groups: dict[tuple[bool, str, int, int], list[Mislabelled]] = defaultdict(list)
-        for label in tested.case.labels:
-            if label.log_p <= tested.selection.log_level:
-                name = tested.case.observations.views[label.view].target
-                groups[label.is_curve, name, label.feature, label.instead].append(label)
-        for (_, target, _, _), labels in groups.items():
-            yield self._finding(tested, target, labels)
-
-    def _finding(self, tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
-        most_named = 5
-        observations, table, one = tested.case.observations, tested.case.table, labels[0]
-        described = observations.targets[target]
-        names = described.curve_names if one.is_curve else described.point_names
-        kind = "curve" if one.is_curve else "point"
-        rows = np.concatenate([label.rows for label in labels])
-        at = rows + (len(observations.points) if one.is_curve else 0)
-        frames = list(dict.fromkeys(observations.views[label.view].frame for label in labels))
-        listing = ", ".join(map(repr, frames[:most_named])) + (" ..." if len(frames) > most_named else "")
-        away = float(np.mean(np.concatenate([label.distance_px for label in labels])))
-        px, mm = _mean(np.abs(table.distance_px[at])), _mean(np.abs(table.error_mm[at]))
-        sentence = (
-            f"frame {listing}: {names[one.feature]!r} observed where {names[one.instead]!r} projects ({len(rows)} "
-            f"{kind} observation{'s' if len(rows) > 1 else ''}, {away:.2f} px from it)"
-        )
-        return Finding(
-            self.kind, self.wrong, f"{target}/{names[one.feature]}", frames[0], sentence,
-            "correct the label; it was taken out and did no harm", px, mm, px / away, (),
-            tested.selection.log10_p(min(label.log_p for label in labels)), len(rows),
-            tuple((kind, int(row)) for row in rows),
-        )  # fmt: skip
+def _wrong_label(tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
+    most_named = 5
+    observations, table, one = tested.case.observations, tested.case.table, labels[0]
+    described = observations.targets[target]
+    names = described.curve_names if one.is_curve else described.point_names
+    kind = "curve" if one.is_curve else "point"
+    rows = np.concatenate([label.rows for label in labels])
+    at = rows + (len(observations.points) if one.is_curve else 0)
+    frames = list(dict.fromkeys(observations.views[label.view].frame for label in labels))
+    listing = ", ".join(map(repr, frames[:most_named])) + (" ..." if len(frames) > most_named else "")
+    away = float(np.mean(np.concatenate([label.distance_px for label in labels])))
+    px, mm = _mean(np.abs(table.distance_px[at])), _mean(np.abs(table.error_mm[at]))
+    sentence = (
+        f"frame {listing}: {names[one.feature]!r} observed where {names[one.instead]!r} projects ({len(rows)} "
+        f"{kind} observation{'s' if len(rows) > 1 else ''}, {away:.2f} px from it)"
+    )
+    return Finding(
+        "wrong label", "observations", f"{target}/{names[one.feature]}", frames[0], sentence,
+        "correct the label; it was taken out and did no harm", px, mm, px / away, (),
+        tested.selection.log10_p(min(label.log_p for label in labels)), len(rows),
+        tuple((kind, int(row)) for row in rows),
+    )  # fmt: skip
 
 
 def _mean(values: Array) -> float:
@@ -236,31 +223,25 @@ def _mean(values: Array) -> float:
     return float(np.mean(known)) if len(known) else float("nan")
 
 
-class OfNoise(Check):
+def _of_noise(
+    kind: str, about: Callable[[Noise], tuple[float, float, Words]], tested: TestResults
+) -> Iterator[Finding]:
     """What the noise of points and of curves is like.
 
-    Attributes:
+    Args:
         about: of either, log P of as much by chance, px that it is of, and its words.
     """
-
-    def __init__(self, kind: str, about: Callable[[Noise], tuple[float, float, Words]]) -> None:
-        self.kind, self.about = kind, about
-
-    def tests(self, case: DiagnosisCase) -> int:
-        return 2
-
-    def findings(self, tested: TestResults) -> Iterator[Finding]:
-        case = tested.case
-        for noise in tested.noise:
-            log_p, px, words = self.about(noise)
-            if log_p <= tested.selection.log_level:
-                rows = case.model.used & (case.equations.is_curve == (noise.kind == "curves"))
-                all_px, all_mm, _ = case.effect(case.equations.residual, rows)
-                mm = px * all_mm / all_px if all_px > 0.0 else float("nan")
-                yield Finding(
-                    self.kind, self.wrong, noise.kind, None, words.sentence, words.advice, px, mm, px / noise.sigma_px,
-                    words.amounts, tested.selection.log10_p(log_p), noise.observations,
-                )  # fmt: skip
+    case = tested.case
+    for noise in tested.noise:
+        log_p, px, words = about(noise)
+        if log_p <= tested.selection.log_level:
+            rows = case.model.used & (case.equations.is_curve == (noise.kind == "curves"))
+            all_px, all_mm, _ = case.effect(case.equations.residual, rows)
+            mm = px * all_mm / all_px if all_px > 0.0 else float("nan")
+            yield Finding(
+                kind, "observations", noise.kind, None, words.sentence, words.advice, px, mm, px / noise.sigma_px,
+                words.amounts, tested.selection.log10_p(log_p), noise.observations,
+            )  # fmt: skip
 
 
 def larger(noise: Noise) -> tuple[float, float, Words]:
@@ -286,47 +267,42 @@ def correlated(noise: Noise) -> tuple[float, float, Words]:
     return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))
 
 
-class DoesNotHold(Check):
+def does_not_hold(tested: TestResults) -> Iterator[Finding]:
     """A refit to new observations would fit them better than chance explains.
 
     The gain of a refit is chi-square where the calibration is exact; its own uncertainty adds as much again for every
     time that the new observations are as many as those it was made from. That holds where both see the same part of the
     image: what is new at places that the calibration never saw is held against it.
     """
-
-    kind = "does not hold"
-    wrong: ClassVar[Wrong] = "calibration"
-
-    def tests(self, case: DiagnosisCase) -> int:
-        return 1
-
-    def findings(self, tested: TestResults) -> Iterator[Finding]:
-        case, model = tested.case, tested.case.model
-        step, used = model.step, model.used
-        if case.calibration is None or not len(step):
-            return
-        own = 2 * case.calibration.fit.points + case.calibration.fit.curves
-        inflation = 1.0 + np.count_nonzero(used) / max(own, 1)
-        left = model.left_over
-        variance = float(left @ left) / max(model.spare, 1)
-        statistic = float(step @ step) / (inflation * len(step) * variance)
-        log_p = float(log_f_tail(statistic, len(step), max(model.spare, 1)))
-        if log_p > tested.selection.log_level:
-            return
-        px, mm, count = case.effect(np.where(used, (model.shared @ step) / model.weight, 0.0), used)
-        sentence = (
-            "the calibration does not hold on these observations: a refit would move it by "
-            f"{px:.2f} px, {mm:.1f} mm rms"
-        )
-        yield Finding(
-            self.kind, self.wrong, ", ".join(case.observations.stations), None, sentence,
-            "find out with `ceres-cal check` whether the camera was moved, and refit", px, mm,
-            px / case.noise_px(left, used), (), tested.selection.log10_p(log_p), count,
-        )  # fmt: skip
+    case, model = tested.case, tested.case.model
+    step, used = model.step, model.used
+    if case.calibration is None or not len(step):
+        return
+    own = 2 * case.calibration.fit.points + case.calibration.fit.curves
+    inflation = 1.0 + np.count_nonzero(used) / max(own, 1)
+    left = model.left_over
+    variance = float(left @ left) / max(model.spare, 1)
+    statistic = float(step @ step) / (inflation * len(step) * variance)
+    log_p = float(log_f_tail(statistic, len(step), max(model.spare, 1)))
+    if log_p > tested.selection.log_level:
+        return
+    px, mm, count = case.effect(np.where(used, (model.shared @ step) / model.weight, 0.0), used)
+    sentence = (
+        f"the calibration does not hold on these observations: a refit would move it by {px:.2f} px, {mm:.1f} mm rms"
+    )
+    yield Finding(
+        "does not hold", "calibration", ", ".join(case.observations.stations), None, sentence,
+        "find out with `ceres-cal check` whether the camera was moved, and refit", px, mm,
+        px / case.noise_px(left, used), (), tested.selection.log10_p(log_p), count,
+    )  # fmt: skip
 
 
-_EVERY = (WrongLabel(), OfNoise("noise", larger), OfNoise("correlated", correlated), DoesNotHold())
-CHECKS: dict[str, Check] = {one.kind: one for one in _EVERY}
+CHECKS = {
+    "wrong label": Check(wrong_labels, lambda case: case.labels_tried),
+    "noise": Check(partial(_of_noise, "noise", larger), lambda case: 2),
+    "correlated": Check(partial(_of_noise, "correlated", correlated), lambda case: 2),
+    "does not hold": Check(does_not_hold, lambda case: 1),
+}
 
 
 def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:

@@ -21,6 +21,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.effects.strands import StrandFamily, decay
+from ceres_cal.observations import joined
 
 ASIDE = 20.0
 """Times the longest strand: the length of what moves it as a whole."""
@@ -104,7 +105,7 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
                 parts.append(part)
                 best = max(best, float(part.log.max()))
                 falls = bool(part.log[-1] < min(best - nothing, part.log[-2]))
-    return Likelihoods(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+    return joined(parts)
 
 
 def _lengths(family: StrandFamily) -> list[float]:

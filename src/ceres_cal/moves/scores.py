@@ -29,11 +29,7 @@ from ceres_cal.start.world import chained_poses
 @checked
 @numerical("the score")
 def score(
-    calibration: Calibration,
-    observations: Observations,
-    *,
-    options: Options | None = None,
-    hold_stations: bool = False,
+    calibration: Calibration, observations: Observations, *, options: Options | None = None, hold_stations: bool = False
 ) -> Agreements:
     """How well new observations of fields or boards agree with a calibration: poses alone are solved for.
 

@@ -11,6 +11,7 @@ from ceres_cal.observations.columns import Curves as Curves
 from ceres_cal.observations.columns import Points as Points
 from ceres_cal.observations.columns import Prior as Prior
 from ceres_cal.observations.columns import View as View
+from ceres_cal.observations.columns import joined as joined
 from ceres_cal.observations.columns import prior_from_json as prior_from_json
 from ceres_cal.observations.columns import prior_to_json as prior_to_json
 from ceres_cal.observations.columns import taken as taken

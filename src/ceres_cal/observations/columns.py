@@ -161,6 +161,11 @@ def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
     return type(columns)(**{name: _taken(column, rows) for name, column in vars(columns).items()})
 
 
+def joined(parts: Sequence[C]) -> C:
+    """Columns of one kind, one after the other."""
+    return type(parts[0])(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+
+
 def _taken(column: AnyArray, rows: Indices | Indices32 | Mask) -> AnyArray:
     """Rows of a column; of one in a file, where they lie side by side, without mapping what is around them."""
     most_runs = 10_000  # of rows side by side that are read one by one

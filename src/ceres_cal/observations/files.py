@@ -212,10 +212,7 @@ def _concatenate(parts: Sequence[Any], dtype: Any) -> AnyArray:
 
 
 def _columns(
-    entries: Sequence[tuple[int, _PointsFile]],
-    views: Sequence[View],
-    index: Mapping[str, Mapping[str, int]],
-    kind: str,
+    entries: Sequence[tuple[int, _PointsFile]], views: Sequence[View], index: Mapping[str, Mapping[str, int]], kind: str
 ) -> dict[str, Any]:
     """The columns of all views' features; InputError naming the view and the feature."""
     view, feature, sigma = [], [], []

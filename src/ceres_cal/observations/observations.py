@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,11 +26,11 @@ from ceres_cal.observations.columns import (
     Alone,
     Columns,
     Curves,
-    Points,
     Prior,
     View,
     each_block,
     in_blocks,
+    joined,
     taken,
     view_label,
 )
@@ -369,18 +368,14 @@ def combine(parts: Sequence[Observations]) -> Observations:
         for name, size in part.cameras.items():
             if cameras.setdefault(name, size) != size:
                 raise InputError(f"camera {name!r} has image sizes {cameras[name]} and {size}: these are two cameras")
-    starts = np.cumsum([0, *(len(part.views) for part in parts)])
-
-    def joined(columns: Sequence[Any]) -> dict[str, Any]:
-        moved = [replace(c, view=(c.view + start).astype(np.int32)) for c, start in zip(columns, starts, strict=False)]
-        return {name: np.concatenate([getattr(c, name) for c in moved]) for name in vars(columns[0])}
-
+    starts = np.cumsum([0, *(len(part.views) for part in parts)], dtype=np.int32)
+    each = list(zip(parts, starts[:-1], strict=True))
     return Observations(
         targets,
         cameras,
         tuple(view for part in parts for view in part.views),
-        Points(**joined([part.points for part in parts])),
-        Curves(**joined([part.curves for part in parts])),
+        joined([replace(part.points, view=part.points.view + start) for part, start in each]),
+        joined([replace(part.curves, view=part.curves.view + start) for part, start in each]),
         tuple(dict.fromkeys(prior for part in parts for prior in part.priors)),
     )
 

@@ -116,10 +116,7 @@ class Sights(Sequence["Sights"]):
         return tuple(dict.fromkeys(map(itemgetter(0), self.keys)))
 
     def numbers(
-        self,
-        camera: str | None = None,
-        station: str | None = None,
-        placements: Container[str | None] | None = None,
+        self, camera: str | None = None, station: str | None = None, placements: Container[str | None] | None = None
     ) -> Indices:
         """Numbers of the sights of this camera, station and these placements; None asks for nothing."""
         numbers = [

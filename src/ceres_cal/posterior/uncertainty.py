@@ -315,12 +315,7 @@ class Uncertainty:
         return image_map(self.estimate, self.posterior, camera)
 
     def seam_sd_mm(
-        self,
-        first: str,
-        second: str,
-        height_m: float = 0.0,
-        x_m: ArrayLike | None = None,
-        y_m: ArrayLike | None = None,
+        self, first: str, second: str, height_m: float = 0.0, x_m: ArrayLike | None = None, y_m: ArrayLike | None = None
     ) -> FieldMap:
         """By how much two stations may disagree about places that both see.
 

@@ -201,11 +201,7 @@ class Lengths(Protocol):
 
 
 def noise_of(
-    points: Lengths,
-    curves: Lengths,
-    redundancy: Redundancy,
-    options: Options,
-    usual: tuple[float, float] | None = None,
+    points: Lengths, curves: Lengths, redundancy: Redundancy, options: Options, usual: tuple[float, float] | None = None
 ) -> NoiseScales:
     """The noise that lengths show; see `judge`."""
     if options.noise_scale == "stated":

@@ -56,13 +56,15 @@ class Explanation:
     Attributes:
         name: of the group. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
             lies aside, the median. log_odds: natural logarithm of the odds that it does not belong.
-        instead: what the next best explanation says. other: the estimate of the less probable one of the two.
+        remedy: what to look at. instead: what the next best explanation says. other: the estimate of the less
+            probable one of the two.
     """
 
     name: str
     rows: Mask
     aside_px: float
     log_odds: float
+    remedy: str
     instead: str
     other: Estimate
 
@@ -90,7 +92,7 @@ class Explanation:
     def warning(self) -> str:
         """What to know before the calibration is used."""
         if not self.is_doubtful:
-            return f"{self.words}: taken out together; check the label, and where it is painted"
+            return f"{self.words}: taken out together; {self.remedy}"
         where = f"{self.name} may be {two_digits(self.aside_px)} px off its nominal position"
         sure = f"probability {100.0 * (1.0 - self.doubt if self.is_taken else self.doubt):.0f} %"
         how = "taken out together" if self.is_taken else "used"
@@ -286,7 +288,7 @@ class _Competition:
                 rivals = self._without(groups, tuple(rival if one == number else one for one in numbers))
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
             aside_px = float(medians_known(lengths[own]))
-            explanations.append(Explanation(groups.name(number), own, aside_px, odds, instead, other))
+            explanations.append(Explanation(groups.name(number), own, aside_px, odds, groups.remedy, instead, other))
         rows = groups.among(np.array(numbers)) & self._taking_part
         least = min(one.log_odds for one in explanations)
         return _Trial(suspects, without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))

@@ -35,7 +35,8 @@ class ObservationGroups(ABC):
     of which nothing was observed.
 
     Attributes:
-        kind: of the effect. prior: of one that lies aside. most_views: that are compared with one another.
+        kind: of the effect. prior: of one that lies aside. most_views: that are compared with one another. remedy: what
+            to look at where one does not belong.
         observations: all of them. of: (N + M,) number of the group of each, points by row and then curves by row; -1
             for none. size: how many numbers there are. frames: (V,) how many go with each view.
     """
@@ -43,6 +44,7 @@ class ObservationGroups(ABC):
     kind: ClassVar[str]
     prior: ClassVar[SizePrior]
     most_views: ClassVar[int]
+    remedy: ClassVar[str]
     observations: Observations
     of: Indices32
     size: int
@@ -92,6 +94,7 @@ class FeatureGroups(ObservationGroups):
     kind = "feature aside"
     prior = FEATURE_ASIDE
     most_views = 8
+    remedy = "check the label, and where it is painted"
 
     def modes(self, equations: Equations, group: Indices) -> Array:
         every = np.zeros((len(equations), 3))
@@ -124,6 +127,7 @@ class ViewGroups(ObservationGroups):
     kind = "view aside"
     prior = VIEW_ASIDE
     most_views = 24
+    remedy = "look at its picture: did the camera or the target move, or was it bent?"
 
     def modes(self, equations: Equations, group: Indices) -> Array:
         return _view_modes(equations)

@@ -153,11 +153,12 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
         off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
         own = end.problem.sights.of_camera(name)
         reach = np.concatenate([own.pixels, own.curve_pixels]).max(axis=0, initial=0.0)
-        if off_px > _OFF_CENTRE * np.hypot(width, height) or _is_of_smaller(camera, reach, off_px):
+        if off_px > _OFF_CENTRE * np.hypot(width, height) or _suits_another(camera, reach, off_px):
             warnings.append(
                 f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image of {width} x "
                 f"{height} px, of which observations reach {reach[0]:.0f} x {reach[1]:.0f}: "
-                "is image_size that of the pictures, and are pixels counted from their top-left corner?"
+                "is image_size that of the pictures, are pixels counted from their top-left corner, and is x, not y, "
+                "the first?"
             )
         if not camera.folds:
             continue
@@ -176,13 +177,16 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
     return (*warnings, *_lost(end.inliers, problem, wholes))
 
 
-def _is_of_smaller(camera: Camera, reach: Array, off_px: float) -> bool:
-    """Whether the principal point suits an image that ends where the observations do, not the stated one."""
+def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
+    """Whether the principal point suits another image than the stated one: one that ends where the observations do, or
+    that has width and height in the other order, as where pixels are given as (row, column).
+    """
     size = np.array(camera.image_size, dtype=float)
-    other_px = float(np.hypot(*(camera.principal_point - 0.5 * reach)))
-    return bool(
-        np.any(reach < _UNFILLED * size) and off_px > _UNUSUAL * np.hypot(*size) and other_px < _NEARER * off_px
-    )
+    others = [size[::-1]]
+    if np.any(reach < _UNFILLED * size):
+        others.append(reach)
+    other_px = min(float(np.hypot(*(camera.principal_point - 0.5 * (other - 1.0)))) for other in others)
+    return bool(off_px > _UNUSUAL * np.hypot(*size) and other_px < _NEARER * off_px)
 
 
 def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Simulation of scenes: observations with noise, outliers and hidden stretches, and their truth.
 
-A scene also says how photographs of it look (`Photography`); scripts/rendering draws them.
+A scene may also say how photographs of it look, for scripts/rendering, which draws them.
 """
 
 from ceres_cal.problem.parameters import Station as Station
@@ -21,7 +21,6 @@ from ceres_cal.simulate.files import scene_to_json as scene_to_json
 from ceres_cal.simulate.files import truth_to_json as truth_to_json
 from ceres_cal.simulate.files import write_simulation as write_simulation
 from ceres_cal.simulate.scene import Disturbance as Disturbance
-from ceres_cal.simulate.scene import Photography as Photography
 from ceres_cal.simulate.scene import Scene as Scene
 from ceres_cal.simulate.scene import ViewPlan as ViewPlan
 from ceres_cal.simulate.simulation import CLEAN as CLEAN

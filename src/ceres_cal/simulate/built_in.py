@@ -13,7 +13,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate.compose import BoardRanges, board_scene, field_scene, join, overhead_pose, rings_scene
-from ceres_cal.simulate.scene import Disturbance, Photography, Scene
+from ceres_cal.simulate.scene import Disturbance, Scene
 
 _WORKDAY = Disturbance(
     points_sigma_px=0.5,
@@ -64,7 +64,7 @@ def _ssl_field() -> tuple[Scene, Disturbance]:
     stations = {"overhead": Station("overhead", pose)}
     field = field_scene(ssl_field("B"), cameras, stations, frames=8, spacing_m=0.15)
     boards = board_scene(checkerboard(9, 6, 0.1), cameras, stations, count=12, seed=1)
-    how = Photography(robots=8, balls=1, shadows=1, wear=0.03, jpeg_quality=90)
+    how = {"robots": 8, "balls": 1, "shadows": 1, "wear": 0.03, "jpeg_quality": 90}
     return replace(join(field, boards), photography=how), _WORKDAY
 
 
@@ -72,13 +72,13 @@ def _rings_2004() -> tuple[Scene, Disturbance]:
     sheet = rings([i / 100 for i in range(1, 37)])
     cam_from_sheet = Pose.exp((0.012, -0.016, 0.3, 0.002, 0.0015, 0.4))
     scene = rings_scene(sheet, {"overhead": _camera_2004()}, {"overhead": _station_2004()}, cam_from_sheet)
-    return replace(scene, photography=Photography(jpeg_quality=95)), Disturbance(curves_sigma_px=0.2)
+    return replace(scene, photography={"jpeg_quality": 95}), Disturbance(curves_sigma_px=0.2)
 
 
 def _field_2004() -> tuple[Scene, Disturbance]:
     cameras, stations = {"overhead": _camera_2004()}, {"overhead": _station_2004()}
     scene = field_scene(_field_of_2004(), cameras, stations, frames=1, spacing_m=0.03)
-    how = Photography(robots=5, balls=1, shadows=1, wear=0.03, jpeg_quality=95)
+    how = {"robots": 5, "balls": 1, "shadows": 1, "wear": 0.03, "jpeg_quality": 95}
     return replace(scene, photography=how), Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 
 
@@ -111,7 +111,7 @@ def _photographs() -> tuple[Scene, Disturbance]:
     pose = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=6.0, tilt_y_deg=-5.0, yaw_deg=90.6)
     stations = {"overhead": Station("overhead", pose)}
     scene = field_scene(ssl_field("B"), {"overhead": _overhead_camera()}, stations, frames=4)
-    how = Photography(robots=8, balls=1, shadows=1, wear=0.05, jpeg_quality=95)
+    how = {"robots": 8, "balls": 1, "shadows": 1, "wear": 0.05, "jpeg_quality": 95}
     return replace(scene, photography=how), Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 
 

@@ -52,11 +52,7 @@ class BoardRanges:
 
 
 def board_placements(
-    board: Target,
-    cameras: Sequence[Camera],
-    count: int,
-    seed: int,
-    held: BoardRanges = BoardRanges(),
+    board: Target, cameras: Sequence[Camera], count: int, seed: int, held: BoardRanges = BoardRanges()
 ) -> list[Pose]:
     """world_from_target of a board at random places where every one of the posed cameras sees all of its points.
 
@@ -87,11 +83,7 @@ def _random_board_pose(board: Target, camera: Camera, held: BoardRanges, rng: np
 
 
 def board_pose(
-    board: Target,
-    camera: Camera,
-    pixel: ArrayLike,
-    distance_m: float,
-    turn_rad: tuple[float, float, float],
+    board: Target, camera: Camera, pixel: ArrayLike, distance_m: float, turn_rad: tuple[float, float, float]
 ) -> Pose:
     """cam_from_board with the board's middle at a pixel (2,), so far from the camera.
 
@@ -201,5 +193,5 @@ def join(*scenes: Scene) -> Scene:
         together("stations"),
         together("placements"),
         tuple(plan for scene in scenes for plan in scene.views),
-        next((scene.photography for scene in scenes if scene.photography is not None), None),
+        next((scene.photography for scene in scenes if scene.photography), {}),
     )

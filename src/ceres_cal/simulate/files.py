@@ -19,14 +19,14 @@ from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
 from ceres_cal.scene.targets import targets_from_specs
-from ceres_cal.simulate.scene import Disturbance, Photography, Scene, ViewPlan
+from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
 
 SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
 TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
 UNITS = "metres, radians, pixels"
 
-Settings = TypeVar("Settings", Disturbance, Photography, ViewPlan)
+Settings = TypeVar("Settings", Disturbance, ViewPlan)
 
 
 class _RotationFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -52,7 +52,7 @@ class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
     views: list[dict[str, Any]]
     placements: dict[str, Any] = {}
     disturbance: dict[str, Any] = {}
-    photography: dict[str, Any] | None = None
+    photography: dict[str, Any] = {}
     units: str = UNITS
 
 
@@ -90,7 +90,7 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
             {name: _station(entry, f"station {name!r}") for name, entry in file.stations.items()},
             {name: _placement(entry, f"placement {name!r}") for name, entry in file.placements.items()},
             tuple(_named(ViewPlan, entry, f"view {number}") for number, entry in enumerate(file.views)),
-            None if file.photography is None else _named(Photography, file.photography, "photography"),
+            file.photography,
         )
         return scene, _named(Disturbance, file.disturbance, "disturbance")
 
@@ -147,10 +147,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             for name, station in scene.stations.items()
         },
         "placements": {
-            name: {
-                "translation_m": pose.translation.tolist(),
-                "rotation_vector": rotation_log(pose.rotation).tolist(),
-            }
+            name: {"translation_m": pose.translation.tolist(), "rotation_vector": rotation_log(pose.rotation).tolist()}
             for name, pose in scene.placements.items()
         },
         "views": [
@@ -158,7 +155,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             for plan in scene.views
         ],
         "disturbance": vars(disturbance or Disturbance()).copy(),
-        **({} if scene.photography is None else {"photography": vars(scene.photography).copy()}),
+        **({"photography": dict(scene.photography)} if scene.photography else {}),
     }
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import Curves, Observations, Points, View, joined, taken
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve
 from ceres_cal.scene.targets import Target
@@ -66,18 +66,8 @@ class _InView:
     neighbour: Indices32 | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Columns of the observations of one plan, with their truth; `view` counts from the first view of all plans."""
-
-    view: Indices32
-    feature: Indices32
-    pixels: Array
-    sigma_px: Array
-    side: Codes
-    flag: Codes
-    true_feature: Indices32
-    true_pixels: Array
+_Rows = tuple[Curves, Truth]
+"""Columns of the observations of one plan, whose views count from the first of all plans, with their truth."""
 
 
 def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0) -> Simulation:
@@ -213,18 +203,10 @@ def _observe(
     true_feature = in_view.feature[place]
     feature = _mislabel(in_view, place, flag, rng)
     flag[(flag == WRONG_LABEL) & (feature == true_feature)] = CLEAN  # there is no other name
-    rows = _Rows(
-        view=(first_view + frame).astype(np.int32),
-        feature=feature,
-        pixels=pixels,
-        sigma_px=np.full(len(place), sigma_px or 1.0),
-        side=np.full(len(place), in_view.side, dtype=np.int8),
-        flag=flag,
-        true_feature=true_feature,
-        true_pixels=true_pixels,
-    )
-    kept = in_image(pixels, in_view.image_size)
-    return rows if np.all(kept) else _Rows(**{name: column[kept] for name, column in vars(rows).items()})
+    view, side = (first_view + frame).astype(np.int32), np.full(len(place), in_view.side, dtype=np.int8)
+    rows = Curves(view, feature, pixels, np.full(len(place), sigma_px or 1.0), side)
+    kept = np.flatnonzero(in_image(pixels, in_view.image_size))
+    return taken(rows, kept), taken(Truth(flag, true_feature, true_pixels), kept)
 
 
 def _mislabel(in_view: _InView, place: Indices, flag: Codes, rng: np.random.Generator) -> Indices32:
@@ -249,7 +231,7 @@ def _assemble(
     point_rows: Sequence[_Rows],
     curve_rows: Sequence[_Rows],
 ) -> Simulation:
-    points, curves = _joined(point_rows), _joined(curve_rows)
+    (points, of_points), (curves, of_curves) = _joined(point_rows), _joined(curve_rows)
     used = np.zeros(len(views), dtype=bool)
     used[points.view] = used[curves.view] = True
     number = (np.cumsum(used) - 1).astype(np.int32)
@@ -259,13 +241,10 @@ def _assemble(
         {name: camera.image_size for name, camera in scene.cameras.items()},
         kept_views,
         Points(number[points.view], points.feature, points.pixels, points.sigma_px),
-        Curves(number[curves.view], curves.feature, curves.pixels, curves.sigma_px, curves.side),
+        replace(curves, view=number[curves.view]),
     )
-    truths = [Truth(rows.flag, rows.true_feature, rows.true_pixels) for rows in (points, curves)]
-    return Simulation(scene, disturbance, seed, observations, *truths)
+    return Simulation(scene, disturbance, seed, observations, of_points, of_curves)
 
 
 def _joined(parts: Sequence[_Rows]) -> _Rows:
-    if len(parts) == 1:
-        return parts[0]
-    return _Rows(**{name: np.concatenate([getattr(rows, name) for rows in parts]) for name in vars(parts[0])})
+    return joined([rows for rows, _ in parts]), joined([truth for _, truth in parts])

@@ -84,12 +84,7 @@ def homography_from_points(plane_points: ArrayLike, image_points: ArrayLike) -> 
     scale = np.diag([1.0, 1.0, max(float(np.mean(np.linalg.norm(image[:, :2], axis=1))), 1e-12)])
     u = image @ scale
     zero = np.zeros_like(x)
-    rows = np.vstack(
-        [
-            np.hstack([u[:, 2:] * x, zero, -u[:, :1] * x]),
-            np.hstack([zero, u[:, 2:] * x, -u[:, 1:2] * x]),
-        ]
-    )
+    rows = np.vstack([np.hstack([u[:, 2:] * x, zero, -u[:, :1] * x]), np.hstack([zero, u[:, 2:] * x, -u[:, 1:2] * x])])
     _, s, vt = np.linalg.svd(rows)
     if s[7] <= 1e-9 * s[0]:
         raise DegenerateError(f"of any four of the {len(plane)} points three lie on one line: add points beside it")
@@ -177,25 +172,15 @@ class PlaneData:
     offsets: Array
 
 
-@dataclass(frozen=True, eq=False)
-class RadialAlignment:
-    """Answer of `radial_alignment`: the profile, and each point's error.
-
-    Attributes:
-        error_px: (N,). relative_error: (N,) the same in units of what is usual at that distance from the centre.
-    """
-
-    profile: RadialProfile
-    error_px: Array
-    relative_error: Array
-
-
-def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -> RadialAlignment:
+def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -> tuple[RadialProfile, Array, Array]:
     """Profile from sights of points, whatever the radial distortion (design, section 7).
 
     p_x (h2 . X) - p_y (h1 . X) = 0 holds for any radial lens: it gives h1 and h2 of each sight. Along p, then,
     r (h3 . X) - q sum c_k r^2k = q with q = (h1 . X, h2 . X) . p / r is linear in h3 of each sight and in the shared c.
     Rounds of reweighting keep wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
+
+    Returns:
+        The profile, and each point's error: (N,) px, and in units of what is usual at that distance from the centre.
     """
     (a, b), sizes = data.offsets.T / unit_px, np.diff(data.bounds)
     r2 = a * a + b * b
@@ -237,7 +222,7 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
         parts = np.split(errors[order], np.cumsum(counts)[:-1])
         usual[order] = np.repeat([max(median(part), 1e-12) for part in parts], counts)
         weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
-    return RadialAlignment(RadialProfile(tuple(c.tolist()), unit_px), errors * unit_px, errors / usual)
+    return RadialProfile(tuple(c.tolist()), unit_px), errors * unit_px, errors / usual
 
 
 def _rings(radius: Array) -> tuple[Indices, Indices]:
@@ -274,60 +259,46 @@ def fit_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array | N
     """
     singular = 1e-12
     no_second = 1e-6  # root of the second least eigenvalue: as small, and the null vector is one of many
-    fit = _LineFit.of(lines, image_points[None], rounds)
-    inverse = fit.inverse[0] * np.copysign(1.0, median(fit.sent[0, :, 2]))
-    typical = float(fit.typical[0])
+    plane_scale, image_scale, found, second, sent, distance = _fitted_lines(lines, image_points[None], rounds)
+    inverse, typical = found[0] * np.copysign(1.0, median(sent[0, :, 2])), float(distance[0])
     # More than one G fits, or one that sends the image to a line.
-    if fit.second[0] < no_second**2 or abs(np.linalg.det(inverse)) < singular:
+    if second[0] < no_second**2 or abs(np.linalg.det(inverse)) < singular:
         return None, typical
-    return np.asarray(np.linalg.inv(fit.plane_scale @ inverse @ fit.image_scale[0])), typical
+    return np.asarray(np.linalg.inv(plane_scale @ inverse @ image_scale[0])), typical
 
 
 def misfits_of_lines(lines: Array, image_points: Array, rounds: int) -> Array:
     """(C,) median distances on the plane, in units of its size, of image points (C, N, 3) as C lenses have them."""
-    return _LineFit.of(lines, image_points, rounds).typical
+    return _fitted_lines(lines, image_points, rounds)[-1]
 
 
-@dataclass(frozen=True, eq=False)
-class _LineFit:
+def _fitted_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array, Array, Array, Array, Array, Array]:
     """The DLT of points on lines, l . G d = 0 with G = H^-1 (design, section 7), reweighted to distances on the plane
-    and against wrong labels; of C lenses at once.
+    and against wrong labels; of C lenses at once, of image points (C, N, 3) on lines (N, 3).
 
-    Attributes:
-        plane_scale: (3, 3) and image_scale: (C, 3, 3) of the units of the fit. inverse: (C, 3, 3) G in these.
-        second: (C,) the second least eigenvalue. sent: (C, N, 3) G d. typical: (C,) middle distance on the plane.
+    Returns:
+        (3, 3) and (C, 3, 3) scales of the plane and of images in the fit's units, (C, 3, 3) G in these, (C,) the second
+        least eigenvalue, (C, N, 3) G d, and (C,) the middle distance on the plane.
     """
-
-    plane_scale: Array
-    image_scale: Array
-    inverse: Array
-    second: Array
-    sent: Array
-    typical: Array
-
-    @classmethod
-    def of(cls, lines: Array, image_points: Array, rounds: int) -> _LineFit:
-        """Of image points (C, N, 3) on lines (N, 3)."""
-        of_a_plane = 8  # numbers of a homography
-        plane_scale = np.array([1.0, 1.0, 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9)])
-        reach = np.max(np.abs(image_points[:, :, :2]), axis=(1, 2))
-        image_scale = np.column_stack([1.0 / reach, 1.0 / reach, np.ones_like(reach)])
-        lines, image_points = lines * plane_scale, image_points * image_scale[:, None]
-        rows = (lines[:, :, None] * image_points[:, :, None, :]).reshape(*image_points.shape[:2], 9)
-        weights = np.ones(image_points.shape[:2])
-        # The middle of those that G's eight numbers cannot fit exactly: the median itself may be 0 beside what decides.
-        middle = min((len(lines) + of_a_plane) // 2, len(lines) - 1)
-        for _ in range(rounds):
-            values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
-            inverse = vectors[:, :, 0].reshape(-1, 3, 3)
-            sent = image_points @ np.swapaxes(inverse, 1, 2)
-            distance = np.abs(np.sum(lines * sent, axis=2)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
-            typical = np.partition(distance, middle, axis=1)[:, middle]
-            bound = np.maximum(3.0 * typical, 1e-9)[:, None]
-            weights = 1.0 / (np.maximum(sent[:, :, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
-            weights /= weights.mean(axis=1, keepdims=True)
-        scales = image_scale[:, :, None] * np.eye(3)
-        return cls(np.diag(plane_scale), scales, inverse, values[:, 1], sent, typical)
+    of_a_plane = 8  # numbers of a homography
+    plane_scale = np.array([1.0, 1.0, 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9)])
+    reach = np.max(np.abs(image_points[:, :, :2]), axis=(1, 2))
+    image_scale = np.column_stack([1.0 / reach, 1.0 / reach, np.ones_like(reach)])
+    lines, image_points = lines * plane_scale, image_points * image_scale[:, None]
+    rows = (lines[:, :, None] * image_points[:, :, None, :]).reshape(*image_points.shape[:2], 9)
+    weights = np.ones(image_points.shape[:2])
+    # The middle of those that G's eight numbers cannot fit exactly: the median itself may be 0 beside what decides.
+    middle = min((len(lines) + of_a_plane) // 2, len(lines) - 1)
+    for _ in range(rounds):
+        values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
+        inverse = vectors[:, :, 0].reshape(-1, 3, 3)
+        sent = image_points @ np.swapaxes(inverse, 1, 2)
+        distance = np.abs(np.sum(lines * sent, axis=2)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
+        typical = np.partition(distance, middle, axis=1)[:, middle]
+        bound = np.maximum(3.0 * typical, 1e-9)[:, None]
+        weights = 1.0 / (np.maximum(sent[:, :, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
+        weights /= weights.mean(axis=1, keepdims=True)
+    return np.diag(plane_scale), image_scale[:, :, None] * np.eye(3), inverse, values[:, 1], sent, typical
 
 
 def point_lines(points: Array) -> Array:

@@ -11,6 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.transforms import skews
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
@@ -94,15 +95,9 @@ def _equations(floor: Array, image: Array, is_line: Mask, to_floor: Array, to_im
     p = np.where(is_line[:, None], image @ np.linalg.inv(to_image), image @ to_image)
     f, p = f / np.linalg.norm(f, axis=1, keepdims=True), p / np.linalg.norm(p, axis=1, keepdims=True)
     # of a point [p]x H f, whose rows are sums of p_i H_jk f_k; of a line [f]x H^T p
-    of_point = np.einsum("eij,ek->eijk", _skew(p), f)
-    of_line = np.einsum("eik,ej->eijk", _skew(f), p)
+    of_point = np.einsum("eij,ek->eijk", skews(p), f)
+    of_line = np.einsum("eik,ej->eijk", skews(f), p)
     return np.asarray(np.where(is_line[:, None, None, None], of_line, of_point).reshape(len(f), 3, 9))
-
-
-def _skew(v: Array) -> Array:
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
 
 
 def _drawn(count: int) -> Indices:

@@ -14,6 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.base.errors import or_none
 from ceres_cal.base.native import kept_signals
+from ceres_cal.observations import joined
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.start.closed_forms import (
     PlaneData,
@@ -157,8 +158,7 @@ def profile_and_homographies(
         parts.append(Homographies(np.array([i]), matrix[None], height, size))
     if len(pure):
         parts.append(_of_boards(pure, board, data, profile))
-    names = ("sights", "matrices", "heights_m", "sizes_px")
-    return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return profile, joined(parts)
 
 
 def _scatter(values: Array, bounds: Indices) -> Array:
@@ -203,12 +203,12 @@ def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialPro
         bounds_of(np.diff(data.bounds)[numbers]), data.plane.take(rows, axis=0), data.offsets.take(rows, axis=0)
     )
     terms = int(np.clip((sizes.sum() - 3 * len(numbers)) // 8, 1, 3))
-    first = radial_alignment(few, unit, terms, rounds=2)
-    wrong = (first.relative_error > _SUSPICIOUS) & (first.error_px > 1.0)
-    if np.mean(wrong) < 0.02 and median(first.error_px) < _ROUGH_PX:
-        return first.profile
+    profile, error_px, relative_error = radial_alignment(few, unit, terms, rounds=2)
+    wrong = (relative_error > _SUSPICIOUS) & (error_px > 1.0)
+    if np.mean(wrong) < 0.02 and median(error_px) < _ROUGH_PX:
+        return profile
     some = board.take(numbers)
-    return radial_alignment(_plane_data(some, np.arange(len(some.points))), unit, terms, rounds=8).profile
+    return radial_alignment(_plane_data(some, np.arange(len(some.points))), unit, terms, rounds=8)[0]
 
 
 def _spread_rows(bounds: Indices) -> Indices:

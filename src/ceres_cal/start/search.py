@@ -14,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.observations import joined
 from ceres_cal.start.minimal import minimal_sets
 from ceres_cal.start.sightlines import Candidates, Sightlines
 
@@ -208,10 +209,10 @@ def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Ca
     some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:first])
     sets = minimal_sets(few, _logs(known, np.geomspace(_PHI_GRID[0], _PHI_GRID[-1], 60)))
     sets = sets.take(np.argsort(costs(few, known, sets, rough_px))[:then]) if len(sets) else sets
-    some = refined(few, known, Candidates.joined(proposed, some), _FIRST_STEPS)
-    some = Candidates.joined(refined(few, known, sets, _FIRST_STEPS, rough_px), some)
+    some = refined(few, known, joined([proposed, some]), _FIRST_STEPS)
+    some = joined([refined(few, known, sets, _FIRST_STEPS, rough_px), some])
     some = some.take(apart(some, costs(few, known, some, rough_px), near)[:then])
-    return best_of(lines, known, Candidates.joined(proposed, refined(lines, known, some, _STEPS)))
+    return best_of(lines, known, joined([proposed, refined(lines, known, some, _STEPS)]))
 
 
 def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> BestCameras:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
 from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.transforms import skews
 
 _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
@@ -57,11 +58,6 @@ class Candidates:
         return Candidates(
             *(np.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(mine, theirs, strict=True))
         )
-
-    @classmethod
-    def joined(cls, *some: Candidates) -> Candidates:
-        """One after the other."""
-        return cls(*(np.concatenate(parts) for parts in zip(*(vars(one).values() for one in some), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,9 +258,7 @@ def _cross(a: Array, b: Array) -> Array:
 def _turns(vectors: Array) -> Array:
     """(K, 3, 3) of rotation vectors (K, 3), rad."""
     angle = np.linalg.norm(vectors, axis=1)
-    x, y, z = (vectors / np.maximum(angle, _LEAST)[:, None]).T
-    zero = np.zeros_like(x)
-    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    skew = skews(vectors / np.maximum(angle, _LEAST)[:, None])
     return np.asarray(
         np.eye(3) + np.sin(angle)[:, None, None] * skew + (1.0 - np.cos(angle))[:, None, None] * (skew @ skew)
     )

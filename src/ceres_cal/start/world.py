@@ -127,23 +127,26 @@ def holds(lines: Sightlines, known: Beforehand, found: BestCameras, unit_px: flo
 
 def open_numbers(matrix: Array) -> tuple[str, ...]:
     """Names of the numbers that an information matrix (8, 8) leaves open; those that are held have no row."""
-    free = np.flatnonzero(np.diag(matrix) > 0.0)
+    free, sizes, values, vectors = _decomposed(matrix)
     missing = [_NAMES[n] for n in range(6) if n not in free]
-    sizes = np.sqrt(np.diag(matrix)[free])
-    values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
     lost = vectors[:, values < _OPEN * max(values[-1], 1e-300)] / sizes[:, None] if len(free) else np.empty((0, 0))
     moved = np.max(np.abs(lost), axis=1, initial=0.0)
     names = [_NAMES[n] for n, m in zip(free, moved, strict=True) if m > 0.1 * np.max(moved, initial=0.0) > 0.0]
     return tuple(dict.fromkeys([*missing, *names]))
 
 
+def _decomposed(matrix: Array) -> tuple[Indices, Array, Array, Array]:
+    """Which numbers of an information matrix are free, their sizes, and eigenvalues and vectors in these."""
+    free = np.flatnonzero(np.diag(matrix) > 0.0)
+    sizes = np.sqrt(np.diag(matrix)[free])
+    return free, sizes, *np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
+
+
 def _sd_of(matrix: Array, number: int) -> float:
     """Standard deviation of one number, infinite where it is open; 0 where it is held."""
-    free = np.flatnonzero(np.diag(matrix) > 0.0)
+    free, sizes, values, vectors = _decomposed(matrix)
     if number not in free:
         return 0.0
-    sizes = np.sqrt(np.diag(matrix)[free])
-    values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / sizes[:, None] / sizes)
     row = int(np.searchsorted(free, number))
     share = vectors[row] / sizes[row]
     return float(np.sqrt(np.sum(share**2 / np.maximum(values, 1e-300))))

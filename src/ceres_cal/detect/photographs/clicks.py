@@ -34,8 +34,10 @@ FORMAT, VERSION = "ceres-cal/corners", 1
 # How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
 SIGMA_PX = 15.0
 FEWEST = 4
+STRETCH = 0.03
+"""A standard deviation of fy / fx where a picture was stretched one way."""
 _WRONG = 6.0  # standard deviations of a click: as far off, and it is another place's
-_FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
+_FREED = ("a3", "phi", "aspect", "a2", "cx", "cy", "a4", "a5")
 
 
 @dataclass(frozen=True)
@@ -127,15 +129,14 @@ def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prio
     Args:
         camera: far from the middle of whose picture its principal point is about right.
     """
-    # A standard deviation of fy / fx where a picture was stretched one way; and of the principal point, of the width.
-    stretch, off = 0.03, 0.04
+    off = 0.04  # a standard deviation of the principal point, of the width
     size, centre = np.array(camera.image_size), 0.5 * (np.array(camera.image_size) - 1.0)
     if np.any(np.abs(camera.principal_point - centre) > 3.0 * off * size):
         centre, off = np.array(camera.principal_point), 2.0 * off
     priors = (
         Prior("camera", CAMERA, "phi", (camera.phi,), (0.5 * camera.phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(centre), (off * size[0],) * 2),
-        Prior("camera", CAMERA, "aspect", (1.0,), (stretch,)),
+        Prior("camera", CAMERA, "aspect", (1.0,), (STRETCH,)),
     )
     return FreeIntrinsics(_FREED, (*priors, *lengths), hints)
 

@@ -21,7 +21,7 @@ from ceres_cal.detect.images import filled, negative, read_colour, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.median import MOST_PICTURES, merged
 from ceres_cal.detect.photographs.candidates import prepare_search
-from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.detect.photographs.clicks import STRETCH, Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
@@ -364,13 +364,16 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     if beside is not None:
         aside = _curves(beside, beside.found, options.edges)
         curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
+    priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
+    if camera.aspect != 1.0:  # else it is solved for as one with square pixels
+        priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(
         {TARGET_NAME: target},
         {options.camera: camera.image_size},
         (View(frame, options.camera, options.station or options.camera, TARGET_NAME),),
         points,
         curves,
-        tuple(Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()),
+        tuple(priors),
     )
 
 

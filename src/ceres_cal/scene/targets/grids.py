@@ -11,16 +11,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Curve, Segment
-from ceres_cal.scene.targets.target import (
-    Disc,
-    Grid,
-    Paper,
-    Square,
-    Target,
-    TargetKind,
-    from_arguments,
-    require_size,
-)
+from ceres_cal.scene.targets.target import Disc, Grid, Paper, Square, Target, TargetKind, from_arguments, require_size
 
 
 def _require_counts(kind: str, what: str, columns: int, rows: int, least: int = 2) -> None:

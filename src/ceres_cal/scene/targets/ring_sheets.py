@@ -10,14 +10,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.typed import checked
 from ceres_cal.scene.curves import Arc, Curve
-from ceres_cal.scene.targets.target import (
-    Disc,
-    Paper,
-    Square,
-    Target,
-    TargetKind,
-    from_arguments,
-)
+from ceres_cal.scene.targets.target import Disc, Paper, Square, Target, TargetKind, from_arguments
 
 
 @checked

@@ -1,0 +1,97 @@
+"""How a photograph of a scene is taken: light, carpet, paint, what stands about, lens blur and sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
+from ceres_cal.simulate.scene import Scene
+
+MOST_THINGS = 100
+
+
+@dataclass(frozen=True)
+class Photography:
+    """What a photograph shows besides the targets, and what the camera makes of it.
+
+    Attributes:
+        blur_px: standard deviation of the lens's Gaussian point spread (defocus), besides the pixel's own square.
+        vignetting: share of the light that is lost in the farthest image corner.
+        unevenness: share by which the lamps' light varies over the image.
+        shadows: number of people's shadows on the floor. shadow_depth: share of the light that each takes.
+        robots: number of robots on the field, balls: number of balls; both hide what is behind them.
+        wear: share of the paint that is worn off.
+        carpet: brightness of the carpet, paint: of paint and paper, as shares of white.
+        carpet_colour, paint_colour: blue, green and red of each, times its brightness.
+        sun: light of the sun, times the lamps', in stripes as windows let it in.
+        strips: share by which strips of carpet, which meet in seams, differ in brightness.
+        glare: share of white that a lamp mirrored by the floor adds where it is brightest.
+        carpet_texture: standard deviation of the carpet's brightness, as a share of it.
+        exposure: grey level of white in full light.
+        read_noise: standard deviation of the sensor's noise in the dark, grey levels.
+        shot_noise: variance that each grey level of signal adds, in grey levels squared (photon noise).
+        mosaic: whether each of the sensor's pixels sees one colour (red and green in every other row, green and blue in
+            the others), the other two filled in from those around.
+        motion_px: way of the camera while the shutter is open.
+        jpeg_quality: 1 to 100; 0: no compression.
+
+    Raises:
+        InputError: on construction: a number that is not in its range.
+    """
+
+    blur_px: float = 0.6
+    vignetting: float = 0.2
+    unevenness: float = 0.1
+    shadows: int = 0
+    shadow_depth: float = 0.5
+    robots: int = 0
+    balls: int = 0
+    wear: float = 0.0
+    carpet: float = 0.2
+    paint: float = 0.85
+    carpet_colour: tuple[float, float, float] = (0.55, 1.25, 0.65)  # a green one
+    paint_colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    carpet_texture: float = 0.05
+    exposure: float = 230.0
+    read_noise: float = 1.0
+    shot_noise: float = 0.01
+    sun: float = 0.0
+    strips: float = 0.0
+    glare: float = 0.0
+    motion_px: float = 0.0
+    mosaic: bool = False
+    jpeg_quality: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.all(np.isfinite(value) & np.greater_equal(value, 0.0)):
+                raise InputError(f"photography: {name} must be a number from 0 on, not {value}")
+        for name in ("vignetting", "unevenness", "shadow_depth", "wear", "carpet", "paint", "strips"):
+            if getattr(self, name) > 1.0:
+                raise InputError(f"photography: {name} is a share and at most 1, not {getattr(self, name)}")
+        for name in ("shadows", "robots", "balls"):
+            if getattr(self, name) > MOST_THINGS:
+                raise InputError(f"photography: at most {MOST_THINGS} {name}, not {getattr(self, name)}")
+        if self.jpeg_quality > 100:
+            raise InputError(f"photography: jpeg_quality is at most 100 (0: none), not {self.jpeg_quality}")
+
+
+def photography_of(scene: Scene) -> Photography:
+    """As the scene says it.
+
+    Raises:
+        InputError: it says something that photographs have not, or a number that cannot be.
+    """
+    known = [field.name for field in fields(Photography)]
+    for name in scene.photography:
+        if name not in known:
+            raise InputError(f"photography: {name!r} is unknown: there are {', '.join(known)}")
+    return convert(dict(scene.photography), Photography, "photography")
+
+
+def taken_as(scene: Scene, how: Photography) -> Scene:
+    """The scene with how photographs of it are taken."""
+    return replace(scene, photography=vars(how).copy())
