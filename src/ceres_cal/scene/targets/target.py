@@ -60,7 +60,7 @@ LARGEST_M = 1e7
 """Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
 
 
-_HANDY_M = 50.0  # of a target that somebody holds before a camera, from its origin
+HANDY_M = 50.0  # of a target that somebody holds before a camera, from its origin
 
 
 def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
@@ -132,7 +132,7 @@ class Target:
 
     def __post_init__(self) -> None:
         require_places(self.kind, self.points, self.curves)
-        if self.movable and self.reach_m > _HANDY_M:  # boards alone fit in any unit
+        if self.movable and self.reach_m > HANDY_M:  # boards alone fit in any unit
             raise InputError(
                 f"{self.kind}: it reaches {self.reach_m:.0f} m from its origin, and nobody holds that before a camera: "
                 "give its dimensions in metres, or with their unit, such as 25mm"
