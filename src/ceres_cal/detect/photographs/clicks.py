@@ -55,6 +55,15 @@ class Clicks:
         if not np.all(np.isfinite([*self.points.values(), *(place[1:] for place in self.curves)])):
             raise InputError("a point to start from has a number that is not finite")
 
+    def require_names(self, target: Target) -> None:
+        """Raise InputError where a target has no such point or curve."""
+        for name in self.points:
+            if name not in target.point_index:
+                raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+        for name, *_ in self.curves:
+            if name not in target.curve_index:
+                raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+
 
 class _ClicksFile(msgspec.Struct, forbid_unknown_fields=True):
     format: str
@@ -92,12 +101,7 @@ def starts_from_clicks(
         InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
     stretches = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
-    for name in clicks.points:
-        if name not in target.point_index:
-            raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
-    for name, *_ in clicks.curves:
-        if name not in target.curve_index:
-            raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    clicks.require_names(target)
     index = np.array([target.point_index[name] for name in clicks.points], dtype=np.int32)
     pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 1e-6:
