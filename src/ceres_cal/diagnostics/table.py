@@ -163,7 +163,7 @@ def make_table(
     residual[equations.observation] = 0.0
     np.add.at(residual, equations.observation, equations.direction * equations.residual[:, None])
     distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
-    inlier = np.concatenate([inliers.points, inliers.curves])
+    inlier = inliers.rows
     original = np.concatenate(observations.copies.originals)
     seen = np.isfinite(residual[:, 0])
     return ResidualTable(

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -32,16 +32,6 @@ _RETRIES = 3  # of what a worker that was lost had to do
 _PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
 _NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
 _NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
-
-
-class Engine(Protocol):
-    """Where shares are asked."""
-
-    def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
-        """The sum of answer(share, *request) over all shares."""
-
-    def close(self) -> None:
-        """Let the shares go."""
 
 
 class InProcess:
@@ -210,7 +200,7 @@ def _lost(last: str) -> SolutionError:
 class SharedObservations:
     """The observations of an engine's shares, judged at an estimate; see `problem.Elsewhere`."""
 
-    engine: Engine
+    engine: InProcess | OnWorkers
     keys: tuple[SightKey, ...]
     equations: int
     judged_at: tuple[str, Estimate]

@@ -111,6 +111,11 @@ class Inliers:
         return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
 
     @property
+    def rows(self) -> Mask:
+        """(N + M,) which observations take part, points by row and then curves by row."""
+        return np.concatenate([self.points, self.curves])
+
+    @property
     def scales(self) -> tuple[float, float]:
         """Of points and of curves."""
         return self.point_scale, self.curve_scale
