@@ -241,9 +241,7 @@ def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]
 def resized(camera: Camera, scale: float, image_size: tuple[int, int]) -> Camera:
     """The camera of images that were scaled: a pixel's centre c goes to s (c + 1/2) - 1/2."""
     cx, cy = (scale * (c + 0.5) - 0.5 for c in camera.principal_point)
-    lens = camera.lens
-    if lens.acts_on_pixels:
-        lens = lens.with_values([v * scale ** (1 - order) for v, order in zip(lens.values, lens.orders, strict=True)])
+    lens = camera.lens.with_values(np.array(camera.lens.values) / camera.lens.scales(scale))
     return replace(camera, image_size=image_size, phi=scale * camera.phi, principal_point=(cx, cy), lens=lens)
 
 

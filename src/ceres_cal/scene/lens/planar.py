@@ -218,6 +218,10 @@ class Planar(Lens):
             flat = self._within(self._newton(flat, measured))
         return self._lifted(flat * (unit / phi))
 
+    def unlimited(self, rays: Array) -> Array:
+        """Where rays (N, 3) are measured, (N, 2) at focal length 1, also past the limit, where the map has folded."""
+        return self._map(self._flat(rays))
+
     def _newton(self, start: Array, measured: Array) -> Array:
         """Points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
         longest = 0.1  # step of Newton's method, of the limit
