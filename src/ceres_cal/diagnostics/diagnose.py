@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, numerical
 from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.shown import Shown, drawn, html_of, text_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -37,8 +37,7 @@ FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(Frozen):
     """What the residuals say.
 
     Attributes:

@@ -8,7 +8,6 @@ below that of a field, by the same share whatever the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, attempt
 from ceres_cal.base.executing import each
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 FOLDS = 5
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOut(Frozen):
     """Errors of prediction, each observation by a calibration that did not see its frame.
 
     Attributes:
@@ -66,8 +65,7 @@ class HeldOut:
     failed: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
+class Choice(Frozen):
     """Which lens the held-out error speaks for.
 
     Attributes:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
@@ -33,7 +34,6 @@ from ceres_cal.scene.targets import Target
 FALSE_ALARMS = 0.01
 
 
-@dataclass(frozen=True, eq=False)
 class FieldDifference(ErrorMap):
     """Where two cameras locate the same pixels, over the field.
 
@@ -76,8 +76,7 @@ def _root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
 
 
-@dataclass(frozen=True, eq=False)
-class MapChange:
+class MapChange(Frozen):
     """A station from one camera to another.
 
     Attributes:
@@ -94,8 +93,7 @@ class MapChange:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False)
-class ImageDifference:
+class ImageDifference(Frozen):
     """Where two cameras see the same directions, over the image.
 
     Attributes:
@@ -140,8 +138,7 @@ class Misfit:
     noise: tuple[float, float] = (np.nan, np.nan)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Agreement:
+class Agreement(Frozen, kw_only=True):
     """What is said of one station, camera or view; what was not asked is left at its default.
 
     Attributes:
@@ -174,8 +171,7 @@ class Agreement:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False)
-class Agreements(Mapping[str, Agreement]):
+class Agreements(Frozen, Mapping[str, Agreement]):
     """The answers by name, of stations or of cameras.
 
     Attributes:
@@ -308,8 +304,7 @@ def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Arra
 # ---- two statements about the same numbers --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class NormalDistribution:
+class NormalDistribution(Frozen):
     """A normal distribution of K numbers, seen from an estimate.
 
     Attributes:
@@ -321,8 +316,7 @@ class NormalDistribution:
     degrees_of_freedom: float
 
 
-@dataclass(frozen=True, eq=False)
-class Contrast:
+class Contrast(Frozen):
     """By how much the least squared distance to two statements falls when some numbers may differ between them.
 
     Attributes:

@@ -10,13 +10,13 @@ value is the cause that is named.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.errors import CalibrationError, InputError, attempt
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -67,8 +67,7 @@ def audit(foreign: Calibration, observations: Observations) -> Agreements:
 # ---- one station ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _AuditCase:
+class _AuditCase(Frozen):
     """One station's observations, those of them that count, and ours."""
 
     observations: Observations

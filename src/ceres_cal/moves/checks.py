@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, numerical
 from ceres_cal.base.errors import InputError, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
@@ -98,8 +98,7 @@ def check(
 # ---- one station ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _CheckCase:
+class _CheckCase(Frozen):
     """One station's new observations and what was known of its numbers."""
 
     calibration: Calibration

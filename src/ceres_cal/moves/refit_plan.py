@@ -6,12 +6,13 @@ The same observations under other names: a field turned by half a turn, mirrored
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked_fields
 from ceres_cal.base.words import no_such
@@ -92,8 +93,7 @@ class RefitOptions:
             raise InputError(no_such("way to take labels", self.labels, LABELS))
 
 
-@dataclass(frozen=True, eq=False)
-class RefitPlan:
+class RefitPlan(Frozen):
     """A refit as it was asked for.
 
     Attributes:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
@@ -41,7 +41,6 @@ from ceres_cal.scene.targets import Target
 _NAMES = attrgetter("camera", "station", "target", "placement")
 
 
-@dataclass(frozen=True, eq=False)
 class Observations(Content):
     """Everything that was observed.
 

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import Array, Indices, Mask, median
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations.columns import Alone, Columns, Curves, Points, View, each_block, view_label
 from ceres_cal.observations.files import Content
@@ -175,8 +175,7 @@ COUNTED_ONCE = ": counted once"
 _X, _FEATURE, _FRAME = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
-@dataclass(frozen=True, eq=False)
-class Copies:
+class Copies(Frozen):
     """Which observations repeat others.
 
     Attributes:

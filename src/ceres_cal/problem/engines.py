@@ -9,7 +9,6 @@ import errno
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.native import keep_freed_memory
 from ceres_cal.base.threads import at_most, available, single_threaded_blas
 from ceres_cal.base.transforms import Poses
@@ -196,8 +196,7 @@ def _lost(last: str) -> SolutionError:
     return SolutionError("workers were lost again and again: have they enough memory?" + f" ({last})" * bool(last))
 
 
-@dataclass(frozen=True, eq=False)
-class SharedObservations:
+class SharedObservations(Frozen):
     """The observations of an engine's shares, judged at an estimate; see `problem.Elsewhere`."""
 
     engine: InProcess | OnWorkers

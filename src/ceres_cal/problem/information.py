@@ -13,12 +13,12 @@ from where the pose is, so no pose is special, not even one turned by half a tur
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import Spread, known_inverses, without
 
@@ -98,8 +98,7 @@ def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
 _VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
 
 
-@dataclass(frozen=True, eq=False)
-class Information:
+class Information(Frozen):
     """An information matrix, symmetric, not necessarily of full rank.
 
     Attributes:

@@ -6,12 +6,13 @@ Residuals are taken in units of their stated sigma; the noise scale is the facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.observations import Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.problem.parameters import Options
@@ -54,8 +55,7 @@ def by_leverage(counts: tuple[int, int], leverages: tuple[float, float]) -> Redu
     return points, curves
 
 
-@dataclass(frozen=True, eq=False)
-class Inliers:
+class Inliers(Frozen):
     """Which observations take part, and the noise scales they were judged by.
 
     Attributes:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
@@ -32,8 +33,7 @@ from ceres_cal.scene.targets import Target
 _LEAST, _WIDTH, _BINS = 1e-6, 0.00375, 8192
 
 
-@dataclass(frozen=True, eq=False)
-class Histogram:
+class Histogram(Frozen):
     """Lengths by their size: (B,) how many, and (B,) the sum of their squares."""
 
     counts: Indices
@@ -74,8 +74,7 @@ def _bin_of(lengths: Array) -> Indices32:
     return np.asarray(np.clip(place, 0.0, _BINS - 1.0), dtype=np.int32)
 
 
-@dataclass(frozen=True, eq=False)
-class Looked:
+class Looked(Frozen):
     """What residuals are like.
 
     Attributes:
@@ -96,8 +95,7 @@ class Looked:
         return Looked(self.points + other.points, self.curves + other.curves, *map(np.concatenate, each))
 
 
-@dataclass(frozen=True, eq=False)
-class CompressedBlocks:
+class CompressedBlocks(Frozen):
     """Compressed blocks (K + 1, K + 1) by sight, the residual last; None where an observation cannot be projected."""
 
     of: Mapping[SightKey, Array] | None
@@ -111,8 +109,7 @@ class CompressedBlocks:
         return CompressedBlocks(both)
 
 
-@dataclass(frozen=True, eq=False)
-class SightNormals:
+class SightNormals(Frozen):
     """Normal equations by sight and by kind, see `problem.reduced`."""
 
     of: Mapping[SightKey, Mapping[int, Array]]
@@ -126,8 +123,7 @@ class SightNormals:
         return SightNormals(both)
 
 
-@dataclass(frozen=True, eq=False)
-class Used:
+class Used(Frozen):
     """The rows that take part, and those that do not.
 
     Attributes:
@@ -178,8 +174,7 @@ class ShareRequest(NamedTuple):
     feet_along: tuple[tuple[str, Estimate], ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _RowBounds:
+class _RowBounds(Frozen):
     """What decides which rows take part at a place.
 
     Attributes:

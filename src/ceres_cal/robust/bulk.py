@@ -8,13 +8,13 @@ answer with sums (`shares`): here, or wherever workers have them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.bundle import Progress, Solution, solve
@@ -43,8 +43,7 @@ _PART, _FEWEST_VIEWS = 300_000, 200
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
 
 
-@dataclass(frozen=True, eq=False)
-class Subset:
+class Subset(Frozen):
     """Some of the observations: all that are not of the world, and whole views of it.
 
     Attributes:
@@ -56,8 +55,7 @@ class Subset:
     gone: Mask | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Settled:
+class Settled(Frozen):
     """Where all observations were solved for.
 
     Attributes:
@@ -180,8 +178,7 @@ class Bulk:
         return here[0], engine.ask(Share.looked, ShareRequest(here[1], blank, weighting, here, bounds, (*along, here)))
 
 
-@dataclass(frozen=True, eq=False)
-class _BulkResiduals:
+class _BulkResiduals(Frozen):
     """Residuals at an estimate: the name of the shares' ones, what these are like, those of the part, and the lengths
     of these in stated sigmas.
     """
@@ -208,8 +205,7 @@ class _BulkResiduals:
         return self.looked.points + own[0], self.looked.curves + own[1]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _SumRound(RobustSolution):
+class _SumRound(RobustSolution, kw_only=True):
     """Where one round over all observations ended; inliers and residuals are the part's.
 
     Attributes:

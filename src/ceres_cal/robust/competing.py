@@ -12,12 +12,12 @@ What is said of a group that may not belong: how far it lies aside, how surely, 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Indices, Mask, medians_known
 from ceres_cal.base.errors import CalibrationError, attempt, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.evidence import Offsets, measure_offsets
@@ -48,8 +48,7 @@ from ceres_cal.robust.usable import require_fits
 DOUBTFUL = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Explanation:
+class Explanation(Frozen):
     """That a group of observations does not belong.
 
     Attributes:
@@ -166,8 +165,7 @@ _Suspects = tuple[ObservationGroups, tuple[int, ...]]
 """Groups of one kind, by their numbers."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
+class _Trial(Frozen):
     """What a solve without the suspects says of them.
 
     Attributes:

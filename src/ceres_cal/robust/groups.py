@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, median
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.evidence import FEATURE_ASIDE, VIEW_ASIDE, SizePrior
 from ceres_cal.observations import Columns, Observations, View
@@ -28,8 +28,7 @@ FEWEST_VIEWS = 4  # of which one may not belong
 FEWEST = 3  # observations of a group: two numbers of a line's offset, and one left over
 
 
-@dataclass(frozen=True, eq=False)
-class ObservationGroups(ABC):
+class ObservationGroups(Frozen, ABC):
     """The groups of one kind, by number, each of which may lie aside: an effect whose size is large. There are numbers
     of which nothing was observed.
 
@@ -225,8 +224,7 @@ _LEFT = 0.5
 _MOST_ASKED, _FEWEST_ASKED = 200_000, 200
 
 
-@dataclass(frozen=True, eq=False)
-class Subproblem:
+class Subproblem(Frozen):
     """The observations that are asked, with their problem and its end.
 
     Attributes:

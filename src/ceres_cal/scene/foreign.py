@@ -7,7 +7,6 @@ how much it misses: `error_px`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, make_lens
@@ -41,8 +41,7 @@ _GRID = (41, 31)  # pixels of the image over which a fit is made
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
 
 
-@dataclass(frozen=True, eq=False)
-class ForeignCamera:
+class ForeignCamera(Frozen):
     """A camera in the words of others.
 
     Attributes:

@@ -7,7 +7,7 @@ into stations and placements. Nothing here is the answer: the bundle is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, numerical
 from ceres_cal.base.errors import attempt
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
@@ -109,8 +110,7 @@ def _initialised(observations: Observations, sights: Sights, options: Options) -
     return Start(estimate, posed.phi_from, others=others)
 
 
-@dataclass(frozen=True, eq=False)
-class PosedSights:
+class PosedSights(Frozen):
     """Cameras and the sights that they were posed by.
 
     Attributes:

@@ -11,13 +11,13 @@ numbers of the homography H. Of H follow phi, by r1 . r2 = 0 and |r1| = |r2|, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.transforms import rotation_exp, skews
 from ceres_cal.observations import joined
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
@@ -32,8 +32,7 @@ _ROUGH_PX = 2.0  # scale of a search's first rounds
 _DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
 
 
-@dataclass(frozen=True, eq=False)
-class Beforehand:
+class Beforehand(Frozen):
     """What is known of a camera beforehand: means and standard deviations, infinite where nothing is, 0 where a number
     is held; and the least scale that residuals can have.
     """
@@ -58,8 +57,7 @@ class Beforehand:
         return np.where(share > 0.0, off, 0.0) * share, share
 
 
-@dataclass(frozen=True, eq=False)
-class BestCameras:
+class BestCameras(Frozen):
     """The best cameras, the least cost first.
 
     Attributes:
