@@ -130,7 +130,7 @@ def test_what_lies_towards_which_side() -> None:
     both = [Facing("LeftGoalLine", "top"), Facing("TopTouchLine", "left")]
     assert agreeing_with_facing(ways, both, FIELD, NAMES) == []
     # Mirrored it is no way: no turn has the left goal at the top and the top touch line at the left.
-    with pytest.raises(InputError, match="a side of the picture is one of left, right"):
+    with pytest.raises(InputError, match="choose one of left, right"):
         Facing("LeftGoalLine", "up")
 
 
@@ -165,7 +165,7 @@ def test_without_a_word_on_which_way_round(shot: script.Shot) -> None:
         InputError, match=r"in 2 ways: LeftGoalLine lies towards the (top|bottom) or the (top|bottom) of"
     ):
         search(shot.grey, FIELD, NAMES, Auto())
-    with pytest.raises(InputError, match="the target has no line, arc or point 'Nowhere'"):
+    with pytest.raises(InputError, match="there is no line or point 'Nowhere'"):
         search(shot.grey, FIELD, NAMES, Auto((Facing("Nowhere", "top"),)))
     with pytest.raises(InputError, match="HalfwayLine lies in the middle of the field"):
         search(shot.grey, FIELD, NAMES, Auto((Facing("HalfwayLine", "top"),)))
@@ -265,7 +265,7 @@ def test_from_photographs_alone_to_a_calibration(
         assert message in capsys.readouterr().err
     without = [argument for argument in detect if argument != "--auto"]
     assert main([*without, "--start", calibration, "--facing", "LeftGoalLine=top"]) == 2
-    assert "--facing is for --auto" in capsys.readouterr().err
+    assert "--facing needs --auto" in capsys.readouterr().err
     assert main([*without, "--target", "ssl-b"]) == 2
     assert "or --auto" in capsys.readouterr().err
 

@@ -173,7 +173,7 @@ def test_lengths_are_taken_everywhere(say: Say, tmp_path: Path) -> None:
     board = ["x.png", "--columns", "4", "--rows", "3", "-o", "y.json"]
     assert COMMANDS["detect board"].parse([*board, "--square", "25mm"]).square == 0.025
     assert COMMANDS["advise"].parse(["x", "--good-enough-mm", "0.2cm"]).good_enough_mm == 2.0
-    assert COMMANDS["undistort"].parse(["x", "y", "-o", "z", "--height-mm", "0.15m"]).height_mm == 150.0
+    assert COMMANDS["undistort"].parse(["x", "y", "-o", "z", "--top-view", "--height-mm", "0.15m"]).height_mm == 150.0
     out = tmp_path / "calibration.json"
     said = say("calibrate", SAMPLE, "-o", out, "--prior", "height_m=4020mm:1cm", "--tolerance", "field.lines_m=10mm")
     assert said.code == 0
@@ -293,7 +293,7 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
         (("simulate", "ssl-field"), "name a scene and a folder"),
         (("simulate", "atlantis", "-o", "x"), "there is no scene 'atlantis'"),
         (("simulate", "atlantis.json", "-o", "x"), "atlantis.json: no such file"),
-        (("simulate", "boards", "-o", "x", "--seed", "-1"), "--seed must be"),
+        (("simulate", "boards", "-o", "x", "--seed", "-1"), "--seed: '-1' is no whole number"),
         (("simulate", "boards", "-o", SAMPLE), "is a file: name a folder"),
         (("targets", "pitch"), "there is no target 'pitch'"),
         (("targets", "nowhere.json"), "nowhere.json: no such file"),
@@ -941,7 +941,9 @@ def test_detect_board_without_one(say: Say, photos: Path, tmp_path: Path) -> Non
     assert "not an image" in refused(say("detect", "board", photos / "notes.txt", *BOARD, "-o", out))
     assert "no images in this folder" in refused(say("detect", "board", ROOT / "data", *BOARD, "-o", out))
     assert ".json or .npz" in refused(say("detect", "board", photos, *BOARD, "-o", tmp_path / "o.csv"))
-    assert "belong together" in refused(say("detect", "board", photos, *BOARD, "-o", out, "--charuco", "DICT_4X4_50"))
+    assert "--charuco needs --marker" in refused(
+        say("detect", "board", photos, *BOARD, "-o", out, "--charuco", "DICT_4X4_50")
+    )
     assert not out.exists()
 
 

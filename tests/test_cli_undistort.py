@@ -140,9 +140,9 @@ def test_refusals(say: Say, folder: Path, tmp_path: Path) -> None:
         ((tmp_path / "missing.png",), "no such file"),
         ((photograph, tmp_path / "again" / "shot.png"), "would both become"),
         ((photograph, "--top-view", "--overlay"), "two kinds of pictures"),
-        ((photograph, "--area", "0,0,1,1"), "--area is for --top-view"),
+        ((photograph, "--area", "0,0,1,1"), "--area needs --top-view"),
         ((photograph, "--overlay", "--whole"), "--whole is for straight images"),
-        ((photograph, "--height-mm", "150"), "--height-mm is for"),
+        ((photograph, "--height-mm", "150"), "--height-mm needs --top-view or --overlay"),
         ((photograph, "--size", "12"), "write WIDTHxHEIGHT"),
         ((photograph, "--size", "0x7"), "0 x 7 px"),
         ((photograph, "--phi", "nan"), "not a finite number"),
@@ -201,5 +201,5 @@ def test_photographs_that_do_not_belong(say: Say, folder: Path, tmp_path: Path) 
     assert said.out.startswith("This calibration ")
     why = f"{tmp_path / 'shot.png'}: 64 x 48 px, but camera 'camera' has 1280 x 960"
     assert f"\nerror     no report: {why}" in said.out
-    assert "--images is for the report" in refused(say("calibrate", folder / "obs.json", "--images", wrong))
+    assert "--images needs --report" in refused(say("calibrate", folder / "obs.json", "--images", wrong))
     assert not (tmp_path / "page.html").exists()

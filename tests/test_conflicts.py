@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import RADIAL, SCENES, camera
 
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
@@ -247,19 +247,17 @@ def test_a_height_that_no_calibration_comes_out_of_is_refused() -> None:
         calibrate(seen(), under(height(150.0, 5e-6 * 150.0)))
 
 
-@pytest.mark.parametrize(
-    "name, square_m, why",
-    [
-        ("field-boards", 100.0, "target 'board' reaches 943 m from its origin: give its dimensions in metres"),
-        ("boards", 100.0, "target 'board' reaches 943 m from its origin"),
-        ("field-boards", 1.0, "target 'board' lies up to 16 m under the floor: its dimensions are too large"),
-    ],
-)
-def test_boards_in_another_unit_are_refused(name: str, square_m: float, why: str) -> None:
-    """Boards of 100 m squares under a camera at 5 m; alone they fit in any unit."""
-    observed = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
-    targets = {**observed.targets, "board": checkerboard(9, 6, square_m)}
-    with pytest.raises(SolutionError, match=why):
+def test_boards_in_another_unit_are_refused() -> None:
+    """One of 100 m squares, alone it would fit in any unit; one of 1 m squares lies under the floor."""
+    with pytest.raises(
+        InputError, match=r"checkerboard: it reaches 943 m from its origin.*give its dimensions in metres"
+    ):
+        checkerboard(9, 6, 100.0)
+    observed = simulate(SCENES["radial-2-3/field-boards"](), NOISE).observations
+    targets = {**observed.targets, "board": checkerboard(9, 6, 1.0)}
+    with pytest.raises(
+        SolutionError, match="target 'board' lies up to 16 m under the floor: its dimensions are too large"
+    ):
         calibrate(replace(observed, targets=targets), RADIAL)
 
 

@@ -153,7 +153,7 @@ def test_what_is_typed() -> None:
         ("length,length", "given twice"),
         ("length=long", "is not a number"),
         ("length=9:0", "sigma above 0"),
-        ("length=-9", "above 0"),
+        ("length=-9", "at least 0.45 m"),
     ):
         with pytest.raises(InputError, match=words):
             parse_estimates([text], {"field": FIELD})

@@ -123,7 +123,7 @@ def test_an_offset_is_no_length() -> None:
     seen = observations_of(FIELD, CAMERA.image_size, np.zeros(1, int), np.full((1, 2), 99.0), np.ones(1))
     priors = (Prior.of_offset("field", "HalfwayLine", 0.04), Prior("target", "field", "field_width_m", (5.9,), (0.1,)))
     detections = FieldDetections(replace(seen, priors=priors), {}, (), {})
-    assert Document(tuple(_sections(detections, None, Path("field.json")))).data["lengths_m"] == {"field_width_m": 5.9}
+    assert Document(tuple(_sections(detections, {}, Path("field.json")))).data["lengths_m"] == {"field_width_m": 5.9}
 
 
 @pytest.mark.parametrize("share", [0.92, 0.95, 0.97])

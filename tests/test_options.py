@@ -20,7 +20,7 @@ from ceres_cal.cli.command import (
     add_options,
     argument,
     filled,
-    given_of,
+    given,
     option,
     options_of,
     switch,
@@ -43,7 +43,6 @@ class Form:
     options: type[FormOptions] = FormOptions
 
 
-@dataclass(frozen=True, kw_only=True)
 class Every(QuietArguments):
     """One field of each kind."""
 
@@ -76,12 +75,16 @@ def test_everything_has_its_type() -> None:
     typed = (
         "x 1 --size 2cm 2 --count 4 --scale .5 --kind b --name p --name q --holds --no-usual --one --error-mm 9 --quiet"
     )
-    given = read(*typed.split())
-    assert given == Every(
+    args = read(*typed.split())
+    assert args == Every(
         first=Path("x"), rest=(1, 2), count=4, scale=0.5, size=20.0, kind="b", name=("p", "q"), holds=True, usual=False,
         one=True, form={"error_mm": "9"}, quiet=True,
     )  # fmt: skip
-    assert given_of(given, "more") == ["--usual"] and given_of(read("x", "--size", "2"), "more") == []
+    assert given(args)["usual"]["group"] == "more" and given(read("x", "--size", "2")).keys() == {
+        "first",
+        "size",
+        "form",
+    }
 
 
 @pytest.mark.parametrize(

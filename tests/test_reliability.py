@@ -392,7 +392,7 @@ def test_a_field_in_millimetres(observations: Observations) -> None:
     }  # fmt: skip
     large = replace(observations, targets={name: ssl_field(None, **lengths)}, priors=())
     assert (
-        f"target {name!r} reaches 4500 m from its origin: are its numbers metres"
+        f"target {name!r} reaches 5408 m from its origin: are its numbers metres"
         in calibrate(large, RADIAL).warnings[0]
     )
 

@@ -10,7 +10,7 @@ def test_all_kinds_are_read() -> None:
     kinds = {one.kind for one in EVERY}
     assert kinds == {"error", "help", "answer", "words"} and len(EVERY) > 1200  # 1700 measured
     texts = {one.text for one in EVERY}
-    assert "The solve converged." in texts and any(text.startswith("--facing is for --auto") for text in texts)
+    assert "The solve converged." in texts and any(text.startswith("--corner says where to start") for text in texts)
 
 
 @pytest.mark.parametrize(

@@ -287,10 +287,10 @@ arcs = st.builds(
     lambda centre, radius, start, span, width: Arc(centre, radius, start, start + span, width),
     *(places, st.floats(0.1, 9.0), st.floats(-4.0, 4.0), st.floats(0.1, 6.0), st.floats(0.0, 0.1)),
 )
-positive = st.floats(1e-3, 100.0)
+positive, handy = st.floats(1e-3, 100.0), st.floats(1e-3, 8.0)
 any_target = (
-    st.builds(checkerboard, st.integers(2, 5), st.integers(2, 5), positive)
-    | st.lists(positive, min_size=1, max_size=5, unique=True).map(lambda radii: rings(sorted(radii)))
+    st.builds(checkerboard, st.integers(2, 5), st.integers(2, 5), handy)
+    | st.lists(handy, min_size=1, max_size=5, unique=True).map(lambda radii: rings(sorted(radii)))
     | st.builds(ssl_field, st.sampled_from("AB"), field_length_m=positive, penalty_area_width_m=positive)
     | st.builds(custom, st.dictionaries(names, places, min_size=1), st.dictionaries(names, segments | arcs))
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,6 +42,7 @@ def detect_board(
     marker_m: float | None = None,
     legacy: bool = False,
     frames: int = 30,
+    folder: str | PathLike[str] | None = None,
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
     """Find a board in photographs or videos of one camera: `detect_board("photographs/", checkerboard(9, 6, 0.025))`.
@@ -51,27 +53,29 @@ def detect_board(
         corner_fit: "saddle", which also measures boards partly out of the picture, or "opencv".
         charuco: OpenCV's dictionary of a ChArUco board, such as "DICT_4X4_50"; marker_m: side of its markers, m.
         legacy: the ChArUco board was made with OpenCV before 4.6. frames: how many to take out of each video.
+        folder: where these are kept; by default they are not.
         progress: called after each image with (steps done, steps in all, file name).
 
     Raises:
         InputError: an image cannot be read, or no image shows the board.
     """
-    from ceres_cal.detect.boards import detect_boards
+    from ceres_cal.detect.boards import detect_boards, finder_of
     from ceres_cal.detect.charuco import CharucoSpec
     from ceres_cal.detect.video import frames_of_videos
 
     if (charuco is None) != (marker_m is None):
         raise InputError("charuco and marker_m belong together: give both or neither")
     corners = corner_fit if charuco is None or marker_m is None else CharucoSpec(charuco, marker_m, legacy)
+    finder_of(board, corners)  # or says what does not fit, before any video is read
     photographs, videos = images_and_videos(images)
-    with TemporaryDirectory() as folder:
-        photographs += frames_of_videos(videos, frames, Path(folder), progress)
+    with nullcontext(folder) if folder else TemporaryDirectory() as place:
+        photographs += frames_of_videos(videos, frames, Path(place), progress)
         return detect_boards(photographs, board, camera, station, corners, progress)
 
 
 @checked
 def detect_field(
-    images: Images,
+    images: Images | Callable[[], Images],
     target: Target | None = None,
     start: Calibration | Camera | Clicks | Mapping[str, tuple[float, float]] | None = None,
     *,
@@ -91,7 +95,8 @@ def detect_field(
     """Find the painted lines, corners and crossings of a field in photographs of one station.
 
     Args:
-        images: photographs that one camera took at one station. target: the field, such as `ssl_field("B")`; by
+        images: photographs that one camera took at one station, or a function that makes them, which is called once
+            all else is found to fit. target: the field, such as `ssl_field("B")`; by
             default that of the calibration to start from.
         start: where the camera was before, or four named points or more with their pixels, roughly. Without a start
             the field is found in the photograph.
@@ -109,13 +114,10 @@ def detect_field(
         InputError: an image cannot be read, or a name does not fit. NothingShownError: no image shows the field.
     """
     from ceres_cal.detect.images import read_grey
-    from ceres_cal.detect.photographs import SIDES, Auto, Clicks, Facing, FieldOptions
+    from ceres_cal.detect.photographs import Auto, Clicks, Facing, FieldOptions
     from ceres_cal.detect.photographs import detect_field as detected
 
     sides = facing or {}
-    for feature, side in sides.items():
-        if side not in SIDES:
-            raise InputError(f"facing {feature!r}: {no_such('side', side, SIDES)}")
     if sides and not auto and start is not None:
         raise InputError("facing is for a search without a start: a start says which way round the field is")
     posed: Camera | Clicks | Auto
@@ -134,12 +136,7 @@ def detect_field(
         posed = Auto(tuple(Facing(*one) for one in sides.items()), before)
     if target is None:
         raise InputError("target is missing: name the field, such as ssl_field('B')")
-    for feature in sides:
-        if feature not in target.point_index and feature not in target.curves:
-            raise InputError(f"facing: {no_such('line or point', feature, (*target.curves, *target.point_index))}")
-    for name in not_painted:
-        if name not in target.curves:
-            raise InputError(f"not_painted: {no_such('line', name, target.curves)}")
+    painted = lines_to_find(target, sides, not_painted, estimate)
     options = FieldOptions(
         camera or "camera",
         station or camera or "camera",
@@ -150,8 +147,30 @@ def detect_field(
         keep_start=keep_start,
         refused=refused,
     )
+    if isinstance(posed, Clicks):
+        posed.require_names(target)
+    return detected(image_files(images() if callable(images) else images), target, posed, painted, options, progress)
+
+
+def lines_to_find(
+    target: Target, facing: Mapping[str, str], not_painted: Sequence[str] = (), lengths: Sequence[Prior] = ()
+) -> list[str]:
+    """The lines of a field that are looked for in photographs.
+
+    Raises:
+        InputError: what is said of the field does not fit it: see `detect_field`.
+    """
+    from ceres_cal.detect.photographs.facing import Facing, require_sides
+    from ceres_cal.detect.photographs.field import require_findable
+
+    sides = [Facing(*one) for one in facing.items()]
+    for name in not_painted:
+        if name not in target.curves:
+            raise InputError(f"not_painted: {no_such('line', name, target.curves)}")
     painted = [name for name in target.curves if name not in not_painted]
-    return detected(image_files(images), target, posed, painted, options, progress)
+    require_findable(target, painted, lengths)
+    require_sides(sides, target, painted)
+    return painted
 
 
 def field_of(calibration: Calibration) -> Target | None:

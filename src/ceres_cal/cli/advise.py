@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.cli.arguments import (
-    calibration_argument,
-    height_option,
-    length,
-    metres,
-    parse_board,
-    station_option,
-)
+from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, command, option
 from ceres_cal.cli.files import read_calibration, station_of
 from ceres_cal.cli.terminal import progress_bar
@@ -25,21 +17,20 @@ if TYPE_CHECKING:
     from ceres_cal.diagnostics.advice import Advice, Measurement, Promise
 
 
-@dataclass(frozen=True, kw_only=True)
 class AdviseArguments(QuietArguments):
     """What is to be reached, and by which means."""
 
-    calibration: Path = calibration_argument()
-    height_mm: float = height_option("height of what is to be located; default: 150, a robot's top", 150.0)
-    station: str | None = station_option("whose map; may be left out where there is only one")
+    calibration: Path = arguments.calibration_argument()
+    height_mm: float = arguments.height_option("height of what is to be located; default: 150, a robot's top", 150.0)
+    station: str | None = arguments.station_option("whose map; may be left out where there is only one")
     good_enough_mm: float | None = option(
-        "the worst error that will do; nothing is advised where it is reached", "MM", read=length("mm")
+        "the worst error that will do; nothing is advised where it is reached", "MM", read=arguments.length("mm")
     )
     board: tuple[int, int, float] | None = option(
         "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
         "calibration's own, or that one",
         "COLUMNSxROWSxMM",
-        read=parse_board,
+        read=arguments.parse_board,
     )
 
 
@@ -60,7 +51,7 @@ def _run(args: AdviseArguments) -> Document:
     station = station_of(args.calibration, args.station, calibration)
     with naming(args.calibration), progress_bar(args) as bar:
         board = None if args.board is None else checkerboard(*args.board)
-        advice = advise(calibration, station, metres(args.height_mm), enough, board, bar.update)
+        advice = advise(calibration, station, arguments.metres(args.height_mm), enough, board, bar.update)
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
     return Document(tuple(_sections(advice, weak)))
 

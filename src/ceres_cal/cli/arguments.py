@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import re
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import did_you_mean
+from ceres_cal.base.words import did_you_mean, printable
 from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:
-    from ceres_cal.observations import Observations, Prior
+    from ceres_cal.observations import Prior
+    from ceres_cal.problem.parameters import Options
     from ceres_cal.scene.targets import Target
 
 PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
+FACING_EXAMPLE = "LeftGoalLine=top"
 _ESTIMATE_EXAMPLE = "length,width"
 _PLACES = {"FILE": "file ", "DIR": "folder "}
 _IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
@@ -33,12 +34,17 @@ def calibration_argument(what: str = "file that `ceres-cal calibrate` or `refit`
 
 def station_option(what: str = "which station; may be left out where there is only one") -> Any:
     """The option --station NAME."""
-    return option(what, "NAME")
+    return option(what, "NAME", read=name)
 
 
-def jobs_option(what: str, default: int) -> Any:
+def camera_option(what: str = "name of the camera", default: str | None = "camera") -> Any:
+    """The option --camera NAME."""
+    return option(what, "NAME", default, read=name)
+
+
+def jobs_option(what: str, default: int, **about: Any) -> Any:
     """The option --jobs: how many processes; 0 is one a core."""
-    return option(f"{what} at a time; default: {default or 'one a core'}", "N", default)
+    return option(f"{what} at a time; default: {default or 'one a core'}", "N", default, read=whole(0), **about)
 
 
 def output_option(what: str, default: Any = REQUIRED, metavar: str = "FILE") -> Any:
@@ -56,38 +62,38 @@ def prior_option(metavar: str = "OWNER.NAME=VALUE:SIGMA", what: str = "", group:
     return option(what or every, metavar, repeatable=True, group=group)
 
 
-def estimate_option(group: str = "") -> Any:
+def estimate_option(**about: Any) -> Any:
     """The option --estimate."""
     return option(
         f"dimensions of the field that are not known and solved for, such as {_ESTIMATE_EXAMPLE}: one length of it, or "
         "a height, must be known; width=5.5 says where to start, width=5.50:20mm how well it is known",
         "NAME,...",
         repeatable=True,
-        group=group,
+        **about,
     )
 
 
-def not_painted_option(what: str) -> Any:
+def not_painted_option(what: str, **about: Any) -> Any:
     """The option --not-painted of lines."""
-    return option(what, "NAME,...", "")
+    return option(what, "NAME,...", "", **about)
 
 
-def height_option(what: str, default_mm: float | None = None) -> Any:
+def height_option(what: str, default_mm: float | None = None, **about: Any) -> Any:
     """The option --height-mm."""
-    return option(what, "MM", default_mm, read=length("mm"))
+    return option(what, "MM", default_mm, read=length("mm"), **about)
 
 
 def timeout_option() -> Any:
     """The option --timeout S."""
-    return option("give up after so many seconds; default: never", "S")
+    return option("give up after so many seconds; default: never", "S", read=number("--timeout"))
 
 
 def frames_option() -> Any:
     """The option --frames N, of videos."""
-    return option("how many photographs to take out of a video, the sharpest of as many stretches", "N", 30)
+    what = "how many photographs to take out of a video, the sharpest of as many stretches"
+    return option(what, "N", 30, read=whole(1))
 
 
-@dataclass(frozen=True, kw_only=True)
 class ReportArguments(QuietArguments):
     """Of a command that may write what it made, and a page."""
 
@@ -97,6 +103,7 @@ class ReportArguments(QuietArguments):
         "with --report: a photograph, or a folder of them, named like the frames: the model is drawn into them",
         "PHOTOGRAPH",
         repeatable=True,
+        beside=("report",),
     )
 
 
@@ -149,12 +156,38 @@ def number(where: str) -> Callable[[str], float]:
     return partial(parse_number, where=where)
 
 
+def whole(least: int, most: float = float("inf")) -> Callable[[str], int]:
+    """The type of an argument that is a whole number in a range."""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch(r"-?\d+", text) or not least <= int(text) <= most:
+            raise ArgumentTypeError(f"{text!r} is no whole number from {least} {'on' if most > 1e9 else f'to {most}'}")
+        return int(text)
+
+    return parse
+
+
+def name(text: str) -> str:
+    """The type of an argument that names something: files hold it as UTF-8."""
+    if not text or text != printable(text):
+        raise ArgumentTypeError(f"'{printable(text)}' is no name in UTF-8: give another one")
+    return text
+
+
 def parse_board(text: str) -> tuple[int, int, float]:
     """COLUMNSxROWSxMM: inner corners, and the side of a square in metres."""
     parts = text.split("x")
     if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
         raise InputError(f"board {text!r}: write COLUMNSxROWSxSQUARE, such as 9x6x25mm")
     return int(parts[0]), int(parts[1]), parse_length(parts[2], f"board {text!r}", "mm") / 1000.0
+
+
+def parse_facing(spec: str) -> tuple[str, str]:
+    """NAME=SIDE of a picture."""
+    name, equals, side = (part.strip() for part in spec.partition("="))
+    if not (name and equals and side):
+        raise InputError(f"--facing {spec!r}: write NAME=SIDE, such as {FACING_EXAMPLE}")
+    return name, side
 
 
 def parse_names(text: str) -> list[str]:
@@ -167,57 +200,40 @@ def metres(height_mm: float | None) -> float:
     return 0.0 if height_mm is None else height_mm / 1000.0
 
 
-class PriorNames(NamedTuple):
-    """The quantities that a `--prior` may name: of a station, and of a camera."""
+def parse_prior(spec: str, owners: Mapping[str, Collection[str]], quantities: Mapping[str, Sequence[str]]) -> Prior:
+    """The prior of a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; InputError that names it.
 
-    station: Sequence[str]
-    camera: Sequence[str] = ()
+    Args:
+        owners: names of stations, and of cameras. quantities: those that may be named, of a station and of a camera.
+    """
+    from ceres_cal.observations import prior_from_json
 
-    @property
-    def known(self) -> str:
-        of_camera = f", a camera {', '.join(self.camera)}" if self.camera else ""
-        return f"a station has {', '.join(self.station)}{of_camera}"
-
-
-def prior_parts(spec: str, names: PriorNames) -> tuple[str, str, str, tuple[float, ...]]:
-    """Owner, quantity, values and sigmas of a `--prior` argument; InputError that names it."""
     where = f"--prior {spec!r}"
     left, equals, right = spec.rpartition("=")
     values, colon, sigmas = right.partition(":")
     if not (equals and colon):
         raise InputError(f"{where}: write OWNER.NAME=VALUE:SIGMA, such as {PRIOR_EXAMPLE}")
     name, _, quantity = left.strip().rpartition(".")
-    if quantity not in (*names.station, *names.camera):
-        meant = did_you_mean(quantity, (*names.station, *names.camera))
-        raise InputError(f"{where}: there is no quantity {quantity!r}{meant or f': {names.known}'}")
-    sigma = _parser_of(quantity)(sigmas, f"{where}: sigma")
+    owner = next((one for one, known in quantities.items() if quantity in known), "")
+    if not owner:
+        meant = did_you_mean(quantity, [one for known in quantities.values() for one in known])
+        known = ", ".join(f"a {one} has {', '.join(names)}" for one, names in quantities.items())
+        raise InputError(f"{where}: there is no quantity {quantity!r}{meant or f': {known}'}")
+    parse = parse_lengths if quantity.endswith("_m") else parse_numbers
+    sigma = parse(sigmas, f"{where}: sigma")
     if min(sigma) <= 0.0:
         raise InputError(f"{where}: sigma must be above 0")
-    return name, quantity, values, sigma
+    name = name if name or len(owners[owner]) != 1 else next(iter(owners[owner]))
+    if name not in owners[owner]:
+        raise InputError(f"{where}: name one {owner} before the dot: {', '.join(owners[owner])}")
+    spread = {"sigma_m" if owner == "station" else "sigma": sigma[0] if len(sigma) == 1 else list(sigma)}
+    return prior_from_json({owner: name, quantity: list(parse(values, where)), **spread}, where)
 
 
-def _parser_of(quantity: str) -> Callable[[str, str], tuple[float, ...]]:
-    return parse_lengths if quantity.endswith("_m") else parse_numbers
-
-
-def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Prior:
-    """The prior of a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; InputError that names it."""
-    from ceres_cal.observations import prior_from_json
-
-    where, (name, quantity, values, sigma) = f"--prior {spec!r}", prior_parts(spec, names)
-    owner, known = ("station", observations.stations) if quantity in names.station else ("camera", observations.cameras)
-    if not name and len(known) == 1:
-        name = next(iter(known))
-    if name not in known:
-        raise InputError(f"{where}: name one {owner} before the dot: {', '.join(known)}")
-    return prior_from_json(
-        {
-            owner: name,
-            quantity: list(_parser_of(quantity)(values, where)),
-            "sigma_m" if owner == "station" else "sigma": sigma[0] if len(sigma) == 1 else list(sigma),
-        },
-        where,
-    )
+def parse_priors(specs: Sequence[str], owners: Mapping[str, Collection[str]], options: Options) -> list[Prior]:
+    """The priors of `--prior` arguments beside options of `calibrate`."""
+    quantities = {"station": ("height_m", "position_m"), "camera": (*options.intrinsic_names, "principal_point")}
+    return [parse_prior(spec, owners, quantities) for spec in specs]
 
 
 def parse_estimates(specs: Sequence[str], targets: Mapping[str, Target]) -> tuple[Prior, ...]:
@@ -235,6 +251,7 @@ def parse_estimates(specs: Sequence[str], targets: Mapping[str, Target]) -> tupl
 
 def _parsed(text: str, targets: Mapping[str, Target]) -> Prior:
     from ceres_cal.observations import Prior
+    from ceres_cal.problem.ranges import dimension_range
 
     where = f"--estimate {text!r}"
     left, equals, right = text.partition("=")
@@ -246,7 +263,9 @@ def _parsed(text: str, targets: Mapping[str, Target]) -> Prior:
         said = f"may be {' or '.join(one for _, one in found)}" if found else "is no dimension"
         raise InputError(f"{where}: {word!r} {said}: there are {', '.join(names) or 'none'}")
     ((name, dimension),) = found
-    length = parse_length(value, where) if equals else targets[name].dimensions[dimension]
+    drawn_m = targets[name].dimensions[dimension]
+    length = parse_length(value, where) if equals else drawn_m
+    dimension_range(drawn_m).require(length, f"{where}: {dimension}")
     sd = parse_length(sigma, f"{where}: sigma") if colon else float("inf")
     return Prior("target", name, dimension, (length,), (sd,))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from ceres_cal.moves.agreement import Agreement
 
 
-@dataclass(frozen=True, kw_only=True)
 class AuditArguments(Arguments):
     """A calibration, and what is held against it."""
 

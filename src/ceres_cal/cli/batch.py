@@ -8,7 +8,6 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +28,6 @@ _EXIT_CODES = {"failed": 3, "no": 1}
 _MOST_REASONS = 4
 
 
-@dataclass(frozen=True, kw_only=True)
 class BatchArguments(QuietArguments):
     """The jobs, and where their results go."""
 

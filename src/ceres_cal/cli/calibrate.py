@@ -5,33 +5,13 @@ from __future__ import annotations
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import (
-    Loss,
-    PriorNames,
-    ReportArguments,
-    estimate_option,
-    output_option,
-    parse_estimates,
-    parse_length,
-    parse_names,
-    parse_number,
-    parse_prior,
-    prior_option,
-)
+from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
-from ceres_cal.cli.files import (
-    read_observations,
-    report_page,
-    report_photographs,
-    require_different,
-    require_outputs,
-    write_results,
-)
 from ceres_cal.cli.terminal import ProgressBar, progress_bar
 from ceres_cal.report.document import Document
 
@@ -56,14 +36,13 @@ def _lens_kind(name: str) -> str:
     return name
 
 
-@dataclass(frozen=True, kw_only=True)
-class CalibrateArguments(ReportArguments):
+class CalibrateArguments(arguments.ReportArguments):
     """What is to be solved for and how; what is named as in `Options` goes there as it is."""
 
     observations: tuple[str, ...] = argument(
         "OBS", "files of observations (.json or .npz, or one folder .columns), taken together"
     )
-    output: Path | None = output_option("the calibration", None)
+    output: Path | None = arguments.output_option("the calibration", None)
     lens: str | None = option(
         "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), spline (no formula), ...: `--lens ?` "
         "names all; default: auto, the simplest of all with a formula that predicts views as well as any other",
@@ -116,13 +95,13 @@ class CalibrateArguments(ReportArguments):
         group=_CAMERA,
     )
     as_built: bool = switch("the contrary of --as-drawn, which is the default", group=_CAMERA)
-    prior: tuple[str, ...] = prior_option(group=_CAMERA)
-    estimate: tuple[str, ...] = estimate_option(group=_CAMERA)
+    prior: tuple[str, ...] = arguments.prior_option(group=_CAMERA)
+    estimate: tuple[str, ...] = arguments.estimate_option(group=_CAMERA)
     mend_labels: bool = switch(
         "give features that were seen under the name of another their own, and calibrate again; else they are named",
         group=_SOLVE,
     )
-    loss: Loss = option(default="huber", group=_SOLVE)
+    loss: arguments.Loss = option(default="huber", group=_SOLVE)
     loss_scale: float = option("where the loss starts to bend", "SIGMA", 2.5, group=_SOLVE)
     reject_sigma: float = option("observations farther off are taken out and listed", "SIGMA", 5.0, group=_SOLVE)
     noise_scale: Literal["estimate", "stated"] = option(
@@ -149,11 +128,11 @@ class CalibrateArguments(ReportArguments):
     "field.json --estimate length,width=5.50:20mm -o calibration.json",
 )
 def _run(args: CalibrateArguments) -> Document:
-    require_outputs(args, args.observations)
-    require_different(args.observations)
+    files.require_outputs(args, args.observations)
+    files.require_different(args.observations)
     fixed, powers = _fixed(args.fix), _powers(args)  # wrong usage is said before anything is read
-    observations = read_observations(args.observations)
-    photographs = report_photographs(args, observations)
+    observations = files.read_observations(args.observations)
+    photographs = files.report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
     with progress_bar(args) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
@@ -170,9 +149,9 @@ def _run(args: CalibrateArguments) -> Document:
     calibration = replace(calibration, warnings=(*calibration.warnings, *told))
     from ceres_cal.report.summary import calibration_sections
 
-    page, unmade = report_page(args, calibration, observations, photographs)
+    page, unmade = files.report_page(args, calibration, observations, photographs)
     answer = tuple(calibration_sections(quality_of(calibration, observations), args.observations))
-    return Document((*answer, unmade, write_results(args, calibration.save, page)), 1 if unmade.data else 0)
+    return Document((*answer, unmade, files.write_results(args, calibration.save, page)), 1 if unmade.data else 0)
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:
@@ -229,7 +208,7 @@ def _fixed(specs: Sequence[str]) -> dict[str, float]:
             raise InputError(f"--fix {spec!r}: write NAME=VALUE, such as k3=0")
         if name.strip() in fixed:
             raise InputError(f"--fix {spec!r}: {name.strip()} is fixed twice")
-        fixed[name.strip()] = parse_number(value, f"--fix {spec!r}")
+        fixed[name.strip()] = arguments.parse_number(value, f"--fix {spec!r}")
     return fixed
 
 
@@ -238,10 +217,13 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
     from ceres_cal.problem.parameters import Options
     from ceres_cal.problem.structure import dimensions_of
 
-    parsed |= {"lens": args.lens or _AUTO, "terms": tuple(parse_names(args.terms))}  # powers alone make radial
-    lengths, drawn = parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
-    names = PriorNames(("height_m", "position_m"), (*Options(**parsed).intrinsic_names, "principal_point"))
-    priors = [parse_prior(spec, observations, names) for spec in args.prior]
+    parsed |= {
+        "lens": args.lens or _AUTO,
+        "terms": tuple(arguments.parse_names(args.terms)),
+    }  # powers alone make radial
+    lengths, drawn = arguments.parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
+    owners = {"station": observations.stations, "camera": observations.cameras}
+    priors = arguments.parse_priors(args.prior, owners, Options(**parsed))
     priors += [one for one in lengths if not one.is_open or one.value[0] != drawn[one.dimension]]
     parsed |= {
         "priors": tuple(priors),
@@ -264,5 +246,5 @@ def _tolerances(specs: Sequence[str]) -> dict[str, Tolerance]:
         target, dot, what = left.strip().rpartition(".")
         if not (equals and dot) or what not in names:
             raise InputError(f"--tolerance {spec!r}: write TARGET.{'|'.join(names)}=SIGMA, such as field.lines_m=0.01")
-        given.setdefault(target, {})[what] = parse_length(value, f"--tolerance {spec!r}")
+        given.setdefault(target, {})[what] = arguments.parse_length(value, f"--tolerance {spec!r}")
     return {target: Tolerance(**sigmas) for target, sigmas in given.items()}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import HEIGHTS_M, at_height
-from ceres_cal.cli.arguments import parse_names, parse_number
+from ceres_cal.cli.arguments import parse_names, parse_number, whole
 from ceres_cal.cli.command import command, option
 from ceres_cal.cli.files import read_calibration, read_observations
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
@@ -29,7 +28,6 @@ def _share(text: str) -> float:
     return value
 
 
-@dataclass(frozen=True, kw_only=True)
 class CheckArguments(InputArguments):
     """What is held against a calibration, and how sure the answer is to be."""
 
@@ -37,7 +35,10 @@ class CheckArguments(InputArguments):
         "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
     )
     checks: int = option(
-        "that is at least once in N checks of this calibration: 720 for an hourly check over a month", "N", 1
+        "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
+        "N",
+        1,
+        read=whole(1),
     )
 
 

@@ -1,6 +1,6 @@
 """What every command has: a name, arguments, and a document that it answers, for people or for scripts.
 
-The options of a command: fields of a frozen dataclass, each with its help, from which the parser is made.
+The options of a command: fields of a subclass of `Arguments`, each with its help, from which the parser is made.
 
 A field is made by `option`, `switch` or `argument`; its type says the rest: an argument that is a tuple takes any
 number, of a Literal one is chosen, and Path, int and float are read as such.
@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields
 from types import NoneType
-from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.lazy import LazyTable
@@ -36,6 +36,7 @@ def option(
     repeatable: bool = False,
     group: str = "",
     alone: str = "",
+    beside: tuple[str, ...] = (),
 ) -> Any:
     """A field that is an option, --like-this where its name is like_this.
 
@@ -43,18 +44,17 @@ def option(
         help: what it does; a function where that takes an import. Its default, where it has one, is added.
         flags: how it is typed, where otherwise. read: a value from its text, where its type does not say it.
         repeatable: whether it may be given again and again; the field is a tuple.
-        group: title in the help. alone: of options of the same word one may be given.
+        group: title in the help. alone: of options of the same word one may be given. beside: names of options of which
+            one has to be given, too.
     """
     given = {"flags": flags, "read": read, "repeatable": repeatable, "group": group, "alone": alone}
-    about = {"help": help, "metavar": metavar, **given}
+    about = {"help": help, "metavar": metavar, "beside": beside, **given}
     return field(default=() if repeatable and default is None else default, metadata=about)
 
 
-def switch(
-    help: str, default: bool | None = False, *, flags: tuple[str, ...] = (), group: str = "", alone: str = ""
-) -> Any:
-    """A field that is an option without a value, which makes it the contrary of its default."""
-    return option(help, default=default, flags=flags, group=group, alone=alone)
+def switch(help: str, default: bool | None = False, **about: Any) -> Any:
+    """A field that is an option without a value, which makes it the contrary of its default; about: see `option`."""
+    return option(help, default=default, **about)
 
 
 def argument(metavar: str, help: str | Callable[[], str], default: Any = REQUIRED) -> Any:
@@ -67,14 +67,22 @@ def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
     return field(default_factory=dict, metadata={"forms": forms})
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arguments:
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+class _Fields:
+    """Makes each class below it a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
+
+
+class Arguments(_Fields):
     """What every command takes."""
 
     json: bool = switch("print one JSON object")
 
 
-@dataclass(frozen=True, kw_only=True)
 class QuietArguments(Arguments):
     """Of a command that shows how far it is."""
 
@@ -118,13 +126,17 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def given_of(args: Arguments, group: str) -> list[str]:
-    """The options of a group that were given, as they are typed."""
-    return [
-        flag(one.name)
-        for one in fields(args)
-        if one.metadata.get("group") == group and getattr(args, one.name) != one.default
-    ]
+def given(args: Arguments) -> dict[str, Mapping[str, Any]]:
+    """What was given, by name, with what was said of each where it is defined."""
+    return {one.name: one.metadata for one in fields(args) if getattr(args, one.name) != one.default}
+
+
+def _require_beside(args: Arguments) -> None:
+    """Raise InputError for an option without the one that it belongs to."""
+    every = given(args)
+    for name, about in every.items():
+        if (others := about.get("beside", ())) and every.keys().isdisjoint(others):
+            raise InputError(f"{flag(name)} needs {' or '.join(map(flag, others))}: give both, or leave it out")
 
 
 def _frozen(value: Any) -> Any:
@@ -232,7 +244,9 @@ class Command:
         """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
         parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
         self.fill(parser)
-        return filled(self.arguments, parser.parse_intermixed_args(arguments))
+        args = filled(self.arguments, parser.parse_intermixed_args(arguments))
+        _require_beside(args)
+        return args
 
     @property
     def about(self) -> dict[str, Any]:

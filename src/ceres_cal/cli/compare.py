@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from ceres_cal.moves.agreement import Agreement
 
 
-@dataclass(frozen=True, kw_only=True)
 class CompareArguments(Arguments):
     """Two calibrations, and where to compare them."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from argparse import ArgumentParser
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal
 
 from ceres_cal.base.errors import InputError
@@ -19,7 +18,6 @@ _EXAMPLES = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
 class CompletionArguments(Arguments):
     """Whose."""
 

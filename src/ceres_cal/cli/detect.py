@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import images_and_videos
-from ceres_cal.cli.arguments import frames_option, length, parse_length, parse_lengths
+from ceres_cal.cli.arguments import frames_option, length, number, parse_length, parse_lengths
 from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, command, flag, option, switch
 from ceres_cal.cli.files import finishing, read_target, require_observations_output
 from ceres_cal.cli.photographs import DetectArguments, detected, missed_section
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, kw_only=True)
 class BoardArguments(QuietArguments, DetectArguments):
     """Photographs, and the board in them."""
 
@@ -36,15 +34,29 @@ class BoardArguments(QuietArguments, DetectArguments):
     )
     square: float | None = option("side of a square in metres, or such as 25mm", "M", read=length("m"))
     april_grid: float | None = option(
-        "Kalibr's AprilGrid: side of a tag likewise; columns and rows are of tags", "M", read=length("m")
+        "Kalibr's AprilGrid: side of a tag likewise; columns and rows are of tags",
+        "M",
+        read=length("m"),
+        beside=("gap",),
     )
-    gap: float | None = option("with --april-grid: between tags, over their side (tagSpacing)", "SHARE")
-    circles: float | None = option("a grid of circles, so far apart, instead of squares", "M", read=length("m"))
-    asymmetric: bool = switch("with --circles: every other row half a step aside, M as in OpenCV")
-    diameter: float | None = option("with --circles: of a circle", "M", read=length("m"))
-    charuco: str | None = option("the board has markers of this OpenCV dictionary, such as DICT_4X4_50", "DICT")
-    marker: float | None = option("side of a marker likewise, with --charuco", "M", read=length("m"))
-    legacy: bool = switch("with --charuco: made with OpenCV before 4.6")
+    gap: float | None = option(
+        "with --april-grid: between tags, over their side (tagSpacing)",
+        "SHARE",
+        read=number("--gap"),
+        beside=("april_grid",),
+    )
+    circles: float | None = option(
+        "a grid of circles, so far apart, instead of squares", "M", read=length("m"), beside=("diameter",)
+    )
+    asymmetric: bool = switch("with --circles: every other row half a step aside, M as in OpenCV", beside=("circles",))
+    diameter: float | None = option("with --circles: of a circle", "M", read=length("m"), beside=("circles",))
+    charuco: str | None = option(
+        "the board has markers of this OpenCV dictionary, such as DICT_4X4_50", "DICT", beside=("marker",)
+    )
+    marker: float | None = option(
+        "side of a marker likewise, with --charuco", "M", read=length("m"), beside=("charuco",)
+    )
+    legacy: bool = switch("with --charuco: made with OpenCV before 4.6", beside=("charuco",))
     corner_fit: Literal["saddle", "opencv"] = option(
         "measure corners by the saddle around each (default), also of boards partly out of the picture, or as "
         "OpenCV does, whole boards alone",
@@ -65,21 +77,15 @@ class BoardArguments(QuietArguments, DetectArguments):
 def _run_board(args: BoardArguments) -> Document:
     images, videos = images_and_videos(args.images)
     require_observations_output(args.output, [*images, *videos])
-    from ceres_cal.detect.boards import detect_boards
-    from ceres_cal.detect.charuco import CharucoSpec
-    from ceres_cal.detect.video import frames_of_videos
+    from ceres_cal.functions import detect_board
 
-    corners: str | CharucoSpec = args.corner_fit
-    if args.charuco is not None and args.marker is not None:
-        corners = CharucoSpec(args.charuco, args.marker, args.legacy)
-    elif args.charuco is not None or args.marker is not None:
-        raise InputError("--charuco DICT and --marker M belong together: give both or neither")
-    board = _board(args)
+    same = ("camera", "station", "corner_fit", "charuco", "legacy", "frames")
+    how: dict[str, Any] = {name: getattr(args, name) for name in same}
+    how |= {"marker_m": args.marker, "folder": args.output.parent}
     with progress_bar(args) as bar:
-        taken = partial(frames_of_videos, videos, args.frames, args.output.parent, bar.update)
-        images += detected(args.timeout, taken)
-        found = partial(detect_boards, images, board, args.camera, args.station, corners, bar.update)
-        detections = detected(args.timeout, found)
+        detections = detected(
+            args.timeout, partial(detect_board, args.images, _board(args), **how, progress=bar.update)
+        )
     with finishing():
         detections.observations.save(args.output)
     return _document(detections, args.output)
@@ -104,12 +110,9 @@ def _board(args: BoardArguments) -> Target:
     if args.charuco is not None:
         raise InputError("--charuco is for a board of squares: give --square M")
     if args.april_grid is not None:
-        if args.gap is None:
-            raise InputError("--april-grid M needs --gap SHARE")
-        return april_grid(args.columns, args.rows, args.april_grid, args.gap)
-    if args.circles is None or args.diameter is None:
-        raise InputError("--circles M needs --diameter M")
-    return circle_grid(args.columns, args.rows, args.circles, args.diameter, asymmetric=args.asymmetric)
+        return april_grid(args.columns, args.rows, args.april_grid, args.gap or 0.0)
+    distance, diameter = args.circles or 0.0, args.diameter or 0.0
+    return circle_grid(args.columns, args.rows, distance, diameter, asymmetric=args.asymmetric)
 
 
 def _document(detections: BoardDetections, output: Path) -> Document:
@@ -138,7 +141,6 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-@dataclass(frozen=True, kw_only=True)
 class RingsArguments(DetectArguments):
     """A photograph of rings, and the rings."""
 

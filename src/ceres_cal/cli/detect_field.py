@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,18 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import images_and_videos
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import (
-    estimate_option,
-    not_painted_option,
-    output_option,
-    parse_estimates,
-    parse_names,
-    parse_numbers,
-    station_option,
-    timeout_option,
-)
+from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import QuietArguments, argument, command, option, switch
-from ceres_cal.cli.files import finishing, json_object, read_target, require_observations_output
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -34,10 +23,8 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Target
 
 _CORNER = "TopLeftCorner=102,88"
-_FACING = "LeftGoalLine=top"
 
 
-@dataclass(frozen=True, kw_only=True)
 class FieldArguments(QuietArguments):
     """Photographs, the field in them, and where to start."""
 
@@ -63,24 +50,29 @@ class FieldArguments(QuietArguments):
     auto: bool = switch(
         "without any start: find the field in the photograph; with --start CALIBRATION, however far it has moved"
     )
-    keep_start: bool = switch("the start is good to 12 px: nothing farther off is looked at")
+    keep_start: bool = switch(
+        "the start is good to 12 px: nothing farther off is looked at", beside=("start", "corner")
+    )
     facing: tuple[str, ...] = option(
         "with --auto: which way round a field is that looks alike turned, by the side of the picture (left, "
-        f"right, top, bottom, top-left, ...) that a line or point lies towards, such as {_FACING}; it need not be in "
-        "the picture",
+        f"right, top, bottom, top-left, ...) that a line or point lies towards, such as {arguments.FACING_EXAMPLE}; it "
+        "need not be in the picture",
         "NAME=SIDE",
         repeatable=True,
+        beside=("auto",),
     )
-    estimate: tuple[str, ...] = estimate_option()
-    not_painted: str = not_painted_option("lines of the target that this field does not have")
+    estimate: tuple[str, ...] = arguments.estimate_option()
+    not_painted: str = arguments.not_painted_option("lines of the target that this field does not have")
     mask: Path | None = option("a picture of the same size: what is black in it is left out (hall, people)", "FILE")
     picture: Path | None = option("draw what was seen in the first photograph that is refused", "FILE")
     edges: bool = switch("both edges of each line instead of its middle")
     lines_only: bool = switch("no corners and crossings")
-    camera: str | None = option("name of the camera; default: that of the calibration, or camera", "NAME")
-    station: str | None = station_option("name of the station, to start from and to write; default: likewise")
-    output: Path = output_option("the observations (.json or .npz)")
-    timeout: float | None = timeout_option()
+    camera: str | None = arguments.camera_option(
+        "name of the camera; default: that of the calibration, or camera", None
+    )
+    station: str | None = arguments.station_option("name of the station, to start from and to write; default: likewise")
+    output: Path = arguments.output_option("the observations (.json or .npz)")
+    timeout: float | None = arguments.timeout_option()
 
 
 @command(
@@ -94,26 +86,36 @@ class FieldArguments(QuietArguments):
 )
 def _run(args: FieldArguments) -> Document:
     images, videos = images_and_videos(args.images)
-    require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
+    files.require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
+    files.require_output(args.picture, [*images, *videos])
+    files.require_ending(args.picture, "pictures are", ".png")
     one = median_path(args.output, [*images, *videos]) if videos or args.median else None
     _require_fitting(args)
     from ceres_cal.calibration import Calibration
     from ceres_cal.functions import detect_field, field_of
 
     start = _corners(args.corner) if args.corner else None if args.start is None else _start(args.start, auto=args.auto)
-    target = read_target(args.target, "field") if args.target else None
+    target = files.read_target(args.target, "field") if args.target else None
     if target is None and isinstance(start, Calibration):
         target = field_of(start)
     if target is None:
         raise InputError("name the field with --target, such as --target ssl-b")
+    bar, merged = progress_bar(args), {}
+
+    def pictures() -> list[Path]:
+        if one is not None:
+            merged.update(write_median(one, images, videos, bar))
+        return images if one is None else [one]
+
     look = partial(
         detect_field,
+        pictures,
         target=target,
         start=start,
         auto=args.auto,
-        facing=dict(map(_facing, args.facing)),
-        not_painted=parse_names(args.not_painted),
-        estimate=parse_estimates(args.estimate, {"field": target}),
+        facing=dict(map(arguments.parse_facing, args.facing)),
+        not_painted=arguments.parse_names(args.not_painted),
+        estimate=arguments.parse_estimates(args.estimate, {"field": target}),
         mask=args.mask,
         edges=args.edges,
         lines_only=args.lines_only,
@@ -121,15 +123,11 @@ def _run(args: FieldArguments) -> Document:
         camera=args.camera,
         station=args.station,
         refused=_drawing(args.picture, target),
+        progress=bar.update,
     )
-    merged = None
-    if one is not None:
-        with progress_bar(args) as bar:
-            merged = detected(args.timeout, partial(write_median, one, images, videos, bar))
-        images = [one]
-    with progress_bar(args) as bar:
-        detections = detected(args.timeout, partial(look, images, progress=bar.update))
-    with finishing():
+    with bar:
+        detections = detected(args.timeout, look)
+    with files.finishing():
         detections.observations.save(args.output)
     return Document(tuple(_sections(detections, merged, args.output)))
 
@@ -159,8 +157,6 @@ def _require_fitting(args: FieldArguments) -> None:
         raise InputError(f"say where to start: --start FILE, or --corner {_CORNER} four times, or --auto")
     if args.auto and args.corner:
         raise InputError("--corner says where to start and --auto to do without: give one of them")
-    if args.facing and not args.auto:
-        raise InputError("--facing is for --auto: a start already says which way round the field is")
 
 
 # ---- where to start -------------------------------------------------------------------------------------------------
@@ -170,18 +166,11 @@ def _start(path: Path, *, auto: bool) -> Calibration | Clicks:
     from ceres_cal.calibration import FORMAT, Calibration
     from ceres_cal.detect.photographs import load_clicks
 
-    if json_object(path).get("format") == FORMAT:
+    if files.json_object(path).get("format") == FORMAT:
         return Calibration.load(path)
     if auto:
         raise InputError(f"{path}: --auto takes a calibration as start, no corners: leave out --auto, or the file")
     return load_clicks(path)
-
-
-def _facing(spec: str) -> tuple[str, str]:
-    name, equals, side = (part.strip() for part in spec.partition("="))
-    if not (name and equals and side):
-        raise InputError(f"--facing {spec!r}: write NAME=SIDE, such as {_FACING}")
-    return name, side
 
 
 def _corners(specs: Sequence[str]) -> Clicks:
@@ -191,7 +180,7 @@ def _corners(specs: Sequence[str]) -> Clicks:
     for spec in specs:
         where = f"--corner {spec!r}"
         name, equals, place = spec.partition("=")
-        numbers = parse_numbers(place, where) if equals else ()
+        numbers = arguments.parse_numbers(place, where) if equals else ()
         if len(numbers) != 2:
             raise InputError(f"{where}: write NAME=X,Y, such as {_CORNER}")
         if name.strip() in points:
@@ -203,7 +192,7 @@ def _corners(specs: Sequence[str]) -> Clicks:
 # ---- the answer -----------------------------------------------------------------------------------------------------
 
 
-def _sections(detections: FieldDetections, merged: dict[str, Any] | None, output: Path) -> Iterator[Section]:
+def _sections(detections: FieldDetections, merged: dict[str, Any], output: Path) -> Iterator[Section]:
     observations, images = detections.observations, [_image_data(path, detections) for path in detections.found]
     points, curves = len(observations.points), len(observations.curves)
     every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
@@ -214,7 +203,7 @@ def _sections(detections: FieldDetections, merged: dict[str, Any] | None, output
     said = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
     rough = [f"lengths, roughly, for `calibrate` to solve for: {said} m"] if lengths else []
     yield Section("", rough, {"lengths_m": lengths})
-    if merged is not None:
+    if merged:
         yield Section("", [median_text(merged)], {"median": merged})
     yield Section("", tuple(_image_lines(images)))
     yield missed

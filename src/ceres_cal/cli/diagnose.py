@@ -2,48 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import (
-    ReportArguments,
-    calibration_argument,
-    jobs_option,
-    number,
-    output_option,
-)
+from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
-from ceres_cal.cli.files import (
-    read_calibration,
-    read_observations,
-    report_page,
-    report_photographs,
-    require_ending,
-    require_outputs,
-    write_results,
-)
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document
 
 
-@dataclass(frozen=True, kw_only=True)
-class DiagnoseArguments(ReportArguments):
+class DiagnoseArguments(arguments.ReportArguments):
     """A calibration, observations, and how they are tested."""
 
-    calibration: Path = calibration_argument()
+    calibration: Path = arguments.calibration_argument()
     observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order")
-    output: Path | None = output_option("the residual of every observation (.csv, .json or .npz)", None)
+    output: Path | None = arguments.output_option("the residual of every observation (.csv, .json or .npz)", None)
     new_data: bool = switch("the observations are others than those it was made from")
     held_out: bool = switch(
         "also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
         "lens predicts best",
     )
     strict: bool = switch("exit with 1 for any finding, also one that does no harm")
-    folds: int = option("parts into which frames go for --held-out", "K", 5)
-    jobs: int = jobs_option("folds, for --held-out,", 1)
+    folds: int = option(
+        "parts into which frames go for --held-out", "K", 5, read=arguments.whole(2), beside=("held_out",)
+    )
+    jobs: int = arguments.jobs_option("folds, for --held-out,", 1, beside=("held_out",))
     false_alarms: float = option(
-        "probability of any finding where nothing is wrong", "P", 0.01, read=number("--false-alarms")
+        "probability of any finding where nothing is wrong", "P", 0.01, read=arguments.number("--false-alarms")
     )
 
 
@@ -59,32 +44,30 @@ def _run(args: DiagnoseArguments) -> Document:
     from ceres_cal.diagnostics import diagnose
     from ceres_cal.diagnostics.held_out import choose
 
-    calibration, observations = read_calibration(args.calibration), read_observations(args.observations)
-    photographs = report_photographs(args, observations)
+    calibration, observations = files.read_calibration(args.calibration), files.read_observations(args.observations)
+    photographs = files.report_photographs(args, observations)
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=args.false_alarms)
     choice = None
     if args.held_out:
         with progress_bar(args) as bar, processes(args.jobs) as executor:
             options = calibration.options
             choice = choose(observations, options, args.folds, progress=bar.update, executor=executor)
-    page, unmade = report_page(args, calibration, observations, photographs, diagnosis, choice)
+    page, unmade = files.report_page(args, calibration, observations, photographs, diagnosis, choice)
     from ceres_cal.report.findings import diagnosis_sections
     from ceres_cal.report.grounds import is_against
 
     # Wrong labels that were taken out do no harm, and a noise is estimated.
     against = [finding for finding in diagnosis.findings if args.strict or is_against(finding)]
     answer = tuple(diagnosis_sections(diagnosis, choice))
-    sections = (*answer, unmade, write_results(args, diagnosis.table.save, page))
+    sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))
     return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)
 
 
 def _require_fitting(args: DiagnoseArguments) -> None:
     """Raise InputError for options that do not fit."""
-    require_outputs(args, [args.calibration, *args.observations])
-    require_ending(args.output, "the table is", ".csv", ".json", ".npz")
+    files.require_outputs(args, [args.calibration, *args.observations])
+    files.require_ending(args.output, "the table is", ".csv", ".json", ".npz")
     if not 0.0 < args.false_alarms < 1.0:
         raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms:g}")
-    if args.folds < 2:
-        raise InputError(f"--folds must be at least 2, not {args.folds}")
     if args.held_out and args.new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +40,6 @@ def listed(forms: Iterable[ExportFormat | ImportFormat]) -> str:
     return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
 
 
-@dataclass(frozen=True, kw_only=True)
 class TableArguments(Arguments):
     """What is written of a calibration, and how much of it may be lost."""
 
@@ -59,7 +57,6 @@ class TableArguments(Arguments):
         return "table"
 
 
-@dataclass(frozen=True, kw_only=True)
 class ExportArguments(TableArguments):
     """The same, of a format that is named."""
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ceres_cal.base.errors import CalibrationError, InputError, attempt
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import no_such
-from ceres_cal.cli.arguments import ReportArguments
+from ceres_cal.cli.arguments import ReportArguments, parse_board, parse_priors
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Section
 
@@ -55,6 +55,31 @@ def read_target(text: str, name: str) -> Target:
     if not isinstance(spec, dict):
         raise InputError(f"{text}: it holds no target named {name!r}")
     return target_from_spec(spec, text)
+
+
+def require_shown(
+    target: str | None, board: str | None, priors: Sequence[str], camera: str, lens: str = "auto"
+) -> Target | None:
+    """The field that photographs are to show; InputError, before any is read, where what is said of it, of the board or
+    of the camera cannot be.
+    """
+    from ceres_cal.problem.parameters import Options
+    from ceres_cal.problem.ranges import place_range
+
+    least = 0.1  # of the picture's diagonal, that a field is large which can be found
+    if board is not None:
+        from ceres_cal.detect.boards import finder_of
+        from ceres_cal.scene.targets import checkerboard
+
+        finder_of(checkerboard(*parse_board(board)))
+    field = None if target is None else read_target(target, "field")
+    for prior in parse_priors(priors, {"station": [camera], "camera": [camera]}, Options(lens=lens)):
+        if field is not None and prior.owner == "station":
+            for value in prior.value:
+                place_range(field.places, least, "a tenth of the picture").require(
+                    value, f"the prior on {prior.quantity}"
+                )
+    return field
 
 
 def json_object(path: Path) -> Mapping[str, Any]:
@@ -99,9 +124,6 @@ def station_of(path: Path, station: str | None, calibration: Calibration) -> str
     return station or next(iter(calibration.stations))
 
 
-# ---- what is written ------------------------------------------------------------------------------------------------
-
-
 # ---- files ----------------------------------------------------------------------------------------------------------
 
 
@@ -113,8 +135,16 @@ def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:
         raise InputError(f"{path}: cannot be written: there is no folder {str(path.parent)!r}: make it first")
     if path.is_dir():
         raise InputError(f"{path}: cannot be written: it is a folder: name a file in it")
+    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        raise InputError(f"{path}: cannot be written: Permission denied: name another place")
     if path.exists() and any(Path(given).exists() and path.samefile(given) for given in inputs):
         raise InputError(f"{path}: is an input, and the output would replace it: name another file")
+
+
+def require_folder(path: Path) -> None:
+    """Raise InputError, before any long work, where a folder for results is a file."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file: name a folder")
 
 
 def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> None:
@@ -126,8 +156,8 @@ def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> Non
 def require_ending(path: Path | None, what: str, *endings: str) -> None:
     """Raise InputError where a file's ending is none of those that can be written; `what` such as "the table is"."""
     if path is not None and path.suffix not in endings:
-        known = f"{', '.join(endings[:-1])} or {endings[-1]}"
-        raise InputError(f"{path}: {what} written as {known}: give one of these endings")
+        known = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
+        raise InputError(f"{path}: {what} written as {known}: give {'one of these endings' if endings[1:] else 'that'}")
 
 
 def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
@@ -198,10 +228,8 @@ def report_photographs(
         detected_in: photographs that the observations were just detected in: a report shows them without being asked.
 
     Raises:
-        InputError: --images without --report, or none of the images is called like a frame.
+        InputError: none of the images is called like a frame.
     """
-    if args.images and args.report is None:
-        raise InputError("--images is for the report: name a page with --report, or leave it out")
     images = image_files(args.images) if args.images else list(detected_in)
     if not images or args.report is None:
         return None

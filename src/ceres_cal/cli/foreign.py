@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
 from ceres_cal.cli.command import Arguments, argument, command, option, options_of, switch
 from ceres_cal.cli.export import format_options, import_forms, listed, losses
-from ceres_cal.cli.files import finishing, read_calibration, require_output
+from ceres_cal.cli.files import finishing, read_calibration, require_ending, require_output
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
 class ImportArguments(Arguments):
     """A file of another program."""
 
@@ -66,7 +64,6 @@ def _import(args: ImportArguments) -> Document:
 # ---- over the network -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
 class GroupArguments(Arguments):
     """Where the league's messages are."""
 
@@ -81,7 +78,6 @@ def _group(args: GroupArguments) -> Group:
     return Group(args.address, args.port, args.interface)
 
 
-@dataclass(frozen=True, kw_only=True)
 class PublishArguments(GroupArguments):
     """What is sent, and how often."""
 
@@ -117,7 +113,6 @@ def _publish(args: PublishArguments) -> Document:
     return Document((Section("published", [words], data), *losses(exported)))
 
 
-@dataclass(frozen=True, kw_only=True)
 class ListenArguments(GroupArguments):
     """What is written, and how long to wait for it."""
 
@@ -135,8 +130,7 @@ def _listen(args: ListenArguments) -> Document:
     from ceres_cal.formats import geometry_content, received_geometry
 
     require_output(args.output, [])
-    if args.output.suffix not in (".json", ".pb", ".yml", ".yaml"):
-        raise InputError(f"{args.output}: a field is written as .json, .pb or .yml: give one of these endings")
+    require_ending(args.output, "a field is", ".json", ".pb", ".yml", ".yaml")
     heard = received_geometry(_group(args), args.seconds)
     if args.output.suffix == ".json":
         return _write_target(heard.field, args.output, heard.sender)
@@ -153,7 +147,6 @@ def _listen(args: ListenArguments) -> Document:
 # ---- targets --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
 class TargetsImportArguments(Arguments):
     """A file with a field in it."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from ceres_cal.start.same_labels import Labels
 
 
-@dataclass(frozen=True, kw_only=True)
 class JoinArguments(Arguments):
     """What goes together."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,6 @@ def _rows_argument(rows: str, example: str) -> Any:
     return argument(rows, f"such as {example}; - reads lines of these from standard input", ())
 
 
-@dataclass(frozen=True, kw_only=True)
 class ProjectArguments(Arguments):
     """A calibration, and places."""
 
@@ -34,7 +32,6 @@ class ProjectArguments(Arguments):
     station: str | None = station_option()
 
 
-@dataclass(frozen=True, kw_only=True)
 class LocateArguments(ProjectArguments):
     """The same of pixels, and the height of what they show."""
 

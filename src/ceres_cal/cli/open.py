@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import output_option, parse_board, prior_option
+from ceres_cal.cli.arguments import output_option, prior_option, whole
 from ceres_cal.cli.command import Arguments, argument, command, option, switch
-from ceres_cal.cli.files import json_object, read_target
+from ceres_cal.cli.files import json_object, require_folder, require_shown
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.cli.page.session import Session
-    from ceres_cal.cli.page.state import Sitting, State
+    from ceres_cal.cli.page.state import Sitting
 
 
-@dataclass(frozen=True, kw_only=True)
 class OpenArguments(Arguments):
     """What is looked at, and where results go."""
 
@@ -34,7 +32,7 @@ class OpenArguments(Arguments):
     board: str | None = option("a chessboard, as of `run`", "COLUMNSxROWSxMM")
     prior: tuple[str, ...] = prior_option()
     output: Path = output_option("what is made", Path("camera"), "FOLDER")
-    port: int = option("of the page's address; default: one that is free", "N", 0)
+    port: int = option("of the page's address; default: one that is free", "N", 0, read=whole(0, 65535))
     browser: bool = switch("print the address alone, and open no browser", default=True, flags=("--no-browser",))
 
 
@@ -51,11 +49,14 @@ def _run(args: OpenArguments) -> Document:
         import aiohttp  # noqa: F401 what `ceres_cal.cli.page.server` serves with
     except ImportError:
         raise InputError("open needs aiohttp: pip install 'ceres-cal[page]'") from None
+    require_shown(args.target, args.board, args.prior, "camera")
+    require_folder(args.output)
     sitting = _sitting(args)
-    state = _state(args, sitting)
     from ceres_cal.cli.open_steps import PageCommands
     from ceres_cal.cli.page.session import opened
+    from ceres_cal.cli.page.state import State
 
+    state = State(target=args.target or "", board=args.board or "", priors=args.prior)
     session = opened(sitting, PageCommands(sitting), state)
     _serve(session, args)
     return Document(tuple(_sections(session)))
@@ -84,6 +85,8 @@ def _sitting(args: OpenArguments) -> Sitting:
     named = image_files(args.files)
     calibrations = [path for path in named if path.suffix.lower() == ".json"]
     photographs = tuple(dict.fromkeys(path for path in named if path not in calibrations))
+    for path in calibrations:
+        json_object(path)
     if len(calibrations) > most_calibrations:
         raise InputError(f"{calibrations[most_calibrations]}: at most two calibrations are looked at over one picture")
     if not photographs:
@@ -96,19 +99,6 @@ def _sitting(args: OpenArguments) -> Sitting:
         (a, b), (c, d) = sizes[different], sizes[0]
         raise InputError(f"{photographs[different]}: {a} x {b} px, and the first has {c} x {d}: one camera at a time")
     return Sitting(photographs, sizes, args.output, args.target or "", *calibrations)
-
-
-def _state(args: OpenArguments, sitting: Sitting) -> State:
-    from ceres_cal.cli.page.state import State
-
-    if args.board is not None:
-        parse_board(args.board)
-    if args.target is not None:
-        read_target(args.target, "field")
-    for path in (sitting.start, sitting.other):
-        if path is not None:
-            json_object(path)
-    return State(target=args.target or "", board=args.board or "", priors=args.prior)
 
 
 def _sections(session: Session) -> Iterator[Section]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -11,14 +10,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.native import interruptibly
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import (
-    calibration_argument,
-    not_painted_option,
-    output_option,
-    station_option,
-    timeout_option,
-)
-from ceres_cal.cli.command import Arguments, QuietArguments, argument, option
+from ceres_cal.cli import arguments
+from ceres_cal.cli.command import Arguments, QuietArguments, argument
 from ceres_cal.cli.files import finishing, require_different, require_output
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
@@ -32,26 +25,24 @@ _T = TypeVar("_T")
 _OBSERVATIONS = (".json", ".npz")
 
 
-@dataclass(frozen=True, kw_only=True)
 class InputArguments(QuietArguments):
     """A calibration, files of observations or photographs, and what is to be said of photographs."""
 
-    calibration: Path = calibration_argument("the calibration from before")
+    calibration: Path = arguments.calibration_argument("the calibration from before")
     inputs: tuple[str, ...] = argument(
         "OBS|IMAGE", "files of new observations (.json, .npz), taken together; or photographs, or folders of them"
     )
-    station: str | None = station_option("station that took the photographs; default: the only one")
-    not_painted: str = not_painted_option("lines that the photographed field does not have")
+    station: str | None = arguments.station_option("station that took the photographs; default: the only one")
+    not_painted: str = arguments.not_painted_option("lines that the photographed field does not have")
 
 
-@dataclass(frozen=True, kw_only=True)
 class DetectArguments(Arguments):
     """What `detect board` and `detect rings` share."""
 
-    timeout: float | None = timeout_option()
-    camera: str = option("name of the camera", "NAME", "camera")
-    station: str | None = station_option("name of the station; default: that of the camera")
-    output: Path = output_option("the observations (.json or .npz)")
+    timeout: float | None = arguments.timeout_option()
+    camera: str = arguments.camera_option()
+    station: str | None = arguments.station_option("name of the station; default: that of the camera")
+    output: Path = arguments.output_option("the observations (.json or .npz)")
 
 
 def photographs_in(args: InputArguments) -> list[Path]:

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ceres_cal.cli.arguments import PriorNames, ReportArguments, output_option, parse_names, parse_prior, prior_option
+from ceres_cal.base.errors import InputError
+from ceres_cal.cli import files
+from ceres_cal.cli.arguments import ReportArguments, output_option, parse_names, parse_prior, prior_option
 from ceres_cal.cli.command import command, option, switch
-from ceres_cal.cli.files import (
-    read_calibration,
-    read_observations,
-    report_page,
-    report_photographs,
-    require_outputs,
-    write_results,
-)
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -23,9 +16,9 @@ from ceres_cal.report.document import Document, Section
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.detect.photographs import KnownDetections
+    from ceres_cal.observations import Observations, Prior
 
 
-@dataclass(frozen=True, kw_only=True)
 class RefitArguments(InputArguments, ReportArguments):
     """What was seen after a move, and what may have changed."""
 
@@ -55,16 +48,18 @@ class RefitArguments(InputArguments, ReportArguments):
 def _run(args: RefitArguments) -> Document:
     images = photographs_in(args)
     # To replace the old calibration is what many want.
-    require_outputs(args, images or args.inputs)
-    calibration = read_calibration(args.calibration)
-    detections = _photographed(args, calibration, images) if images else None
-    observations = read_observations(args.inputs) if detections is None else detections.require()
+    files.require_outputs(args, images or args.inputs)
+    calibration = files.read_calibration(args.calibration)
+    observed = None if images else files.read_observations(args.inputs)
+    priors = _priors(args, calibration if observed is None else observed)
+    detections = _photographed(args, calibration, images) if observed is None else None
+    observations = detections.require() if detections is not None else observed
+    assert observations is not None
     from ceres_cal.moves.refit_plan import RefitOptions
     from ceres_cal.moves.refits import movements, refit
     from ceres_cal.report.quality import quality_of
 
-    photographs = report_photographs(args, observations, calibration, images)
-    priors = tuple(parse_prior(spec, observations, PriorNames(("height_m",))) for spec in args.prior)
+    photographs = files.report_photographs(args, observations, calibration, images)
     result = refit(
         calibration,
         observations,
@@ -74,20 +69,32 @@ def _run(args: RefitArguments) -> Document:
     )
     from ceres_cal.report.summary import calibration_sections
 
-    page, unmade = report_page(args, result, observations, photographs)
+    page, unmade = files.report_page(args, result, observations, photographs)
     answer = tuple(calibration_sections(quality_of(result, observations), args.inputs))
     about = result.refitted
     assert about is not None
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(calibration, result).items()}
     explained = {"what": about.what, "explanation": about.explanation, "moved": moves}
     first = Section("refit", about.explanation.split("; "), explained)
-    sections = (first, shown(detections), *answer, unmade, write_results(args, result.save, page))
+    sections = (first, shown(detections), *answer, unmade, files.write_results(args, result.save, page))
     return Document(sections, 1 if unmade.data else 0)
+
+
+def _priors(args: RefitArguments, known: Calibration | Observations) -> tuple[Prior, ...]:
+    owners = {"station": known.stations, "camera": known.cameras}
+    return tuple(parse_prior(spec, owners, {"station": ("height_m",)}) for spec in args.prior)
 
 
 def _photographed(args: RefitArguments, calibration: Calibration, images: list[Path]) -> KnownDetections:
     from ceres_cal.detect.photographs import detect_known
+    from ceres_cal.moves.agreement import require_posterior
 
+    require_posterior(calibration)
+    station = files.station_of(args.calibration, args.station, calibration)
+    if strange := set(args.moved) - {station}:
+        raise InputError(
+            f"--moved {sorted(strange)[0]}: the photographs are of station {station!r}: name that, or none"
+        )
     not_painted = parse_names(args.not_painted)
     with progress_bar(args) as bar:
         return detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)

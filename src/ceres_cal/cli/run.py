@@ -10,21 +10,10 @@ from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.images import IMAGE_ENDINGS, images_and_videos
-from ceres_cal.base.words import no_such, plural
-from ceres_cal.cli.arguments import (
-    PriorNames,
-    estimate_option,
-    frames_option,
-    not_painted_option,
-    output_option,
-    parse_board,
-    parse_estimates,
-    parse_names,
-    prior_option,
-    prior_parts,
-)
+from ceres_cal.base.words import plural
+from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
-from ceres_cal.cli.files import attempted, read_target
+from ceres_cal.cli.files import attempted, require_shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -33,24 +22,25 @@ _MOST_NAMES = 3
 _BLANK = Section("", [""])
 
 
-@dataclass(frozen=True, kw_only=True)
 class RunArguments(QuietArguments):
     """What there is, and what is to come of it."""
 
     images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, a folder of them, or a video")
-    output: Path = output_option("everything that is made", metavar="FOLDER")
+    output: Path = arguments.output_option("everything that is made", metavar="FOLDER")
     target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
-    facing: tuple[str, ...] = option("which way round it is, likewise", "NAME=SIDE", repeatable=True)
-    not_painted: str = not_painted_option("lines that this field does not have")
+    facing: tuple[str, ...] = option(
+        "which way round it is, likewise", "NAME=SIDE", repeatable=True, beside=("target",)
+    )
+    not_painted: str = arguments.not_painted_option("lines that this field does not have", beside=("target",))
     board: str | None = option(
         "a chessboard by its inner corners and the side of a square, such as 9x6x25mm", "COLUMNSxROWSxMM"
     )
     lens: str = option("as of `calibrate`", "KIND", "auto")
-    prior: tuple[str, ...] = prior_option()
-    estimate: tuple[str, ...] = estimate_option()
-    camera: str = option("name of the camera", "NAME", "camera")
+    prior: tuple[str, ...] = arguments.prior_option()
+    estimate: tuple[str, ...] = arguments.estimate_option(beside=("target",))
+    camera: str = arguments.camera_option()
     to: tuple[str, ...] = option("export it, too, as of `export`", "FORMAT", repeatable=True)
-    frames: int = frames_option()
+    frames: int = arguments.frames_option()
 
 
 @dataclass(frozen=True)
@@ -71,10 +61,10 @@ class _Step:
     "boards.mp4 --board 9x6x25mm -o camera/",
 )
 def _run(args: RunArguments) -> Document:
-    _require_fitting(args)
     from ceres_cal.base.files import make_folder
     from ceres_cal.formats import export_format
 
+    _require_fitting(args)
     endings = {name: (export_format(name).endings or ("",))[0] for name in args.to}  # or says which there are
     make_folder(args.output)
     images = _photographs(args)
@@ -97,31 +87,16 @@ def _run(args: RunArguments) -> Document:
 
 def _require_fitting(args: RunArguments) -> None:
     """Raise InputError, before any photograph is read, for names, sizes and units that no later step would take."""
+    from ceres_cal.functions import lines_to_find
+
     if args.target is None and args.board is None:
         raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
-    if args.board is not None:
-        parse_board(args.board)
     COMMANDS["calibrate"].parse(["observations.json", "--lens", args.lens])
-    if args.prior:
-        from ceres_cal.problem.parameters import Options
-
-        quantities = (*Options(lens=args.lens).intrinsic_names, "principal_point")
-        for spec in args.prior:
-            prior_parts(spec, PriorNames(("height_m", "position_m"), quantities))
-    if args.target is not None:
-        target = read_target(args.target, "field")
-        parse_estimates(args.estimate, {"field": target})
-        if args.facing:
-            from ceres_cal.detect.photographs import SIDES
-        for spec in args.facing:
-            name, _, side = map(str.strip, spec.partition("="))
-            if side not in SIDES:
-                raise InputError(f"--facing {spec!r}: write NAME=SIDE; {no_such('side', side, SIDES)}")
-            if name not in (*target.curves, *target.point_index):
-                raise InputError(f"--facing: {no_such('line or point', name, (*target.curves, *target.point_index))}")
-        for name in parse_names(args.not_painted):
-            if name not in target.curves:
-                raise InputError(f"--not-painted: {no_such('line', name, target.curves)}")
+    field = require_shown(args.target, args.board, args.prior, args.camera, args.lens)
+    if field is not None:
+        lengths = arguments.parse_estimates(args.estimate, {"field": field})
+        sides = dict(map(arguments.parse_facing, args.facing))
+        lines_to_find(field, sides, arguments.parse_names(args.not_painted), lengths)
 
 
 # ---- the steps ------------------------------------------------------------------------------------------------------

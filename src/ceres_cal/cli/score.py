@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from ceres_cal.moves.agreement import Agreement, Agreements
 
 
-@dataclass(frozen=True, kw_only=True)
 class ScoreArguments(Arguments):
     """A calibration, new observations, and how they are weighed."""
 

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import output_option
+from ceres_cal.cli.arguments import output_option, whole
 from ceres_cal.cli.command import Arguments, argument, command, option, switch
-from ceres_cal.cli.files import finishing
+from ceres_cal.cli.files import finishing, require_folder
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
 
 
-@dataclass(frozen=True, kw_only=True)
 class SimulateArguments(Arguments):
     """A scene, and where its observations go."""
 
     scene: str | None = argument("SCENE", "name of a built-in scene, or a scene file (.json)", None)
     output: Path | None = output_option("observations.json and truth.json; made if missing", None, "DIR")
-    seed: int = option("the same seed gives the same observations", "N", 0)
+    seed: int = option("the same seed gives the same observations", "N", 0, read=whole(0))
     list: bool = switch("list the built-in scenes")
 
 
@@ -46,10 +44,7 @@ def _run(args: SimulateArguments) -> Document:
         raise InputError(
             "name a scene and a folder, as in `ceres-cal simulate ssl-field -o DIR`; --list shows the scenes"
         )
-    if args.seed < 0:
-        raise InputError(f"--seed must be a whole number from 0 on, not {args.seed}")
-    if args.output.exists() and not args.output.is_dir():
-        raise InputError(f"{args.output}: is a file: name a folder")
+    require_folder(args.output)
     is_file = args.scene not in scenes and (Path(args.scene).exists() or args.scene.endswith(".json"))
     scene, disturbance = load_scene(args.scene) if is_file else built_in_scene(args.scene)
     simulation = simulate(scene, disturbance, args.seed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +29,6 @@ def _help() -> str:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
 class TargetsArguments(Arguments):
     """What to list."""
 
@@ -76,7 +74,6 @@ def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
         write_bytes(picture, content)
 
 
-@dataclass(frozen=True, kw_only=True)
 class PrintArguments(Arguments):
     """What to print."""
 

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import frame_of, no_such
-from ceres_cal.cli.arguments import (
-    calibration_argument,
-    height_option,
-    length,
-    metres,
-    number,
-    output_option,
-    parse_lengths,
-    station_option,
-)
-from ceres_cal.cli.command import QuietArguments, argument, command, given_of, option, switch
-from ceres_cal.cli.files import finishing, read_calibration
+from ceres_cal.cli import arguments
+from ceres_cal.cli.command import QuietArguments, argument, command, flag, given, option, switch
+from ceres_cal.cli.files import finishing, read_calibration, require_folder
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -46,21 +36,20 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _area(text: str) -> Area:
-    numbers = parse_lengths(text, f"--area {text!r}")
+    numbers = arguments.parse_lengths(text, f"--area {text!r}")
     if len(numbers) != 4:
         raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
     return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
-@dataclass(frozen=True, kw_only=True)
 class UndistortArguments(QuietArguments):
     """Photographs, and what is made of each."""
 
-    calibration: Path = calibration_argument()
+    calibration: Path = arguments.calibration_argument()
     images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, or folders of them")
-    output: Path = output_option("the pictures; made if missing", metavar="FOLDER")
-    camera: str | None = option("which camera; may be left out where there is only one", "NAME")
-    station: str | None = station_option()
+    output: Path = arguments.output_option("the pictures; made if missing", metavar="FOLDER")
+    camera: str | None = arguments.camera_option("which camera; may be left out where there is only one", None)
+    station: str | None = arguments.station_option()
     format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png")
     crop: bool = switch("the largest rectangle without black (default)", group=_STRAIGHT, alone="shape")
     whole: bool = switch("everything that the photograph shows, black around it", group=_STRAIGHT, alone="shape")
@@ -70,25 +59,35 @@ class UndistortArguments(QuietArguments):
     phi: float | None = option(
         "its focal length instead; the camera's own keeps the scale",
         "PX",
-        read=number("--phi"),
+        read=arguments.number("--phi"),
         group=_STRAIGHT,
         alone="scale",
     )
     angle: float | None = option(
         "widest angle of view; default: 150 with --whole, else as far as detail goes",
         "DEG",
-        read=number("--angle"),
+        read=arguments.number("--angle"),
         group=_STRAIGHT,
     )
     top_view: bool = switch("the field from straight above, to scale", group=_TOP)
-    mm_per_px: float | None = option("scale of the top view; default: 5", "MM", read=length("mm"), group=_TOP)
+    mm_per_px: float | None = option(
+        "scale of the top view; default: 5", "MM", read=arguments.length("mm"), group=_TOP, beside=("top_view",)
+    )
     area: Area | None = option(
-        "area in metres; default: the field and 0.3 m around it", "X0,Y0,X1,Y1", read=_area, group=_TOP
+        "area in metres; default: the field and 0.3 m around it",
+        "X0,Y0,X1,Y1",
+        read=_area,
+        group=_TOP,
+        beside=("top_view",),
     )
     overlay: bool = switch("draw the calibrated lines and boards into photographs", group=_OVERLAY)
-    before: Path | None = option("draw an earlier calibration too", "CALIBRATION", group=_OVERLAY)
-    observations: Path | None = option("say what each frame shows, and draw them too", "OBS", group=_OVERLAY)
-    height_mm: float | None = height_option("plane of the top view, or of a second drawing in an overlay")
+    before: Path | None = option("draw an earlier calibration too", "CALIBRATION", group=_OVERLAY, beside=("overlay",))
+    observations: Path | None = option(
+        "say what each frame shows, and draw them too", "OBS", group=_OVERLAY, beside=("overlay",)
+    )
+    height_mm: float | None = arguments.height_option(
+        "plane of the top view, or of a second drawing in an overlay", beside=("top_view", "overlay")
+    )
 
 
 @command(
@@ -133,21 +132,14 @@ def require_fitting(args: UndistortArguments) -> None:
     """Raise InputError where options of different pictures are mixed."""
     if args.top_view and args.overlay:
         raise InputError("--top-view and --overlay are two kinds of pictures: make one at a time")
-    groups = (
-        (given_of(args, _STRAIGHT), not (args.top_view or args.overlay), "straight images"),
-        (given_of(args, _TOP), args.top_view, "--top-view"),
-        (given_of(args, _OVERLAY), args.overlay, "--overlay"),
-        ([] if args.height_mm is None else ["--height-mm"], args.top_view or args.overlay, "--top-view and --overlay"),
-    )
-    for given, chosen, what in groups:
-        if given and not chosen:
-            raise InputError(f"{given[0]} is for {what}: leave it out, or ask for that")
+    straight = [name for name, about in given(args).items() if about.get("group") == _STRAIGHT]
+    if straight and (args.top_view or args.overlay):
+        raise InputError(f"{flag(straight[0])} is for straight images: leave it out, or ask for that")
 
 
 def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[Path, Path]:
     """Where the picture of each image goes; InputError where two would have one name, or an input would be lost."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file: name a folder")
+    require_folder(folder)
     outputs: dict[Path, Path] = {}
     taken: dict[Path, Path] = {}
     for image in images:
@@ -275,7 +267,7 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     area = args.area or _field(calibration)
     mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
-    grid = make_grid(area, mm_per_px / 1000.0, metres(args.height_mm))
+    grid = make_grid(area, mm_per_px / 1000.0, arguments.metres(args.height_mm))
     warp = top_view(camera, grid)
     x0, y0, x1, y1 = grid.area_m
     facts = {
@@ -314,7 +306,7 @@ def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMake
     from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
     from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 
-    station, height = _station(args, calibration), metres(args.height_mm)
+    station, height = _station(args, calibration), arguments.metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     before = None if args.before is None else File.load(args.before)
     observations = None if args.observations is None else Observations.load(args.observations)

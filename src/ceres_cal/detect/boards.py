@@ -103,7 +103,7 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    find = _finder(board, corners)
+    find = finder_of(board, corners)
     placements = _placement_names(paths) if board.movable else dict.fromkeys(paths)
     # OpenCV's marker detectors keep a state that threads would share.
     side_by_side = board.kind == "checkerboard" and isinstance(corners, str)
@@ -159,7 +159,8 @@ def _find_all(
     return size, grids, missed
 
 
-def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
+def finder_of(board: Target, corners: CharucoSpec | str = "saddle") -> Finder:
+    """What finds a board in an image; InputError for no board, too small a one, or markers that do not fit it."""
     if board.kind == "circle-grid":
         from ceres_cal.detect.circles import measured_circles
 

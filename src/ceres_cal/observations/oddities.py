@@ -159,9 +159,7 @@ def unfilled(content: Content) -> Iterator[str]:
 def odd_sizes(content: Content) -> Iterator[str]:
     """A line for each target so large that its numbers may be millimetres."""
     for name, target in content.targets.items():
-        starts = target.tracks[0, :, 0]  # of lines, and the centres of circles
-        reach_m = max(np.max(np.abs(places), initial=0.0) for places in (target.point_array, starts))
-        if reach_m > _LARGE_M:
+        if (reach_m := target.reach_m) > _LARGE_M:
             yield f"target {name!r} reaches {reach_m:.0f} m from its origin: are its numbers metres, or millimetres?"
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
@@ -101,10 +102,15 @@ def _ranges(prior: Prior, observations: Observations, options: Options) -> Itera
     elif prior.dimension:
         drawn_m = dimensions_of(observations.targets).get(prior.dimension, np.nan)
         if np.isfinite(drawn_m):  # another error names a dimension that is not there
-            why = f"the target is drawn with {drawn_m:g} m"
-            yield Range(drawn_m / _REDRAWN, drawn_m * _REDRAWN, "m", _FINEST, why)
+            yield dimension_range(drawn_m)
     elif prior.curve:
         yield Range(0.0, 0.0, "m", _FINEST, "an offset is about 0")
+
+
+def dimension_range(drawn_m: float) -> Range:
+    """Of a dimension of a target, by how it is drawn."""
+    why = f"the target is drawn with {drawn_m:g} m"
+    return Range(drawn_m / _REDRAWN, drawn_m * _REDRAWN, "m", _FINEST, why)
 
 
 def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Range:
@@ -151,10 +157,15 @@ def _of_place(station: str, observations: Observations) -> Range:
     seen = np.concatenate(places)
     if not len(seen) or spread_px == 0.0:  # boards alone, whose world is wherever one likes
         return Range(-np.inf, np.inf, "m", _FINEST, "")
+    diagonal_px = float(np.hypot(*observations.cameras[observations.stations[station]]))
+    return place_range(seen, spread_px / diagonal_px, f"{spread_px:.0f} px")
+
+
+def place_range(seen: Array, spread: float, said: str) -> Range:
+    """Of a coordinate of a station that sees places (P, 3) m over so much of its image's diagonal; `said` in words."""
     size_m = 2.0 * float(np.linalg.norm(seen.max(axis=0) - seen.min(axis=0)))  # of arcs half is among the places
-    phi = PHI_RANGE[1] * 0.5 * float(np.hypot(*observations.cameras[observations.stations[station]]))
-    most_m = phi * size_m / spread_px + float(np.max(np.linalg.norm(seen, axis=1)))
-    return Range(-most_m, most_m, "m", _FINEST, f"no lens shows its target {spread_px:.0f} px large from farther away")
+    most_m = 0.5 * PHI_RANGE[1] * size_m / spread + float(np.max(np.linalg.norm(seen, axis=1)))
+    return Range(-most_m, most_m, "m", _FINEST, f"no lens shows its target {said} large from farther away")
 
 
 def _require_tolerance(tolerance: Tolerance, target: str, observations: Observations) -> None:

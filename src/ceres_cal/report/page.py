@@ -13,20 +13,8 @@ from typing import Any
 from urllib.parse import quote
 
 from ceres_cal.base.words import grouped
+from ceres_cal.report import document
 from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, to_svg
-from ceres_cal.report.document import (
-    BulletList,
-    Card,
-    Chapter,
-    Figure,
-    Folded,
-    Gallery,
-    PhotoFigure,
-    Table,
-    Text,
-    Tile,
-    Tiles,
-)
 
 
 @singledispatch
@@ -36,18 +24,18 @@ def html(piece: Any) -> str:
 
 
 @html.register
-def _(piece: Text) -> str:
+def _(piece: document.Text) -> str:
     return f"<p{_class(piece.kind)}>{escape(piece.text)}</p>"
 
 
 @html.register
-def _(piece: BulletList) -> str:
+def _(piece: document.BulletList) -> str:
     items = (f"<li{_class(level)}>{escape(text)}</li>" for level, text in piece.lines)
     return f'<ul class="points">{"".join(items)}</ul>'
 
 
 @html.register
-def _(piece: Table) -> str:
+def _(piece: document.Table) -> str:
     short = 14  # letters that stay on one line
 
     def of_row(row: Sequence[str]) -> str:
@@ -67,7 +55,7 @@ def _(piece: Table) -> str:
 
 
 @html.register
-def _(piece: Figure) -> str:
+def _(piece: document.Figure) -> str:
     label = f'role="img" aria-label="{escape(piece.title)}"'
     if piece.hover is not None:
         label += f' data-hover="{escape(json.dumps(vars(piece.hover), separators=(",", ":"), ensure_ascii=False))}"'
@@ -85,7 +73,7 @@ def _(piece: Figure) -> str:
 
 
 @html.register
-def _(piece: PhotoFigure) -> str:
+def _(piece: document.PhotoFigure) -> str:
     content = b64encode(piece.jpeg).decode("ascii")
     return (
         f'<figure id="{escape(piece.name)}" class="wide"><h3>{escape(piece.title)}</h3>'
@@ -95,7 +83,7 @@ def _(piece: PhotoFigure) -> str:
 
 
 @html.register
-def _(piece: Gallery) -> str:
+def _(piece: document.Gallery) -> str:
     elements = [html(picture) for picture in piece.pictures]
     if sum(not picture.wide for picture in piece.pictures) % 2 and not piece.pictures[-1].wide:
         elements[-1] = elements[-1].replace("<figure ", '<figure class="lone" ', 1)
@@ -103,18 +91,18 @@ def _(piece: Gallery) -> str:
 
 
 @html.register
-def _(piece: Folded) -> str:
+def _(piece: document.Folded) -> str:
     body = "".join(map(html, piece.pieces))
     return f'<details class="folded"><summary>{escape(piece.title)}</summary>{body}</details>'
 
 
 @html.register
-def _(piece: Tiles) -> str:
+def _(piece: document.Tiles) -> str:
     return f'<div class="tiles">{"".join(map(html, piece.tiles))}</div>'
 
 
 @html.register
-def _(piece: Tile) -> str:
+def _(piece: document.Tile) -> str:
     unit = f" <small>{escape(piece.unit)}</small>" if piece.unit else ""
     return (
         f"<div{_class('tile', piece.level)}><p>{escape(piece.label)}</p>"
@@ -123,7 +111,7 @@ def _(piece: Tile) -> str:
 
 
 @html.register
-def _(piece: Card) -> str:
+def _(piece: document.Card) -> str:
     facts = "".join(f"<li>{escape(fact)}</li>" for fact in piece.facts)
     said = escape(piece.sentence)
     title = f'<a href="{quote(piece.link)}">{said}</a>' if piece.link else said
@@ -132,7 +120,7 @@ def _(piece: Card) -> str:
 
 
 @html.register
-def _(piece: Chapter) -> str:
+def _(piece: document.Chapter) -> str:
     body = "".join(map(html, piece.pieces))
     return f'<section id="{piece.name}"{_class(piece.level)}><h2>{escape(piece.title)}</h2>{body}</section>'
 
@@ -142,7 +130,9 @@ def _class(*names: str) -> str:
     return f' class="{known}"' if known else ""
 
 
-def page(title: str, about: str, chapters: Sequence[Chapter], foot: str, kind: str = "Calibration report") -> str:
+def page(
+    title: str, about: str, chapters: Sequence[document.Chapter], foot: str, kind: str = "Calibration report"
+) -> str:
     """The whole page, which needs nothing from elsewhere, and in which no script but its own runs."""
     style, script = (
         files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "hover.js")

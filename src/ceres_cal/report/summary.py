@@ -24,21 +24,8 @@ from ceres_cal.base.words import (
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.seam import RigPair
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
+from ceres_cal.report import grounds
 from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
-from ceres_cal.report.grounds import (
-    CARE_MM,
-    GOOD_MM,
-    Reach,
-    disputed,
-    focal,
-    is_against,
-    judge_quality,
-    level_of_verdict,
-    paint_over_usual,
-    promises,
-    reach,
-    worst,
-)
 from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
 from ceres_cal.report.quality import Quality, Seam
 
@@ -49,8 +36,8 @@ _MOST_FINDINGS, _MOST_DIRECTIONS = 3, 4
 _MEANING = (
     "The accuracy in the headline holds for 95 % of the points located, at 95 of 100 places that a camera sees. The "
     "worst place is named where it is much worse. ± is a standard deviation. Both describe the calibration; the noise "
-    f"of the located pixel adds to them. Green: up to {GOOD_MM:g} mm, the width of a painted line. Amber: up to "
-    f"{CARE_MM:g} mm. Where lines are wider, both are as many times as large."
+    f"of the located pixel adds to them. Green: up to {grounds.GOOD_MM:g} mm, the width of a painted line. Amber: up "
+    f"to {grounds.CARE_MM:g} mm. Where lines are wider, both are as many times as large."
 )
 
 
@@ -71,9 +58,9 @@ def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Se
 
 def _verdict(quality: Quality) -> Section:
     """The headline of the report, and what stands behind it and was not said yet."""
-    judged, findings = judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
-    cause = disputed(quality)
-    named = [one for one in findings if is_against(one) and not cause][:_MOST_FINDINGS]
+    judged, findings = grounds.judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
+    cause = grounds.disputed(quality)
+    named = [one for one in findings if grounds.is_against(one) and not cause][:_MOST_FINDINGS]
     lines = [judged.headline, *(f"{one.kind}: {one.sentence}" for one in named)]
     if findings:
         whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
@@ -179,10 +166,12 @@ def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
 
 def verdict_chapter(material: Material) -> Chapter:
     """The chapter, its level the colour of the page's first box."""
-    judged = judge_quality(material)
+    judged = grounds.judge_quality(material)
     tiles = tuple(_tiles(material))
-    if not promises(material):  # the verdict's colour, not that of a number nobody vouches for
-        tiles = tuple(tile._replace(level=worst(judged.level, tile.level)) if tile.level else tile for tile in tiles)
+    if not grounds.promises(material):  # the verdict's colour, not that of a number nobody vouches for
+        tiles = tuple(
+            tile._replace(level=grounds.worst(judged.level, tile.level)) if tile.level else tile for tile in tiles
+        )
     pieces: list[Piece] = [Tiles(tiles), BulletList(judged.reasons)]
     if material.maps:
         pieces.append(Text(_MEANING, "note"))
@@ -197,9 +186,9 @@ def _tiles(material: Material) -> Iterator[Tile]:
     for station, maps in material.maps.items():
         for one in maps:
             label = sentence(at_height(one.height_m)) + (f", {station}" if several else "")
-            yield _map_tile(label, one, reach(one.height_m, [one], paint_over_usual(material)))
+            yield _map_tile(label, one, grounds.reach(one.height_m, [one], grounds.paint_over_usual(material)))
     if not material.maps:
-        for verdict in focal(material):
+        for verdict in grounds.focal(material):
             yield _focal_tile(verdict)
     fit, table = material.calibration.fit, material.diagnosis.table
     if material.diagnosis.new_data:
@@ -214,7 +203,7 @@ def _tiles(material: Material) -> Iterator[Tile]:
     yield Tile("Taken out", short(share), "%", f"{counted(out, 'outlier')} of {counted(len(table), 'observation')}")
 
 
-def _map_tile(label: str, one: FieldMap, known: Reach) -> Tile:
+def _map_tile(label: str, one: FieldMap, known: grounds.Reach) -> Tile:
     level = known.level
     if np.isnan(known.worst_mm):
         return Tile(label, "unseen", "", "the image shows no place of the field", "no")
@@ -230,7 +219,7 @@ def _focal_tile(verdict: Verdict) -> Tile:
     known = np.isfinite(verdict.relative)
     value = f"± {short(100.0 * verdict.relative)}" if known else "unknown"
     note = f"{fixed(verdict.value, 1)} px, 95 %: {bounds(verdict)}"
-    return Tile(f"phi of {verdict.key.owner}", value, "%" if known else "", note, level_of_verdict(verdict))
+    return Tile(f"phi of {verdict.key.owner}", value, "%" if known else "", note, grounds.level_of_verdict(verdict))
 
 
 def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:

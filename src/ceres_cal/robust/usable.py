@@ -23,11 +23,12 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets.target import HANDY_M
 
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
 _NEARER = 0.5
-_LARGEST_M = 50.0  # of a target that somebody holds before a camera, from its origin
+_LARGEST_M = HANDY_M  # of a target that somebody holds before a camera: no larger one can be made
 _BELOW = 0.5  # of the camera's height over the floor: noise sinks a board by centimetres
 
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
@@ -61,7 +62,6 @@ def require_possible(observations: Observations, sights: Sights, estimate: Estim
     Args:
         sights: of all the observations, as the solve took them.
     """
-    _require_handy(observations)
     for station, sight in sights.of_world.items():
         camera = estimate.camera_at(station)
         floor_m = _floor_m(_places_of_world(observations, sight))
@@ -73,16 +73,6 @@ def require_possible(observations: Observations, sights: Sights, estimate: Estim
         _require_ahead(station, sight, residuals)
         if floor_m is not None:
             _require_above(floor_m - _BELOW * (camera.position[2] - floor_m), observations, estimate)
-
-
-def _require_handy(observations: Observations) -> None:
-    """Raise SolutionError where nobody could hold a target before a camera: boards alone fit in any unit."""
-    for name, target in observations.targets.items():
-        reach_m = float(np.max(np.linalg.norm(target.places, axis=1)))
-        if target.movable and reach_m > _LARGEST_M:
-            raise SolutionError(
-                f"target {name!r} reaches {reach_m:.0f} m from its origin: give its dimensions in metres"
-            )
 
 
 def _require_above(least_m: float, observations: Observations, estimate: Estimate) -> None:

@@ -246,9 +246,9 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
             elif prior.quantity in ("cx", "cy"):
                 centre[prior.quantity == "cy"] = prior.value[0]
             elif prior.quantity == "aspect":
-                aspect = prior.value[0]
+                aspect = options.fixed.get("aspect", prior.value[0])
             elif prior.quantity == "skew":
-                skew = prior.value[0]
+                skew = options.fixed.get("skew", prior.value[0])
     cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
     blank = Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect, skew=skew)
     if set(blank.lens.names) <= set(options.held) and not blank.lens.may_fold:

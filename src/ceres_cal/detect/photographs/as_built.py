@@ -27,7 +27,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
 # Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
-# lie aside, root sum of squares: farther, they are others.
+# lie aside, root sum of squares, or a dimension: farther, they are others.
 _SCATTER, _FARTHEST = np.array([0.0125, 0.025, 0.05, 0.1, 0.2]), 3.0
 _ASIDE = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
 SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
@@ -77,20 +77,14 @@ class FieldAsBuilt:
         """Whether this is another field: a dimension too far off for a tape measure, lines all over the place, or bent
         as by no lens.
         """
-        changes = [
-            abs(length / self.drawn[name] - 1.0)
+        farthest_m = _FARTHEST * self.usual_m
+        changed = any(
+            abs(length - self.drawn[name])
+            > max(_SURELY * self.sd_m[name], min(_OTHER_FIELD * self.drawn[name], farthest_m))
             for name, length in self.dimensions.items()
-            if abs(length - self.drawn[name]) > _SURELY * self.sd_m[name]
-        ]
-        far = float(np.linalg.norm(list(self.aside_m.values())))
-        elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
-        return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
-
-    @property
-    def may_be_stretched(self) -> bool:
-        """Whether it looks like another field, if not surely: what a picture that was stretched one way makes of it."""
-        changes = [abs(length / self.drawn[name] - 1.0) for name, length in self.dimensions.items()]
-        return self.is_other or max(changes, default=0.0) > _OTHER
+        )
+        elsewhere = np.linalg.norm(list(self.aside_m.values())) > farthest_m or 2 * len(self.aside_m) > len(self.names)
+        return changed or bool(elsewhere) or self.misfit > _MOST_MISFIT
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""

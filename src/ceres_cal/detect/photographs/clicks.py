@@ -34,8 +34,10 @@ FORMAT, VERSION = "ceres-cal/corners", 1
 # How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
 SIGMA_PX = 15.0
 FEWEST = 4
+STRETCH = 0.03
+"""A standard deviation of fy / fx where a picture was stretched one way."""
 _WRONG = 6.0  # standard deviations of a click: as far off, and it is another place's
-_FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
+_FREED = ("a3", "phi", "aspect", "a2", "cx", "cy", "a4", "a5")
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,15 @@ class Clicks:
             raise InputError(f"{FEWEST} points are needed to start from, not {len(self.points)}: show more corners")
         if not np.all(np.isfinite([*self.points.values(), *(place[1:] for place in self.curves)])):
             raise InputError("a point to start from has a number that is not finite")
+
+    def require_names(self, target: Target) -> None:
+        """Raise InputError where a target has no such point or curve."""
+        for name in self.points:
+            if name not in target.point_index:
+                raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+        for name, *_ in self.curves:
+            if name not in target.curve_index:
+                raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
 
 
 class _ClicksFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -90,12 +101,7 @@ def starts_from_clicks(
         InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
     stretches = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
-    for name in clicks.points:
-        if name not in target.point_index:
-            raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
-    for name, *_ in clicks.curves:
-        if name not in target.curve_index:
-            raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    clicks.require_names(target)
     index = np.array([target.point_index[name] for name in clicks.points], dtype=np.int32)
     pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 1e-6:
@@ -123,15 +129,14 @@ def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prio
     Args:
         camera: far from the middle of whose picture its principal point is about right.
     """
-    # A standard deviation of fy / fx where a picture was stretched one way; and of the principal point, of the width.
-    stretch, off = 0.03, 0.04
+    off = 0.04  # a standard deviation of the principal point, of the width
     size, centre = np.array(camera.image_size), 0.5 * (np.array(camera.image_size) - 1.0)
     if np.any(np.abs(camera.principal_point - centre) > 3.0 * off * size):
         centre, off = np.array(camera.principal_point), 2.0 * off
     priors = (
         Prior("camera", CAMERA, "phi", (camera.phi,), (0.5 * camera.phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(centre), (off * size[0],) * 2),
-        Prior("camera", CAMERA, "aspect", (1.0,), (stretch,)),
+        Prior("camera", CAMERA, "aspect", (1.0,), (STRETCH,)),
     )
     return FreeIntrinsics(_FREED, (*priors, *lengths), hints)
 

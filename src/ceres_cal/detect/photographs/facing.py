@@ -10,6 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import rotation_log
+from ceres_cal.base.words import no_such
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.symmetry import middle_of, size_of
@@ -50,7 +51,7 @@ class Facing:
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:
-            raise InputError(f"facing {self.feature}={self.side}: a side of the picture is one of {', '.join(SIDES)}")
+            raise InputError(f"facing {self.feature!r}: {no_such('side', self.side, SIDES)}")
 
 
 def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[str]) -> None:
@@ -58,10 +59,7 @@ def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[
     size, middle = size_of(target, curves), middle_of(target, curves)[:2]
     for one in facings:
         if one.feature not in target.point_index and one.feature not in target.curves:
-            raise InputError(
-                f"facing {one.feature}={one.side}: the target has no line, arc or point {one.feature!r}: "
-                "`ceres-cal targets` lists the names"
-            )
+            raise InputError(f"facing: {no_such('line or point', one.feature, (*target.curves, *target.point_index))}")
         if np.linalg.norm(_place(one.feature, target) - middle) < _MIDDLE * size:
             raise InputError(
                 f"facing {one.feature}={one.side}: {one.feature} lies in the middle of the field, towards no side: "

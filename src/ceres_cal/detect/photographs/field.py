@@ -21,7 +21,7 @@ from ceres_cal.detect.images import filled, negative, read_colour, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.median import MOST_PICTURES, merged
 from ceres_cal.detect.photographs.candidates import prepare_search
-from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.detect.photographs.clicks import STRETCH, Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
@@ -37,6 +37,8 @@ from ceres_cal.scene.targets import Target
 TARGET_NAME = "field"
 # Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
 _ABOUT = 0.15
+# Of a field from its origin: the largest ones end at 150 m, the smallest in millimetres reaches 750.
+_FIELD_M = 500.0
 # Of the field in two pictures, at the median of its lines: farther, the camera did not stand still.
 _SAME_PLACE_PX = 3.0
 
@@ -112,13 +114,8 @@ def detect_field(
         NothingShownError: no image shows the field.
     """
     options = options or FieldOptions()
-    painted = _painted(target, curves)
+    painted = require_findable(target, curves, options.lengths)
     paths, drawn = [Path(path) for path in images], drawn_as_stated({TARGET_NAME: target}, options.lengths)[TARGET_NAME]
-    for prior in options.lengths:
-        if not features_of(target, prior.quantity) & set(painted):
-            raise InputError(
-                f"no painted line lies elsewhere with another {prior.quantity}: it cannot be found, leave it out"
-            )
     results: dict[str, SearchResult] = {}
     places: list[SearchResult] = []  # one for each that a camera stood at, where the last picture was taken first
     elsewhere = isinstance(start, Auto)  # whether it is looked for at another place, too: once in vain is enough
@@ -231,13 +228,28 @@ def _tracked(lengths: tuple[Prior, ...]) -> tuple[Prior, ...]:
     return tuple(replace(one, sigma=(min(one.sigma[0], _ABOUT * one.value[0]),)) for one in lengths)
 
 
-def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
+def require_findable(
+    target: Target, curves: Collection[str] | None = None, lengths: Sequence[Prior] = ()
+) -> tuple[str, ...]:
+    """The names of the curves that photographs may show, all of a target or some.
+
+    Raises:
+        InputError: a name that the target does not have, no painted curve, a target in another unit, or a length that
+            no painted line shows.
+    """
     for name in curves or ():
         if name not in target.curves:
             raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
     painted = tuple(n for n, curve in target.curves.items() if curve.width_m > 0.0 and (curves is None or n in curves))
     if not painted:
         raise InputError("the target has no painted curve: a line to be found needs a width")
+    if target.reach_m > _FIELD_M:
+        raise InputError(f"the field reaches {target.reach_m:.0f} m from its origin: give its dimensions in metres")
+    for prior in lengths:
+        if not features_of(target, prior.quantity) & set(painted):
+            raise InputError(
+                f"no painted line lies elsewhere with another {prior.quantity}: it cannot be found, leave it out"
+            )
     return painted
 
 
@@ -352,13 +364,16 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     if beside is not None:
         aside = _curves(beside, beside.found, options.edges)
         curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
+    priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
+    if camera.aspect != 1.0:  # else it is solved for as one with square pixels
+        priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(
         {TARGET_NAME: target},
         {options.camera: camera.image_size},
         (View(frame, options.camera, options.station or options.camera, TARGET_NAME),),
         points,
         curves,
-        tuple(Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()),
+        tuple(priors),
     )
 
 

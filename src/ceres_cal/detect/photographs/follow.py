@@ -19,7 +19,7 @@ from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_bui
 from ceres_cal.detect.photographs.beside import among_others
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.painted import painted_curves, visible_curves
-from ceres_cal.detect.photographs.refit import TARGET, FreeIntrinsics, moved_px, observations_of, refit_camera
+from ceres_cal.detect.photographs.refit import TARGET, FreeIntrinsics, misfit, moved_px, observations_of, refit_camera
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, intrinsic_names
@@ -35,8 +35,9 @@ _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # From points that were shown: what stands farther beside a line than they are off cannot draw it away.
 _SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
-_ASPECTS = (1.0, 0.94, 0.97, 1.03, 1.06)  # that a picture which was stretched may have, to start from
-_KEPT = 0.95  # of the measured rows: where the plain picture's lens keeps as many, it was not stretched
+# Of the share, what square pixels keep at least where the picture was not stretched; times the misfit, what they have
+# at most: 1.3 where it was not, 9 where it was by 2 to 7 %.
+_KEPT, _WORSE = 0.95, 2.0
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
 _FEWEST = 12
@@ -67,14 +68,14 @@ def follow(
     if not tracker.free.names:
         return best
     if best.may_be_worn:
-        best = tracker.refined(best)
+        best = tracker.told(best)
         for one in islice(tried, _MOST_OTHERS):
             if best.is_field:
                 break
-            again = tracker.refined(one) if one.holds else one
+            again = tracker.told(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
-    return tracker.stretched(best)
+    return best
 
 
 def approach(
@@ -100,9 +101,8 @@ def look_again(
     picture that was stretched.
     """
     tracker = _Tracker(grey, target, curves, free)
-    refined = tracker.refined(seen)
-    drawn = refined if refined.is_field else tracker.as_drawn(seen)
-    return drawn if drawn.holds else tracker.stretched(drawn)
+    told = tracker.told(seen)
+    return told if told.is_field else tracker.as_drawn(tracker.squared(seen))
 
 
 def refine(
@@ -120,8 +120,7 @@ def refine(
         lacking: parts that this field is known to lack.
     """
     tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
-    refined = tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
-    return tracker.stretched(refined)
+    return tracker.told(tracker.followed(camera, tracker.measured(camera), np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +234,7 @@ class _Tracker:
 
     def refined(self, followed: Followed) -> Followed:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
-        whole = replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
+        whole = self._with(followed)
         followed = whole.without_aside(followed)
         if followed.built.is_other:
             followed = self.as_drawn(followed)
@@ -251,29 +250,38 @@ class _Tracker:
         A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
         dimensions free the camera is right: its own lines are next to where that puts them.
         """
-        there = self.as_built(other, _free(other.camera))[1]
+        there = self.as_built(other)[1].camera
         drawn = self.of_painted(there).at_rest(there, _free(there))
         if drawn.share < SURE_SHARE or not drawn.holds:
             return other
         drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
-    def stretched(self, other: Followed) -> Followed:
-        """What is the field as drawn; what does not hold with square pixels, or the field in a picture that was
-        stretched one way.
+    def told(self, followed: Followed) -> Followed:
+        """The same refined, with square pixels; unless these suit clearly worse, another field too, and the one that is
+        drawn is there in a picture that was stretched one way.
         """
-        if other.is_field and not other.built.may_be_stretched:
-            return other
-        names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
-        free = replace(self.free, names=("aspect", *names))
-        anew = replace(self.lacking(other.lacks_wholly), free=free, reached=[])
-        starts = [replace(other.camera, phi=other.camera.phi / one**0.5, aspect=one) for one in _ASPECTS]
-        tried = [anew.close_in(start, _SHOWN_REACHES_PX) for start in starts]
-        there = max(tried, key=lambda one: (one.holds, one.share))
-        if not there.holds:
-            return other
-        refined = self.refined(there)
-        return refined if refined.is_field and not refined.built.dimensions else other
+        square = self.squared(followed)
+        if self._suits_worse(square, followed):
+            stretched = self.refined(followed)
+            is_drawn = stretched.is_field and not stretched.built.dimensions
+            if is_drawn and self._suits_worse(self._with(square).as_built(square)[1], stretched):
+                return stretched
+        return self.refined(square)
+
+    def _suits_worse(self, one: Followed, other: Followed) -> bool:
+        """Whether less paint is found where one has the lines than where another has them, or it lies off that."""
+        one_px, other_px = (misfit(it.camera, self._with(it)._observed(it.lines, it.camera)) for it in (one, other))
+        return one.share < _KEPT * other.share or one_px > _WORSE * other_px
+
+    def _with(self, followed: Followed) -> _Tracker:
+        """The same for curves, and a target as drawn, as they were followed."""
+        return replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
+
+    def squared(self, followed: Followed) -> Followed:
+        """The same lines through a camera with square pixels."""
+        camera = replace(followed.camera, phi=followed.camera.phi * followed.camera.aspect**0.5, aspect=1.0)
+        return self._with(followed).at_rest(camera, _free(camera))
 
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
@@ -281,7 +289,7 @@ class _Tracker:
         whole, built = replace(self, target=followed.target), AS_DRAWN
         left = whole
         for _ in range(_ROUNDS):
-            known, built = built, whole.as_built(followed, free)[0]
+            known, built = built, whole.as_built(followed)[0]
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
             left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
@@ -294,24 +302,25 @@ class _Tracker:
             beside = every.take(np.isin(every.course.curve, aside))
         return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
-    def as_built(self, followed: Followed, free: tuple[str, ...]) -> tuple[FieldAsBuilt, Camera]:
-        """How all curves lie, and the camera by which they do.
+    def as_built(self, followed: Followed) -> tuple[FieldAsBuilt, Followed]:
+        """How all curves lie, and where they are followed to with those dimensions.
 
         Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
         others; so they are looked for again, and measured, where those dimensions put them.
         """
-        lines, camera, target = self.measured(followed.camera), followed.camera, self.target
-        built = as_built(lines, camera, target, self.free.priors)
+        free, target = _free(followed.camera), self.target
+        nearest = replace(followed, lines=self.measured(followed.camera))
+        built = as_built(nearest.lines, nearest.camera, target, self.free.priors)
         for _ in range(_NEARER):
             if not built.dimensions:
                 break
             there = replace(self, target=target_from_spec({**target.spec, **built.dimensions}, target.kind))
-            nearer = there.at_rest(camera, free)
-            if nearer.share < lines.share - _LESS:
+            nearer = there.at_rest(nearest.camera, free)
+            if nearer.share < nearest.share - _LESS:
                 break
-            lines, camera = nearer.lines, nearer.camera
-            built = as_built(lines, camera, target, self.free.priors)
-        return built, camera
+            nearest = nearer
+            built = as_built(nearest.lines, nearest.camera, target, self.free.priors)
+        return built, nearest
 
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
@@ -323,22 +332,18 @@ class _Tracker:
         known = tuple(prior for prior in self.free.priors if prior.dimension)
         observations = self._observed(lines, followed.camera)
         near = followed.camera
-        stretched = [near, *(replace(near, phi=near.phi / one**0.5, aspect=near.aspect * one) for one in _ASPECTS[1:])]
+        stretched = near.aspect != 1.0
         for kind, lens in LENSES.items():
             if lens.set_at_start:
                 continue  # a few lines do not tell a lens without a formula
             powers = (lens.trial_powers or ((),))[-1]
-            own = Options(lens=kind, powers=powers, priors=known, as_built="as drawn")  # which is judged beside it
+            own = Options(lens=kind, powers=powers, priors=known, as_built="as drawn", free_aspect=stretched)
             # The first one comes to rest where phi is usual, should its valley be open, and the others start there.
-            # From square pixels lines of a stretched picture are taken out instead; one lens shows how it is stretched.
-            for camera in [near] if fits else stretched:  # of which the first is as it is
-                if camera is not near and fits and fits[0][1].fit.curves > _KEPT * len(lines.found):
-                    break
-                # quiet: where none fits these lines, they are judged as found
-                found = attempt(partial(calibrate_near, camera, observations, own, knows=not fits))
-                if isinstance(found, Calibration):
-                    fits.append((found.fit.curve_scale * len(lines.found) / found.fit.curves, found, own))
-            near = min(fits, key=lambda fit: fit[0])[1].station() if fits else near
+            # quiet: where none fits these lines, they are judged as found
+            found = attempt(partial(calibrate_near, near, observations, own, knows=not fits))
+            if isinstance(found, Calibration):
+                fits.append((found.fit.curve_scale * len(lines.found) / found.fit.curves, found, own))
+                near = min(fits, key=lambda fit: fit[0])[1].station()
         order = sorted(fits, key=lambda fit: (fit[1].station().folds, fit[0]))
         asked = (  # of where phi may be only the one that is taken: that takes longer
             # quiet: the next one is taken

@@ -13,7 +13,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs.field import FieldOptions, detect_field
 from ceres_cal.detect.photographs.follow import FAR_PX
-from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
+from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements, require_posterior
 from ceres_cal.moves.checks import check, not_found
 from ceres_cal.observations import Observations, combine
 from ceres_cal.scene.camera import Camera
@@ -145,6 +145,7 @@ def check_photographs(
     Where no photograph shows the field near where the calibration has it, the station does not hold, and its words say
     so: the camera has moved far, or nothing is to be seen. Raises what `detect_known` and `check` raise.
     """
+    require_posterior(calibration)  # before any is read
     detections = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
     if detections.observations is not None:
         return check(calibration, detections.observations, false_alarms, checks), detections

@@ -60,6 +60,9 @@ LARGEST_M = 1e7
 """Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
 
 
+HANDY_M = 50.0  # of a target that somebody holds before a camera, from its origin
+
+
 def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
     """Raise InputError where a point or a curve of a target has numbers that cannot be."""
     once_round = 2.0 * np.pi * (1.0 + 1e-6)  # people round
@@ -128,6 +131,11 @@ class Target(Frozen):
 
     def __post_init__(self) -> None:
         require_places(self.kind, self.points, self.curves)
+        if self.movable and self.reach_m > HANDY_M:  # boards alone fit in any unit
+            raise InputError(
+                f"{self.kind}: it reaches {self.reach_m:.0f} m from its origin, and nobody holds that before a camera: "
+                "give its dimensions in metres, or with their unit, such as 25mm"
+            )
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -186,6 +194,11 @@ class Target(Frozen):
     def places(self) -> Array:
         """(P, 3) m: its points, and where its curves begin."""
         return np.concatenate([self.point_array, self.tracks[0, :, 0] + self.tracks[0, :, 1]])
+
+    @property
+    def reach_m(self) -> float:
+        """How far the farthest of `places` lies from its origin."""
+        return float(np.max(np.linalg.norm(self.places, axis=1), initial=0.0))
 
     @cached_property
     def box(self) -> Array:
