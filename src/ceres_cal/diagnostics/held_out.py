@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, rms
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, attempt
 from ceres_cal.base.executing import each
 from ceres_cal.base.frozen import Frozen, field, replace
@@ -132,8 +132,8 @@ def cross_validate(
     np.add.at(counts, frame[kept], 1.0)
     points = kept & (np.arange(len(kept)) < len(observations.points))
     return HeldOut(
-        label or label_of(options), coefficients_of(options), folds, failed, _rms(errors[points, 0]),
-        _rms(errors[kept & ~points, 0]), _rms(errors[kept, 0]), _rms(errors[kept, 1]), _rms(fit_px), names,
+        label or label_of(options), coefficients_of(options), folds, failed, rms(errors[points, 0]),
+        rms(errors[kept & ~points, 0]), rms(errors[kept, 0]), rms(errors[kept, 1]), rms(fit_px), names,
         squares, counts,
     )  # fmt: skip
 
@@ -259,8 +259,3 @@ def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array
     px = np.concatenate([np.linalg.norm(there.points, axis=1), np.abs(there.curves)])
     px = np.where(np.isfinite(px), px, unseen_sigma * column_of(observations, "sigma_px"))
     return np.column_stack([px, np.abs(error_mm(equations, equations.residual, len(px)))])
-
-
-def _rms(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, rms
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
@@ -58,7 +58,7 @@ class FieldDifference(ErrorMap):
     @property
     def rms_mm(self) -> float:
         """Root mean square of the difference; infinite where the second has no answer somewhere."""
-        return np.inf if self.lost.any() else _root_mean_square(self.errors_mm)
+        return np.inf if self.lost.any() else rms(self.errors_mm)
 
     @property
     def most_mm(self) -> float:
@@ -68,12 +68,7 @@ class FieldDifference(ErrorMap):
     @property
     def known_mm(self) -> float:
         """Root mean square of what is expected."""
-        return _root_mean_square(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm))
-
-
-def _root_mean_square(values: Array) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
+        return rms(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm))
 
 
 class MapChange(Frozen):
@@ -292,7 +287,7 @@ def change_of(
         places = np.column_stack([grid.places, np.full(len(seen), grid.height_m)])
         shifts = np.linalg.norm(seen - after.project(places), axis=1)
     turned_deg, phi_px = float(np.degrees(turn)), (camera.phi, after.phi)
-    return MapChange(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
+    return MapChange(1e3 * shift_m, turned_deg, phi_px, rms(shifts), maps)
 
 
 def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Array) -> FieldDifference:

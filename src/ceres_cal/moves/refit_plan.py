@@ -26,7 +26,6 @@ from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import intrinsic_keys
 from ceres_cal.problem.ranges import require_possible_numbers
-from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.symmetry import counterparts
 from ceres_cal.scene.targets import target_from_spec
 
@@ -188,9 +187,7 @@ def make_plan(
             calibration.cameras,
             {name: placed[name] for name in dict.fromkeys([*old, *stations]) if name in placed},
             {},
-            make_structure(observed.targets, options.tolerances, options.dimensions).carrying(
-                calibration.estimate.structure
-            ),
+            options.structure_of(observed.targets).carrying(calibration.estimate.structure),
         ),
         prior,
         scales,

@@ -231,10 +231,8 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
     return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
 
 
-_ALONG, _OVER = (
-    36,
-    (6, 12, 24),
-)  # bumps from the middle to the farthest observation, or along the longer side of the image
+# Bumps from the middle to the farthest observation, and along the longer side of the image.
+_ALONG, _OVER = 36, (6, 12, 24)
 
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:

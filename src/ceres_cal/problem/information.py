@@ -25,6 +25,7 @@ from ceres_cal.base.spread import Spread, known_inverses, without
 _TURNS = ("turn_x", "turn_y", "turn_z")
 STATION_QUANTITIES = ("x", "y", "height", *_TURNS)
 PLACEMENT_QUANTITIES = ("x", "y", "z", *_TURNS)
+POSE_QUANTITIES = {"station": STATION_QUANTITIES, "placement": PLACEMENT_QUANTITIES}
 _POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 _LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
 
@@ -71,8 +72,7 @@ def sigma_limits(keys: Sequence[Key]) -> Array:
 
 def pose_keys(kind: str, name: str) -> list[Key]:
     """The six keys of a station or a placement."""
-    quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
-    return [Key(kind, name, q, unit) for q, unit in zip(quantities, _POSE_UNITS, strict=True)]
+    return [Key(kind, name, q, unit) for q, unit in zip(POSE_QUANTITIES[kind], _POSE_UNITS, strict=True)]
 
 
 def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:

@@ -21,9 +21,10 @@ from ceres_cal.base.typed import checked_fields, take_types
 from ceres_cal.base.words import no_such
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
-from ceres_cal.problem.structure import Structure, Tolerance
+from ceres_cal.problem.structure import Structure, Tolerance, make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens, lens_class, make_lens
+from ceres_cal.scene.targets import Target
 
 AUTO = "auto"
 """The lens that the data ask for: which it is, a calibration says in its options (`calibration.lens_choice`)."""
@@ -141,6 +142,10 @@ class Options:
     @property
     def _which(self) -> str:
         return "a lens that is still to be chosen (name it)" if self.lens == AUTO else f"the {self.lens} lens"
+
+    def structure_of(self, targets: Mapping[str, Target]) -> Structure:
+        """What may be built otherwise than it is drawn of the targets, all of it as drawn."""
+        return make_structure(targets, self.tolerances, self.dimensions)
 
     @cached_property
     def held(self) -> Mapping[str, float]:

@@ -177,9 +177,10 @@ class _InformationSums:
         known = reduce(add, priors, Information.nothing(self._keys))
         every = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
         of_targets = [all(key.kind == "structure" for key in prior.keys) for prior in every]
+        each = list(zip(every, of_targets, strict=True))
         stated, built = (
-            reduce(add, (one.information for one, own in zip(every, of_targets, strict=True) if own == of), nothing)
-            for of, nothing in ((False, Information.nothing()), (True, Information.nothing()))
+            reduce(add, (one.information for one, own in each if own == of), Information.nothing())
+            for of in (False, True)
         )
         return ReducedInformation(points, curves, known, stated, built, tuple(eliminated), *self._leverages.tolist())
 

@@ -23,7 +23,6 @@ from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     RADII,
@@ -97,7 +96,7 @@ def _left(observations: Observations, sights: Sights, start: Start) -> float:
 def _initialised(observations: Observations, sights: Sights, options: Options) -> Start:
     posed = posed_sights(observations, sights, options)
     stations, placements = chained_poses(observations, sights, posed.numbers, posed.poses, open_numbers=posed.open)
-    structure = make_structure(observations.targets, options.tolerances, options.dimensions)
+    structure = options.structure_of(observations.targets)
     estimate = Estimate(posed.cameras, stations, placements, structure)
     others = tuple(
         replace(
