@@ -10,9 +10,8 @@ from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.observations import Curves, Observations, Points, View, joined, taken
 from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve
+from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve, is_crossing
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.crossings import is_crossing
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2

@@ -19,8 +19,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.lazy import cached_property
-from ceres_cal.scene.curves import Arc, Curve, along_curve
-from ceres_cal.scene.targets.crossings import aliases
+from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
 class Square(Struct, frozen=True):
