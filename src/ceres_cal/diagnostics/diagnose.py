@@ -276,9 +276,8 @@ def _with_newcomers_placed(observations: Observations, problem: Problem, calibra
         return estimate
     fit, options = calibration.fit, calibration.options
     behind = Pose(np.eye(3), np.array([0.0, 0.0, -1e6]))  # no camera sees it: any pose is better
-    unplaced = {
-        name: estimate.stations[_first_station(observations, name)].cam_from_world.inverse @ behind for name in new
-    }
+    first = {view.placement: view.station for view in reversed(observations.views)}
+    unplaced = {name: estimate.stations[first[name]].cam_from_world.inverse @ behind for name in new}
     start = replace(estimate, placements={**estimate.placements, **unplaced})
     nothing = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
     blank = Inliers(*nothing, fit.point_scale, fit.curve_scale, np.empty(0), np.empty(0))
@@ -295,7 +294,3 @@ def _with_newcomers_placed(observations: Observations, problem: Problem, calibra
                 "points of it in one view, or leave its views out"
             )
     return posed
-
-
-def _first_station(observations: Observations, placement: str) -> str:
-    return next(view.station for view in observations.views if view.placement == placement)

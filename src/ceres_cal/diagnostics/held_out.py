@@ -208,7 +208,7 @@ def _without(
     observations: Observations, options: Options, whole: Calibration, kept: Mask, part: Mask
 ) -> Array | CalibrationError:
     """Errors (n, 2), px and mm, of a part's rows that count, by a calibration without it; or why there is none."""
-    trained = _attempt(_part(observations, ~part), options)
+    trained = _attempt(observations.part(*np.split(~part, [len(observations.points)])), options)
     if isinstance(trained, CalibrationError):
         return trained
     held = part & kept
@@ -217,10 +217,6 @@ def _without(
 
 def _inliers(calibration: Calibration, observations: Observations) -> Mask:
     return np.concatenate(calibration.inlier_masks(observations))
-
-
-def _part(observations: Observations, rows: Mask) -> Observations:
-    return observations.part(*np.split(rows, [len(observations.points)]))
 
 
 def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:

@@ -13,6 +13,7 @@ import pyceres
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import SightKey, Sights
@@ -36,8 +37,7 @@ class Progress:
     step_norm: float
 
 
-@dataclass(frozen=True)
-class Solution:
+class Solution(Frozen):
     """The end of one solve.
 
     Attributes:

@@ -6,7 +6,6 @@ Residuals are taken in units of their stated sigma; the noise scale is the facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -242,8 +241,7 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
-@dataclass(frozen=True)
-class LengthSums:
+class LengthSums(Frozen):
     """Number and sum of squares of the lengths within the rejection bound."""
 
     count: int

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
@@ -217,8 +218,7 @@ class Station:
     cam_from_world: Pose
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(Frozen):
     """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
 
     cameras: Mapping[str, Camera]
@@ -275,8 +275,7 @@ class Estimate:
         return Poses.of(poses).of_names(names)
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(Frozen):
     """Which numbers the solver may move.
 
     Attributes:

@@ -7,7 +7,6 @@ into stations and placements. Nothing here is the answer: the bundle is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
@@ -42,8 +41,7 @@ _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 
 
-@dataclass(frozen=True)
-class Start:
+class Start(Frozen):
     """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess".
 
     Attributes:
