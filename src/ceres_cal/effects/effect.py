@@ -6,9 +6,9 @@ What is found of it: the cause by name, how large, how sure; and what is solved 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -97,9 +97,14 @@ class EffectEstimate:
         return f"{self.sentence}; it was solved for"
 
 
-ShiftsAt = Callable[[Estimate, Sequence[GaussianPrior] | None], tuple[Sequence[Key], Sequence[Array]]]
-"""By how much effects let numbers scatter at an estimate, under other priors where these are given: the numbers, and
-shifts of them whose products with themselves, added up, go into their covariance."""
+class ShiftsAt(Protocol):
+    """By how much effects let numbers scatter at an estimate: the numbers, and shifts of them whose products with
+    themselves, added up, go into their covariance. Under other priors, where these are given.
+    """
+
+    def __call__(
+        self, estimate: Estimate, priors: Sequence[GaussianPrior] | None = None, /
+    ) -> tuple[Sequence[Key], Sequence[Array]]: ...
 
 
 @dataclass(frozen=True)

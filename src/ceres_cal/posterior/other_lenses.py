@@ -20,11 +20,11 @@ lens is. By what the free numbers take up of them they are off.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import HEIGHTS_M
@@ -53,7 +53,8 @@ _PARTS = (1.0, 0.1)
 _COUNTED = 0.5
 
 
-class OtherLenses(Frozen):
+@dataclass(frozen=True, eq=False)
+class OtherLenses:
     """Other lenses than the chosen one, solved for from the same observations.
 
     Attributes:
@@ -231,8 +232,10 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
     return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
 
 
-# Bumps from the middle to the farthest observation, and along the longer side of the image.
-_ALONG, _OVER = 36, (6, 12, 24)
+_ALONG, _OVER = (
+    36,
+    (6, 12, 24),
+)  # bumps from the middle to the farthest observation, or along the longer side of the image
 
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:

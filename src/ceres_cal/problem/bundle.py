@@ -13,7 +13,6 @@ import pyceres
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
-from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import SightKey, Sights
@@ -37,7 +36,8 @@ class Progress:
     step_norm: float
 
 
-class Solution(Frozen):
+@dataclass(frozen=True)
+class Solution:
     """The end of one solve.
 
     Attributes:

@@ -15,13 +15,13 @@ together tell, are. The posterior has them under their sigmas like any tolerance
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
@@ -41,7 +41,8 @@ from ceres_cal.scene.targets import Target
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
 
 
-class Built(Frozen):
+@dataclass(frozen=True, eq=False)
+class Built:
     """How targets are likely built.
 
     Attributes:
