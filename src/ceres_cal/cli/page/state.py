@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta, Struct
@@ -105,21 +105,6 @@ class Made:
     observed: Mapping[str, bytes]
     calibration: Path
     boards: tuple[Path, ...] = ()
-
-
-class Commands(Protocol):
-    """How the page comes to answers: they are the commands'."""
-
-    def target(self, text: str) -> Target:
-        """The target of `--target`."""
-
-    def make(self, state: State, target: Target | None, folder: Path, *, auto: bool, known: Made | None) -> Made:
-        """Detect and calibrate into a folder.
-
-        Args:
-            auto: without a start. known: what was made before of this state: its observations are written again, and a
-                report and exports, too.
-        """
 
 
 class Change(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="change"):
