@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.base.files import make_folder
@@ -329,8 +330,7 @@ class Session:
         return {one.name: _lines(model_of(found.calibration, one)) for one in frames if one.shown}
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
+class Found(Struct, frozen=True, eq=False):
     """What came of "find the lines"; `known`: what is said of it."""
 
     calibration: Calibration

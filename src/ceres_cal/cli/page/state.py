@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,8 +74,7 @@ class State(Struct, frozen=True, forbid_unknown_fields=True):
     exports: Annotated[tuple[Name, ...], FEW] = ()
 
 
-@dataclass(frozen=True)
-class Sitting:
+class Sitting(Struct, frozen=True):
     """What does not change while the page is open.
 
     Attributes:
@@ -93,8 +91,7 @@ class Sitting:
     other: Path | None = None
 
 
-@dataclass(frozen=True)
-class Made:
+class Made(Struct, frozen=True):
     """What the commands made of a state.
 
     Attributes:
