@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from rendering.moustache import Moustache
 from rendering.photograph import photograph
 from rendering.photography import Photography
 from runner import Row, over
@@ -43,6 +44,7 @@ LENSES: dict[str, tuple[float, Lens]] = {
     "radial 3,5": (345.0, Radial((1.0e-6, 1.4e-12), (3, 5))),
     "brown": (350.0, Brown((-0.17, 0.03, 4e-4, -3e-4, -0.002))),
     "kannala-brandt": (330.0, KannalaBrandt((-0.012, 0.004, -0.003, 0.0006))),
+    "moustache": (310.0, Moustache((0.2, 0.75))),
     "fisheye": (300.0, KannalaBrandt((-0.03, 0.002, 0.0, 0.0))),
 }
 
@@ -128,6 +130,8 @@ KINDS: dict[str, Kind] = {
     "stretched": Kind(camera=lambda camera, rng: replace(camera, aspect=rng.uniform(0.93, 1.07))),
     "dark": Kind(how=lambda how, rng: replace(how, carpet=rng.uniform(0.45, 0.65), paint=rng.uniform(0.08, 0.2))),
     "coma": Kind(coma_px=6.0, most_mm=MOVED_MM),
+    "moustache": Kind(lenses=("moustache",)),
+    "covered": Kind(how=lambda how, rng: replace(how, robots=25, boxes=int(rng.integers(12, 25)), shadows=3)),
     "comatic": Kind(coma_px=6.0, most_mm=MOVED_MM, coma=comatic),
 }
 

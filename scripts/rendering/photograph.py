@@ -16,7 +16,7 @@ from ceres_cal.simulate.scene import Scene
 from rendering import render
 from rendering.ground import Ground, ground_of
 from rendering.photography import Photography, photography_of
-from rendering.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
+from rendering.things import Ball, Box, Robot, Shadow, Thing, outline, patches, shadow_outline
 
 Stretches = Mapping[str, tuple[tuple[float, float], ...]]
 """Curve -> (from, to) m along it."""
@@ -26,6 +26,7 @@ _PENUMBRA_PX = 12.0
 _LIGHT_STEP = 8  # light changes slowly: it is drawn at an eighth of the size
 _WEAR_PATCH_PX, _BLOTCH_PX = 2.0, 30.0
 _TRIES = 200
+_LARGEST_BOX = (0.9, 0.5, 1.4, np.pi, 0.7, 0.7, 0.7)  # half sides and height, m, turn and colour
 _FINE = 8  # parts of a pixel in which a camera's way is drawn
 _GROUND = 1  # its random numbers are its own: pictures without it stay what they are
 
@@ -109,7 +110,18 @@ def _placed(camera: Camera, how: Photography, rng: np.random.Generator) -> tuple
         for x, y in _places(camera, how.shadows, 0.0, rng)
     )
     by_distance = sorted(robots, key=lambda robot: -np.hypot(*(camera.position[:2] - (robot.x_m, robot.y_m))))
-    return (*balls, *by_distance), shadows  # a ball lies below what robots hide
+    return (*balls, *by_distance, *_boxes(camera, how.boxes, rng)), shadows  # a ball lies below what robots hide
+
+
+def _boxes(camera: Camera, count: int, rng: np.random.Generator) -> list[Box]:
+    """What lies flat first, then what stands; one in six is a sheet."""
+    boxes = []
+    for number, (x, y) in enumerate(_places(camera, count, 0.3, rng) if count else ()):
+        length, width, height, turn, *colour = rng.uniform((0.15, 0.15, 0.02, 0.0, 0.02, 0.02, 0.02), _LARGEST_BOX)
+        if number % 6 == 0:
+            length, width, height = 2.5 * length, 2.5 * width, 0.01
+        boxes.append(Box(x, y, (length, width), height, turn, (colour[0], colour[1], colour[2])))
+    return sorted(boxes, key=lambda box: box.height_m)
 
 
 def _places(camera: Camera, count: int, apart_m: float, rng: np.random.Generator) -> list[tuple[float, float]]:

@@ -23,6 +23,7 @@ class Photography:
         unevenness: share by which the lamps' light varies over the image.
         shadows: number of people's shadows on the floor. shadow_depth: share of the light that each takes.
         robots: number of robots on the field, balls: number of balls; both hide what is behind them.
+        boxes: number of boxes, mats and people, who hide a part of the field.
         wear: share of the paint that is worn off.
         carpet: brightness of the carpet, paint: of paint and paper, as shares of white.
         carpet_colour, paint_colour: blue, green and red of each, times its brightness.
@@ -49,6 +50,7 @@ class Photography:
     shadow_depth: float = 0.5
     robots: int = 0
     balls: int = 0
+    boxes: int = 0
     wear: float = 0.0
     carpet: float = 0.2
     paint: float = 0.85
@@ -72,7 +74,7 @@ class Photography:
         for name in ("vignetting", "unevenness", "shadow_depth", "wear", "carpet", "paint", "strips"):
             if getattr(self, name) > 1.0:
                 raise InputError(f"photography: {name} is a share and at most 1, not {getattr(self, name)}")
-        for name in ("shadows", "robots", "balls"):
+        for name in ("shadows", "robots", "balls", "boxes"):
             if getattr(self, name) > MOST_THINGS:
                 raise InputError(f"photography: at most {MOST_THINGS} {name}, not {getattr(self, name)}")
         if self.jpeg_quality > 100:

@@ -44,6 +44,18 @@ class Ball:
 
 
 @dataclass(frozen=True)
+class Box:
+    """A box, a mat or somebody who stands around (x, y) m: half sides, height and turn, and the colour of its top."""
+
+    x_m: float
+    y_m: float
+    half_sides_m: tuple[float, float]
+    height_m: float
+    heading_rad: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
 class Shadow:
     """A person's shadow on the floor: an ellipse around (x, y) m with half axes in m."""
 
@@ -54,7 +66,7 @@ class Shadow:
     heading_rad: float
 
 
-Thing = Robot | Ball
+Thing = Robot | Ball | Box
 
 Patch = tuple[Array, Colour]
 """A filled polygon (N, 2) px."""
@@ -64,6 +76,8 @@ def outline(thing: Thing, camera: Camera) -> Array:
     """(N, 2) px: the border of all that a thing hides, NaN where the camera cannot show it."""
     if isinstance(thing, Ball):
         return camera.project(_ball_horizon(thing, camera.position))
+    if isinstance(thing, Box):
+        return _convex(np.vstack([_level(thing, 0.0, camera), _level(thing, thing.height_m, camera)]))
     middle = np.array([thing.x_m, thing.y_m])
     floor = np.column_stack([middle + ROBOT_RADIUS_M * _CIRCLE, np.zeros(len(_CIRCLE))])
     return _convex(np.vstack([camera.project(floor), _disc(middle, ROBOT_RADIUS_M, camera)]))
@@ -73,6 +87,9 @@ def patches(thing: Thing, camera: Camera) -> list[Patch]:
     """The coloured polygons of a thing, the farthest first."""
     if isinstance(thing, Ball):
         return [(outline(thing, camera), _ORANGE)]
+    if isinstance(thing, Box):
+        red, green, blue = (0.5 * share for share in thing.colour)
+        return [(outline(thing, camera), (red, green, blue)), (_level(thing, thing.height_m, camera), thing.colour)]
     middle = np.array([thing.x_m, thing.y_m])
     cosine, sine = np.cos(thing.heading_rad), np.sin(thing.heading_rad)
     turn = np.array([[cosine, -sine], [sine, cosine]])
@@ -93,6 +110,17 @@ def shadow_outline(shadow: Shadow, camera: Camera) -> Array:
     ellipse = _CIRCLE * (shadow.half_length_m, shadow.half_width_m)
     floor = ellipse @ np.array([[cosine, sine], [-sine, cosine]]) + (shadow.x_m, shadow.y_m)
     return camera.project(np.column_stack([floor, np.zeros(len(floor))]))
+
+
+def _level(box: Box, height_m: float, camera: Camera) -> Array:
+    """Its border at a height; sides in steps, as a lens bends them."""
+    steps = np.linspace(-1.0, 1.0, 12, endpoint=False)
+    ones = np.ones(len(steps))
+    sides = [(steps, -ones), (ones, steps), (-steps, ones), (-ones, -steps)]
+    border = np.vstack([np.column_stack(one) for one in sides]) * box.half_sides_m
+    cosine, sine = np.cos(box.heading_rad), np.sin(box.heading_rad)
+    place = border @ np.array([[cosine, sine], [-sine, cosine]]) + (box.x_m, box.y_m)
+    return camera.project(np.column_stack([place, np.full(len(place), height_m)]))
 
 
 def _disc(middle: Array, radius_m: float, camera: Camera) -> Array:

@@ -8,6 +8,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, attempt
@@ -25,8 +26,7 @@ from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedForm:
+class ClosedForm(Struct, frozen=True, eq=False):
     """The paper's own method on the same observations.
 
     Attributes:
@@ -38,8 +38,7 @@ class ClosedForm:
     lengths: Array
 
 
-@dataclass(frozen=True, eq=False)
-class FramePhotographs:
+class FramePhotographs(Struct, frozen=True, eq=False):
     """Photographs by the names of their frames, and the calibration to compare with.
 
     Attributes:

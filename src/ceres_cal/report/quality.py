@@ -29,8 +29,7 @@ from ceres_cal.problem.parameters import OF_PIXELS
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
-class FaultyMap:
+class FaultyMap(Struct, frozen=True, eq=False):
     """A map of a station at one height, and by how much faults move its places.
 
     Attributes:

@@ -27,15 +27,16 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
 # Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
-# lie aside, root sum of squares, or a dimension: farther, they are others.
+# lie aside, root sum of squares: farther, they are others.
 _SCATTER, _FARTHEST = np.array([0.0125, 0.025, 0.05, 0.1, 0.2]), 3.0
 _ASIDE = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
 SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 _OTHER = 0.1  # of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 _BEAM, _MOST = 24, 9
-# Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
-_OTHER_FIELD = 0.02
+# Of a dimension, and of what a curve usually lies aside, another field: what a tape measure, a strange lens and a floor
+# that is not flat make of one is less.
+_OTHER_FIELD, _LONGER = 0.02, 4.0
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
 # Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
 # wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
@@ -77,14 +78,14 @@ class FieldAsBuilt:
         """Whether this is another field: a dimension too far off for a tape measure, lines all over the place, or bent
         as by no lens.
         """
-        farthest_m = _FARTHEST * self.usual_m
         changed = any(
             abs(length - self.drawn[name])
-            > max(_SURELY * self.sd_m[name], min(_OTHER_FIELD * self.drawn[name], farthest_m))
+            > max(_SURELY * self.sd_m[name], min(_OTHER_FIELD * self.drawn[name], _LONGER * self.usual_m))
             for name, length in self.dimensions.items()
         )
-        elsewhere = np.linalg.norm(list(self.aside_m.values())) > farthest_m or 2 * len(self.aside_m) > len(self.names)
-        return changed or bool(elsewhere) or self.misfit > _MOST_MISFIT
+        far = float(np.linalg.norm(list(self.aside_m.values())))
+        elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
+        return changed or elsewhere or self.misfit > _MOST_MISFIT
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""

@@ -101,5 +101,6 @@ class Followed:
 
     @property
     def _has_all(self) -> bool:
-        missing = np.isin(self.lines.course.curve, self.absent)
+        gone = [number for number in self.absent if self.target.curve_names[number] not in self.visible]
+        missing = np.isin(self.lines.course.curve, gone)  # what it may lack, and others hide, is lacking at most
         return float(np.mean(missing)) <= _MOST_ABSENT

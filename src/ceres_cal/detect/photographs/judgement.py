@@ -26,9 +26,10 @@ _EXPLAINED = 0.75
 # and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
 _OF_ALL, _OF_ALL_IF_WHOLE = 0.55, 0.4
 # Of straight lines, those that a camera lays on any others by place, size and bend; the negative log of the chance that
-# the rest lie on lines by themselves, from which on other lines lie there besides: 13 where they do, of others 7; and
-# below which a corner may be any corner, so that nearly all the picture must be explained: 0.92 is, of others 0.88.
-_LAID, _NO_CHANCE, _BY_ANY, _IF_ANY = 5, 9.0, 2.0, 0.9
+# the rest lie on lines by themselves, from which on other lines lie there besides: 13 where they do, of others 7; the
+# same where each is seen to lie as drawn, to millimetres; and below which a corner may be any corner, so that nearly
+# all the picture must be explained: 0.92 is, of others 0.88.
+_LAID, _NO_CHANCE, _IF_AS_DRAWN, _BY_ANY, _IF_ANY = 5, 9.0, 4.0, 2.0, 0.9
 # Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
 # another line's at least.
 _PARALLEL, _AS_STRONG = 0.07, 0.5
@@ -70,9 +71,11 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
     share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
-    told = coincidence(search, followed)
+    told, as_drawn = coincidence(search, followed), followed.built.names and not followed.built.dimensions
     enough = _EXPLAINED, _OF_ALL if followed.absent else _OF_ALL_IF_WHOLE
-    if told < _NO_CHANCE and np.any(np.less((share, of_all), _IF_ANY if told < _BY_ANY else enough)):
+    if told < (_IF_AS_DRAWN if as_drawn else _NO_CHANCE) and np.any(
+        np.less((share, of_all), _IF_ANY if told < _BY_ANY else enough)
+    ):
         share = min(share, of_all)
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "

@@ -151,7 +151,7 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
         if any(followed is one for one in problem.refused):
             continue
         against = objection(problem, followed)
-        if against and followed.share >= SURE_SHARE:
+        if against and (followed.holds or followed.share >= SURE_SHARE):
             free = _free(own.target, auto, followed.camera)
             followed = look_again(problem.grey, own.target, followed, problem.curves, free)
             against = objection(problem, followed)
