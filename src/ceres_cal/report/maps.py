@@ -16,6 +16,7 @@ from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
+from ceres_cal.report.residual_pictures import number_of, owner_suffix
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 
 if TYPE_CHECKING:
@@ -249,10 +250,9 @@ def lens_image_figure(material: Material, name: str) -> Figure:
     known = material.uncertainty.map_px(name)
     stations = [s for s, owner in material.observations.stations.items() if owner == name]
     observed = np.concatenate([material.observed(station) for station in stations])
-    several = len(material.observations.cameras) > 1
     called = (
-        f"image-{list(material.observations.cameras).index(name)}",
-        "Over the image" + (f", {name}" if several else ""),
+        f"image-{number_of(material, name)}",
+        f"Over the image{owner_suffix(material, name)}",
         "How far off the pixel of a direction may be, with the camera turned to its best pose. Darker is worse.",
     )
     size = material.calibration.cameras[name].image_size
