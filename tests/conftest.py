@@ -4,6 +4,7 @@ import fcntl
 import gc
 import os
 import pickle
+import runpy
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -57,6 +58,20 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[], _T]
             path.write_bytes(pickle.dumps(make()))
     made: _T = pickle.loads(path.read_bytes())
     return made
+
+
+@pytest.fixture
+def as_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a script prints, run in a folder, with arguments; in this process, which has imported all that it needs."""
+
+    def run(script: Path, *arguments: object, folder: Path) -> str:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr("sys.argv", [str(script), *map(str, arguments)])
+        capsys.readouterr()
+        runpy.run_path(str(script), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
+from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
 from ceres_cal.problem.bundle import Progress
@@ -55,6 +56,13 @@ def options_for(scene: Scene, **more: Any) -> Options:
 @cache
 def observed(name: str, disturbance: Disturbance = NOISE, seed: int = 0) -> Simulation:
     return simulate(SCENES[name](), disturbance, seed)
+
+
+@cache
+def solved(name: str, noise_scale: str = "estimate") -> Calibration:
+    """Of a scene as it is observed by default."""
+    simulation = observed(name)
+    return calibrate(simulation.observations, options_for(simulation.scene, noise_scale=noise_scale))
 
 
 def error_of(found: Camera, truth: Camera) -> float:
@@ -314,13 +322,13 @@ def test_order_names_and_frames_do_not_matter(name: str, rearranged: Rearrange) 
     """At the stated noise to the end of the solve; an estimated noise is settled to 1 %, which shows in phi."""
     simulation = observed(name)
     options = options_for(simulation.scene, noise_scale="stated")
-    base = calibrate(simulation.observations, options)
+    base = solved(name, "stated")
     other = calibrate(rearranged(simulation.observations), options)
     for truth, found in zip(base.cameras.values(), other.cameras.values(), strict=True):
         assert found.phi == pytest.approx(truth.phi, rel=1e-8)  # 8e-10 measured
         assert found.principal_point == pytest.approx(truth.principal_point, abs=1e-8 * truth.phi)
     assert sorted(e.row for e in other.rejected) == sorted(e.row for e in base.rejected) == []
-    base = calibrate(simulation.observations, options_for(simulation.scene))
+    base = solved(name)
     other = calibrate(rearranged(simulation.observations), options_for(simulation.scene))
     for truth, found in zip(base.cameras.values(), other.cameras.values(), strict=True):
         assert found.phi == pytest.approx(
@@ -362,7 +370,7 @@ def test_frame_and_unit_of_the_world_do_not_matter(
 ) -> None:
     simulation = observed(name)
     options = options_for(simulation.scene, noise_scale="stated")
-    base = calibrate(simulation.observations, options).station()
+    base = solved(name, "stated").station()
     new_from_old = Pose(rotation_exp((0.0, 0.0, turn)), np.array(shift))
     targets = {key: transformed(target, new_from_old, unit) for key, target in simulation.observations.targets.items()}
     found = calibrate(replace(simulation.observations, targets=targets), options).station()
@@ -627,7 +635,7 @@ def test_one_board_is_enough_for_a_pose_but_not_many() -> None:
 def test_views_without_observations_change_nothing() -> None:
     """Frames in which a board or the field was looked for and not found."""
     simulation = observed("brown/boards")
-    base = calibrate(simulation.observations, options_for(simulation.scene))
+    base = solved("brown/boards")
     target, station = simulation.observations.views[0].target, simulation.observations.views[0].station
     empty = [View(str(number), "camera", station, target, f"unseen_{number}") for number in range(5)]
     empty += [View("field", "camera", station, target), View("moved", "camera", "elsewhere", target, "unseen_0")]

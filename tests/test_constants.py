@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,15 @@ SRC = Path(__file__).parents[1] / "src/ceres_cal"
 each_constant = pytest.mark.parametrize("constant", DECIDING, ids=str)
 
 
+@cache
+def parsed(module: str) -> tuple[str, list[ast.stmt]]:
+    text = (SRC / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
+    return text, ast.parse(text).body
+
+
 def assignment(module: str, name: str) -> tuple[list[str], int, ast.stmt | None]:
     """Lines of the module, number of the one that sets the name, and the statement after it."""
-    text = (SRC / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
-    body = ast.parse(text).body
+    text, body = parsed(module)
     for number, node in enumerate(body):
         targets = (
             node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib as mpl
@@ -15,10 +16,13 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def said(name: str, *arguments: str) -> str:
-    """What an example prints."""
+    """What an example prints, in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     call = [sys.executable, str(ROOT / "examples" / name), *arguments]
     return subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+
+
+Script = Callable[..., str]
 
 
 def number(pattern: str, text: str) -> float:
@@ -32,20 +36,20 @@ def test_every_example_is_tested() -> None:
     assert {path.name for path in (ROOT / "examples").iterdir() if path.is_file()} == tested
 
 
-def test_arrays_of_opencv() -> None:
-    text = said("opencv_arrays.py")
+def test_arrays_of_opencv(as_script: Script) -> None:
+    text = as_script(ROOT / "examples" / "opencv_arrays.py", folder=ROOT)
     assert number(r"rms ([\d.]+) px over 8 boards", text) < 0.2  # 0.05 measured
     assert number(r"phi +([\d.]+)", text) == pytest.approx(872.0, abs=4.0)  # as this lens has it: whole sample
 
 
-def test_a_field_of_ones_own() -> None:
-    text = said("own_field.py")
+def test_a_field_of_ones_own(as_script: Script) -> None:
+    text = as_script(ROOT / "examples" / "own_field.py", folder=ROOT)
     assert number(r"phi ([\d.]+) px", text) == pytest.approx(700.0, abs=10.0)
     assert number(r"off by ([\d.]+) mm", text) < 4.0 * number(r"stated ([\d.]+) mm", text)
 
 
-def test_two_cameras() -> None:
-    text = said("two_cameras.py")
+def test_two_cameras(as_script: Script) -> None:
+    text = as_script(ROOT / "examples" / "two_cameras.py", folder=ROOT)
     assert number(r"see: ([\d.]+) mm", text) < 4.0 * number(r"where ([\d.]+) mm", text)
 
 

@@ -26,7 +26,6 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
-from ceres_cal.cli.open_steps import PageCommands
 from ceres_cal.cli.page.server import serve
 from ceres_cal.cli.page.session import KEPT, Session, opened
 from ceres_cal.cli.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
@@ -44,7 +43,7 @@ CORNERS = ("TopLeftCorner", "TopRightCorner", "BottomLeftCorner", "BottomRightCo
 def session_of(folder: Path, state: State | None = None, count: int = 1) -> Session:
     photographs = tuple(sorted(PHOTOGRAPHS.glob("0*.jpg"))[:count])
     sitting = Sitting(photographs, ((1280, 960),) * count, folder)
-    return opened(sitting, PageCommands(sitting), state or State(target="ssl-b"))
+    return opened(sitting, state or State(target="ssl-b"))
 
 
 def drag(name: str, x: float, y: float, **more: Any) -> Drag:

@@ -53,6 +53,7 @@ WRONG = {
     ],
     "detect field": [
         ("VIDEO --auto --target ssl-c", "there is no target 'ssl-c': did you mean 'ssl-b'?"),
+        ("VIDEO --auto --target VIDEO", "not valid JSON"),
         ("VIDEO --auto --target MILLIMETRES", "the field reaches 5408 m from its origin"),
         ('VIDEO --auto --target \'{"kind": "rings", "radii_m": [0.1]}\'', "no painted curve"),
         ("VIDEO --target ssl-b --start nowhere.json", "nowhere.json: no such file"),

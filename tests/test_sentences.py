@@ -1,15 +1,17 @@
 """Every sentence that a user can meet keeps the simple rules of plain English."""
 
+from functools import cache
+
 import pytest
 from data.sentences import MOST_WORDS, rules, sentences
 
-EVERY = sentences()
+every = cache(sentences)
 
 
 def test_all_kinds_are_read() -> None:
-    kinds = {one.kind for one in EVERY}
-    assert kinds == {"error", "help", "answer", "words"} and len(EVERY) > 1200  # 1700 measured
-    texts = {one.text for one in EVERY}
+    kinds = {one.kind for one in every()}
+    assert kinds == {"error", "help", "answer", "words"} and len(every()) > 1200  # 1700 measured
+    texts = {one.text for one in every()}
     assert "The solve converged." in texts and any(text.startswith("--corner says where to start") for text in texts)
 
 
@@ -26,5 +28,5 @@ def test_what_breaks_a_rule_is_found(text: str, wrong: str) -> None:
 
 
 def test_every_sentence_keeps_the_rules() -> None:
-    broken = [f"{one.where}: {wrong}: {one.text!r:.80}" for one in EVERY for wrong in rules(one.text)]
+    broken = [f"{one.where}: {wrong}: {one.text!r:.80}" for one in every() for wrong in rules(one.text)]
     assert not broken, "\n".join(broken)

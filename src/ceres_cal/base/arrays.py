@@ -62,6 +62,12 @@ def medians(values: Array) -> Array:
     return np.asarray(np.where(np.isnan(largest), largest, 0.5 * (ordered[..., low] + ordered[..., high])))
 
 
+def rms(values: Array, nothing: float = np.nan) -> float:
+    """Root mean square of the values that are not NaN; `nothing` where there are none."""
+    known = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else nothing
+
+
 def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
     """Which of the known names each one is."""
     order = {name: number for number, name in enumerate(known)}

@@ -7,7 +7,6 @@ A pose named `cam_from_world` maps world coordinates to camera coordinates, so f
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import numbers_in
 
@@ -142,8 +142,7 @@ def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
+class Pose(Frozen):
     """A rigid transform b_from_a: x_b = rotation @ x_a + translation.
 
     Attributes:
@@ -247,8 +246,7 @@ def inverted(poses: Array) -> Array:
 _IDENTITY = np.eye(3, 4)[None]
 
 
-@dataclass(frozen=True, eq=False)
-class Poses(Mapping[str, Pose]):
+class Poses(Frozen, Mapping[str, Pose]):
     """Poses by name, held as one stack.
 
     Attributes:

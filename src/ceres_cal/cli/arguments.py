@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -176,10 +176,21 @@ def name(text: str) -> str:
 
 def parse_board(text: str) -> tuple[int, int, float]:
     """COLUMNSxROWSxMM: inner corners, and the side of a square in metres."""
-    parts = text.split("x")
+    parts = text.lower().split("x")
     if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
         raise InputError(f"board {text!r}: write COLUMNSxROWSxSQUARE, such as 9x6x25mm")
     return int(parts[0]), int(parts[1]), parse_length(parts[2], f"board {text!r}", "mm") / 1000.0
+
+
+def board_words(text: str) -> list[str]:
+    """COLUMNSxROWSxMM as `detect board` takes it."""
+    columns, rows, square_m = parse_board(text)
+    return ["--columns", str(columns), "--rows", str(rows), "--square", f"{1e3 * square_m:.9g}mm"]
+
+
+def repeated(option: str, values: Iterable[str]) -> list[str]:
+    """An option that is given with each of the values."""
+    return [word for value in values for word in (option, value)]
 
 
 def parse_facing(spec: str) -> tuple[str, str]:

@@ -139,8 +139,7 @@ def work(job: Job) -> Outcome:
     Raises:
         CalibrationError: as the command has it.
     """
-    command = COMMANDS[job.command]
-    data = command.run(command.parse([*job.arguments, *_written(job.outputs), "--quiet"])).data
+    data = COMMANDS[job.command].answer([*job.arguments, *_written(job.outputs)], quiet=True).data
     return _of_check(job, data) if job.command == "check" else _of_calibration(job, data)
 
 

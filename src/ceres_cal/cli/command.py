@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields
 from types import NoneType
@@ -247,6 +248,15 @@ class Command:
         args = filled(self.arguments, parser.parse_intermixed_args(arguments))
         _require_beside(args)
         return args
+
+    def answer(self, arguments: Sequence[str], *, quiet: bool = False) -> Document:
+        """What it answers to what is typed; `quiet`: without showing how far it is."""
+        quietly = ["--quiet"] if quiet and issubclass(self.arguments, QuietArguments) else []
+        return self.run(self.parse([*arguments, *quietly]))
+
+    def typed(self, arguments: Sequence[str]) -> str:
+        """The whole of it as one types it."""
+        return shlex.join(["ceres-cal", *self.name.split(), *arguments])
 
     @property
     def about(self) -> dict[str, Any]:

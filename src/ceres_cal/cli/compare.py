@@ -11,7 +11,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import fixed
 from ceres_cal.cli.arguments import height_option, metres, station_option
 from ceres_cal.cli.command import Arguments, argument, command, option, switch
-from ceres_cal.cli.files import finishing, require_output
+from ceres_cal.cli.files import read_calibration, require_ending, require_output, save
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -40,9 +40,8 @@ class CompareArguments(Arguments):
 )
 def _run(args: CompareArguments) -> Document:
     require_output(args.picture, [args.a, args.b])
-    from ceres_cal.calibration import Calibration
-
-    first, second = Calibration.load(args.a), Calibration.load(args.b)
+    require_ending(args.picture, "pictures are", ".svg")
+    first, second = read_calibration(args.a), read_calibration(args.b)
     if args.over_image or args.without_turn or all(target.movable for target in first.targets.values()):
         return _over_image(args, first, second)
     return _over_field(args, first, second)
@@ -58,7 +57,6 @@ def _over_image(args: CompareArguments, first: Calibration, second: Calibration)
 
 
 def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
-    from ceres_cal.base.files import write_bytes
     from ceres_cal.moves.comparisons import compare
 
     comparisons = compare(first, second, metres(args.height_mm), args.station)
@@ -68,9 +66,7 @@ def _over_field(args: CompareArguments, first: Calibration, second: Calibration)
             raise InputError(f"--picture shows one station: name it with --station {names}")
         from ceres_cal.report.maps import comparison_svg
 
-        svg = comparison_svg(next(iter(comparisons.values())), first)
-        with finishing():
-            write_bytes(args.picture, svg.encode())
+        save(args.picture, comparison_svg(next(iter(comparisons.values())), first).encode())
     return Document(tuple(section for one in comparisons.values() for section in _station(one)))
 
 

@@ -10,7 +10,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import images_and_videos
 from ceres_cal.cli.arguments import frames_option, length, number, parse_length, parse_lengths
 from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, command, flag, option, switch
-from ceres_cal.cli.files import finishing, read_target, require_observations_output
+from ceres_cal.cli.files import read_target, require_observations_output, save
 from ceres_cal.cli.photographs import DetectArguments, detected, missed_section
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -86,8 +86,7 @@ def _run_board(args: BoardArguments) -> Document:
         detections = detected(
             args.timeout, partial(detect_board, args.images, _board(args), **how, progress=bar.update)
         )
-    with finishing():
-        detections.observations.save(args.output)
+    save(args.output, detections.observations)
     return _document(detections, args.output)
 
 
@@ -160,8 +159,7 @@ def _run(args: RingsArguments) -> Document:
     from ceres_cal.detect.rings import detect_rings
 
     detection = detected(args.timeout, partial(detect_rings, args.image, args.radii, args.camera, args.station))
-    with finishing():
-        detection.observations.save(args.output)
+    save(args.output, detection.observations)
     return _rings_document(detection, args)
 
 

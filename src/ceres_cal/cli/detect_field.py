@@ -127,8 +127,7 @@ def _run(args: FieldArguments) -> Document:
     )
     with bar:
         detections = detected(args.timeout, look)
-    with files.finishing():
-        detections.observations.save(args.output)
+    files.save(args.output, detections.observations)
     return Document(tuple(_sections(detections, merged, args.output)))
 
 
@@ -136,7 +135,6 @@ def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResu
     """Draws what was seen in the first photograph that is refused."""
     if picture is None:
         return None
-    from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded, read_colour
     from ceres_cal.report.pictures.overlay import draw_seen
 
@@ -144,8 +142,7 @@ def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResu
 
     def draw(path: Path, result: SearchResult) -> None:
         if not drawn:
-            content = encoded(draw_seen(read_colour(path), result.seen, target), ".png", 90)
-            write_bytes(picture, content)
+            files.save(picture, encoded(draw_seen(read_colour(path), result.seen, target), ".png", 90))
             drawn.append(path)
 
     return draw

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
 from ceres_cal.cli.command import REQUIRED, Arguments, command, flag, option, options_of
-from ceres_cal.cli.files import finishing, read_calibration, require_output
+from ceres_cal.cli.files import read_calibration, require_output, save
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -93,8 +93,7 @@ def _exported(args: TableArguments) -> Document:
     options = format_options(args.options, [form])
     exported = prepare_export(read_calibration(args.calibration), form.name, args.output, args.station or None, options)
     exported.require_loss_mm(args.max_loss_mm)
-    with finishing():
-        exported.save(args.output)
+    save(args.output, exported)
     about = {"format": form.name, "output": str(args.output), **exported.facts}
     first = Section(form.name, [f"{exported.words}, written to {args.output}"], about)
     return Document((first, *losses(exported)))

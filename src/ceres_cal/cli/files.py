@@ -109,7 +109,7 @@ def read_calibration(path: Path) -> Calibration:
     return Calibration.load(path)
 
 
-def read_observations(paths: Iterable[str]) -> Observations:
+def read_observations(paths: Iterable[str | Path]) -> Observations:
     """All files of observations as one."""
     from ceres_cal.observations import Observations, combine
 
@@ -185,6 +185,19 @@ def finishing() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def save(path: Path, made: Any) -> None:
+    """Write a result whole or not at all: bytes, names and values as JSON, or what saves itself."""
+    from ceres_cal.base.files import write_bytes, write_json
+
+    with finishing():
+        if isinstance(made, bytes):
+            write_bytes(path, made)
+        elif isinstance(made, Mapping):
+            write_json(path, made)
+        else:
+            made.save(path)
 
 
 def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> Section:

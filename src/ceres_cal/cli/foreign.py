@@ -11,7 +11,7 @@ from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
 from ceres_cal.cli.command import Arguments, argument, command, option, options_of, switch
 from ceres_cal.cli.export import format_options, import_forms, listed, losses
-from ceres_cal.cli.files import finishing, read_calibration, require_ending, require_output
+from ceres_cal.cli.files import read_calibration, require_ending, require_output, save
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ def _import(args: ImportArguments) -> Document:
         raise InputError(no_such("import format", args.form, import_forms()))
     forms = list(import_forms().values()) if args.form is None else [import_forms()[args.form]]
     given = read_foreign(args.file, args.form, **format_options(args.options, forms))
-    with finishing():
-        given.save(args.output)
+    save(args.output, given)
     path, place = str(args.output), f"written to {args.output}"
     if isinstance(given, Observations):
         sizes = {name: len(getattr(given, name)) for name in ("points", "curves", "views")}
@@ -134,10 +133,7 @@ def _listen(args: ListenArguments) -> Document:
     heard = received_geometry(_group(args), args.seconds)
     if args.output.suffix == ".json":
         return _write_target(heard.field, args.output, heard.sender)
-    from ceres_cal.base.files import write_bytes
-
-    with finishing():
-        write_bytes(args.output, geometry_content(heard.geometry, args.output.suffix))
+    save(args.output, geometry_content(heard.geometry, args.output.suffix))
     ids = [entry["camera_id"] for entry in heard.geometry.get("calib", [])]
     words = f"a field and cameras {ids} from {heard.sender}, written to {args.output}"
     data = {"output": str(args.output), "camera_ids": ids, "sender": heard.sender}
@@ -163,10 +159,7 @@ def _targets_import(args: TargetsImportArguments) -> Document:
 
 
 def _write_target(target: Target, path: Path, sender: str = "") -> Document:
-    from ceres_cal.base.files import write_json
-
-    with finishing():
-        write_json(path, target.spec)
+    save(path, target.spec)
     whence = f" from {sender}" if sender else ""
     counts = f"{len(target.points)} points and {len(target.curves)} curves"
     words = f"{target.kind} with {counts}{whence}, written to {path}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import Arguments, argument, command, option
-from ceres_cal.cli.files import finishing, read_observations, require_different, require_observations_output
+from ceres_cal.cli.files import read_observations, require_different, require_observations_output, save
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
@@ -45,8 +45,7 @@ def _run(args: JoinArguments) -> Document:
     if args.same_frame is not None:
         observations = with_same_frames(observations, args.same_frame)
     labels = with_same_labels(observations)
-    with finishing():
-        labels.observations.save(args.output)
+    save(args.output, labels.observations)
     return Document(tuple(_sections(labels, args)))
 
 

@@ -52,12 +52,11 @@ def _run(args: OpenArguments) -> Document:
     require_shown(args.target, args.board, args.prior, "camera")
     require_folder(args.output)
     sitting = _sitting(args)
-    from ceres_cal.cli.open_steps import PageCommands
     from ceres_cal.cli.page.session import opened
     from ceres_cal.cli.page.state import State
 
     state = State(target=args.target or "", board=args.board or "", priors=args.prior)
-    session = opened(sitting, PageCommands(sitting), state)
+    session = opened(sitting, state)
     _serve(session, args)
     return Document(tuple(_sections(session)))
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes, write_json
+from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS
-from ceres_cal.cli.files import read_target
 from ceres_cal.cli.page.state import Made, Region, Sitting, State, target_words
 from ceres_cal.detect.images import encoded
 from ceres_cal.detect.photographs.clicks import FEWEST, FORMAT, VERSION
@@ -24,8 +22,7 @@ from ceres_cal.scene.targets import Target
 CAMERA = "camera"
 
 
-@dataclass(frozen=True)
-class PageStep:
+class PageStep(NamedTuple):
     """A command with its arguments, and what it writes."""
 
     name: str
@@ -34,66 +31,61 @@ class PageStep:
 
     @property
     def typed(self) -> str:
-        return shlex.join(["ceres-cal", *self.name.split(), *self.arguments])
+        return COMMANDS[self.name].typed(self.arguments)
+
+    def answer(self) -> Document:
+        return COMMANDS[self.name].answer(self.arguments, quiet=True)
 
 
-@dataclass(frozen=True)
-class PageCommands:
-    """The commands behind one sitting of the page."""
+def make(
+    sitting: Sitting,
+    state: State,
+    target: Target | None,
+    folder: Path,
+    *,
+    auto: bool = False,
+    known: Made | None = None,
+) -> Made:
+    """Detect and calibrate into a folder, by the commands.
 
-    sitting: Sitting
+    Args:
+        auto: without a start. known: what was made before of this state: its observations are written again, and a
+            report and exports, too.
 
-    def target(self, text: str) -> Target:
-        return read_target(text, "field")
+    Raises:
+        CalibrationError: what a command raises, or there is nothing to look for.
+    """
+    write_inputs(state, sitting, folder, auto=auto)
+    done: list[PageStep] = []
+    boards = () if known is None else known.boards
 
-    def make(self, state: State, target: Target | None, folder: Path, *, auto: bool, known: Made | None) -> Made:
-        """See `page.state.Commands`.
+    def observe(step: PageStep) -> Any:
+        done.append(step)
+        if known is None:
+            return step.answer().data["found"]
+        return write_bytes(step.output, known.observed[step.output.name])  # what it wrote when the lines were found
 
-        Raises:
-            CalibrationError: what a command raises, or there is nothing to look for.
-        """
-        write_inputs(state, self.sitting, folder, auto=auto)
-        done: list[PageStep] = []
-        boards = () if known is None else known.boards
-
-        def observe(step: PageStep) -> Any:
-            done.append(step)
-            if known is None:
-                return _answer(step).data["found"]
-            return write_bytes(step.output, known.observed[step.output.name])  # what it wrote when the lines were found
-
-        if state.board:
-            boards = tuple(map(Path, observe(board_step(state, self.sitting, folder)) or boards))
-        if target is not None:
-            for step in field_steps(state, target, self.sitting, folder, boards, auto=auto):
-                observe(step)
-        if not done:
-            raise InputError("say what the photographs show: choose a field, or give the size of a board")
-        outputs = [step.output for step in done]
-        calibrated = calibrate_step(state, outputs, folder, report=known is not None)
-        for step in (calibrated, *(export_steps(state, folder) if known is not None else ())):
-            _answer(step)
-            done.append(step)
-        observed = {path.name: read_bytes(path) for path in outputs}
-        return Made(tuple(step.typed for step in done), observed, calibrated.output, boards)
-
-
-def _answer(step: PageStep) -> Document:
-    """What the command answers; nothing of how far it is."""
-    quiet = [] if step.name == "export" else ["--quiet"]
-    return COMMANDS[step.name].run(COMMANDS[step.name].parse([*step.arguments, *quiet]))
+    if state.board:
+        boards = tuple(map(Path, observe(board_step(state, sitting, folder)) or boards))
+    if target is not None:
+        for step in field_steps(state, target, sitting, folder, boards, auto=auto):
+            observe(step)
+    if not done:
+        raise InputError("say what the photographs show: choose a field, or give the size of a board")
+    outputs = [step.output for step in done]
+    calibrated = calibrate_step(state, outputs, folder, report=known is not None)
+    for step in (calibrated, *(export_steps(state, folder) if known is not None else ())):
+        step.answer()
+        done.append(step)
+    observed = {path.name: read_bytes(path) for path in outputs}
+    return Made(tuple(step.typed for step in done), observed, calibrated.output, boards)
 
 
 def board_step(state: State, sitting: Sitting, folder: Path) -> PageStep:
     """Boards in all photographs."""
-    size = state.board.lower().split("x")
-    if len(size) != 3:
-        raise InputError("a board is COLUMNSxROWSxMM, its inner corners and the side of a square, such as 9x6x25mm")
-    square = size[2] if size[2][-1:].isalpha() else f"{size[2]}mm"
-    images = [str(path) for path in sitting.photographs]
     output = folder / "board.json"
-    words = ["--columns", size[0], "--rows", size[1], "--square", square, "--camera", CAMERA, "-o", str(output)]
-    return PageStep("detect board", (*images, *words), output)
+    words = [*arguments.board_words(state.board), "--camera", CAMERA, "-o", str(output)]
+    return PageStep("detect board", (*map(str, sitting.photographs), *words), output)
 
 
 def field_steps(
@@ -134,7 +126,7 @@ def field_steps(
 
 def calibrate_step(state: State, observed: Sequence[Path], folder: Path, report: bool) -> PageStep:
     """One calibration of all that was observed."""
-    priors = [word for prior in state.priors for word in ("--prior", prior)]
+    priors = arguments.repeated("--prior", state.priors)
     lengths = ["--estimate", ",".join(state.solved)] if state.solved else []
     page = ["--report", str(folder / "report.html")] if report else []
     output = folder / "calibration.json"

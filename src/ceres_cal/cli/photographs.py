@@ -12,7 +12,7 @@ from ceres_cal.base.native import interruptibly
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import Arguments, QuietArguments, argument
-from ceres_cal.cli.files import finishing, require_different, require_output
+from ceres_cal.cli.files import require_different, require_output, save
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
 
@@ -113,14 +113,12 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
     """
     import numpy as np
 
-    from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded
     from ceres_cal.detect.median import merged
 
     found: Merged = merged(_pictures(images, videos, bar))
     levels = np.round(found.picture * (65535 // found.white)).astype(np.uint16)
-    with finishing():
-        write_bytes(path, encoded(np.asarray(levels), ".png", 100))
+    save(path, encoded(np.asarray(levels), ".png", 100))
     left_out = [{"image": name, "reason": reason} for name, reason in found.left_out]
     return {"picture": str(path), "used": list(found.used), "left_out": left_out}
 

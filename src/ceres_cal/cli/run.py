@@ -110,23 +110,19 @@ def _step(
     titles: Collection[str] | None = None,
 ) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
-    quiet = ["--quiet"] if (args.quiet or args.json) and name != "export" else []
+    typed = COMMANDS[name].typed(arguments)
     with progress_bar(args) as bar:
-        bar.say(f"now       {_short(_typed(name, arguments))}")
-    answer = COMMANDS[name].run(COMMANDS[name].parse([*arguments, *quiet]))
+        bar.say(f"now       {_short(typed)}")
+    answer = COMMANDS[name].answer(arguments, quiet=args.quiet or args.json)
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
     lines = [*answer.text(titles).splitlines()[:most], *missed]
-    return _Step(_typed(name, arguments), lines, answer.data, answer.exit_code)
+    return _Step(typed, lines, answer.data, answer.exit_code)
 
 
 def _attempted(args: RunArguments, name: str, arguments: Sequence[str], most: int | None = None) -> _Step:
     """A step after the calibration is there; without data where it fails: the calibration stays."""
     step, unmade = attempted("advice" if name == "advise" else name, lambda: _step(args, name, arguments, most))
-    return step or _Step(_typed(name, arguments), tuple(unmade.shown()), {}, 1)
-
-
-def _typed(name: str, arguments: Sequence[str]) -> str:
-    return shlex.join(["ceres-cal", *name.split(), *arguments])
+    return step or _Step(COMMANDS[name].typed(arguments), tuple(unmade.shown()), {}, 1)
 
 
 def _photographs(args: RunArguments) -> list[Path]:
@@ -142,37 +138,34 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
     """Boards first; what shows none may show the field."""
     rest = [str(path) for path in images]
     if args.board is not None:
-        columns, rows, square = args.board.split("x")
-        square += "" if square[-1].isalpha() else "mm"
-        board = ["--columns", columns, "--rows", rows, "--square", square]
         goal = ["--camera", args.camera, "-o", str(args.output / "board.json")]
+        asked = [*rest, *arguments.board_words(args.board), *goal]
         try:
-            found = _step(args, "detect board", [*rest, *board, *goal], most=1)
+            found = _step(args, "detect board", asked, most=1)
             rest = [path for path in rest if path not in found.data["found"]]
             yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
         except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:
                 raise
-            yield _Step(_typed("detect board", [*rest, *board, *goal]), (str(error),), {}, 1)
+            yield _Step(COMMANDS["detect board"].typed(asked), (str(error),), {}, 1)
     if args.target is not None:
         if not rest:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
-        facing = [word for name in args.facing for word in ("--facing", name)]
-        missing = ["--not-painted", args.not_painted] if args.not_painted else []
-        lengths = [word for names in args.estimate for word in ("--estimate", names)]
+        said = [*arguments.repeated("--facing", args.facing), *arguments.repeated("--estimate", args.estimate)]
+        said += ["--not-painted", args.not_painted] if args.not_painted else []
         goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
         still = [] if images_and_videos(args.images)[0] else ["--median"]  # of videos alone
-        asked = [*rest, *still, "--target", args.target, "--auto", *facing, *missing, *lengths, *goal]
+        asked = [*rest, *still, "--target", args.target, "--auto", *said, *goal]
         yield _step(args, "detect field", asked, most=1)
 
 
 def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step:
     observations = [data["output"] for data in detected]
-    priors = [word for prior in args.prior for word in ("--prior", prior)]
+    priors = arguments.repeated("--prior", args.prior)
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
     folders = [str(args.output / video.stem) for video in images_and_videos(args.images)[1]]
     shown = [name for name in (*args.images, *folders) if Path(name).is_dir() or Path(name).suffix in IMAGE_ENDINGS]
-    images = [word for name in shown if args.target is not None or args.board for word in ("--images", name)]
+    images = arguments.repeated("--images", shown)
     asked = [*observations, "--lens", args.lens, *priors, *goal, *images]
     return _step(args, "calibrate", asked, titles=_SHOWN)
 

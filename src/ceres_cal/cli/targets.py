@@ -10,7 +10,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import output_option, parse_board
 from ceres_cal.cli.command import Arguments, argument, command, option
-from ceres_cal.cli.files import finishing, require_ending, require_output, spelled_target
+from ceres_cal.cli.files import require_ending, require_output, save, spelled_target
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -63,15 +63,12 @@ def _run(args: TargetsArguments) -> Document:
 
 
 def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
-    from ceres_cal.base.files import write_bytes
     from ceres_cal.report.target_picture import target_svg
 
     if len(targets) > 1:
         raise InputError(f"{wanted}: it has several targets: {', '.join(targets)}: --picture draws one of them")
     ((name, target),) = targets.items()
-    content = target_svg(target, name).encode()
-    with finishing():
-        write_bytes(picture, content)
+    save(picture, target_svg(target, name).encode())
 
 
 class PrintArguments(Arguments):
@@ -92,16 +89,13 @@ def _print(args: PrintArguments) -> Document:
     require_ending(args.output, "sheets are", ".pdf")
     import json
 
-    from ceres_cal.base.files import write_bytes
     from ceres_cal.report.sheet import sheet_pdf
 
     targets = _targets(args.target)
     if len(targets) > 1:
         raise InputError(f"{args.target}: it has several targets: {', '.join(targets)}: give the description of one")
     (target,) = targets.values()
-    content = sheet_pdf(target, json.dumps(target.spec))
-    with finishing():
-        write_bytes(args.output, content)
+    save(args.output, sheet_pdf(target, json.dumps(target.spec)))
     return Document((Section("written", [str(args.output)], {"output": str(args.output), "spec": target.spec}),))
 
 

@@ -11,7 +11,7 @@ from ceres_cal.base.images import image_files
 from ceres_cal.base.words import frame_of, no_such
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, argument, command, flag, given, option, switch
-from ceres_cal.cli.files import finishing, read_calibration, require_folder
+from ceres_cal.cli.files import read_calibration, read_observations, require_folder, save
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -103,8 +103,6 @@ def _run(args: UndistortArguments) -> Document:
     images = image_files(args.images)
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
     outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
-    from ceres_cal.base.files import write_json
-
     calibration = read_calibration(args.calibration)
     make, facts, words = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
     args.output.mkdir(parents=True, exist_ok=True)
@@ -119,8 +117,7 @@ def _run(args: UndistortArguments) -> Document:
             written.append({"image": str(path), "output": str(output), **own})
             bar.update(number, len(outputs), path.name)
     data = {"format": format, "version": version, "calibration": str(args.calibration), "kind": kind, **facts}
-    with finishing():
-        write_json(about, {**data, "pictures": written})
+    save(about, {**data, "pictures": written})
     said = {**data, "pictures": written, "output": str(about)}
     return Document((Section("", [*lines, f"{about}: {words}"], said),))
 
@@ -198,13 +195,11 @@ def _read(path: Path, camera: Camera, name: str) -> Image:
 
 def _write(path: Path, picture: Image) -> None:
     jpeg_quality = 95
-    from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded
     from ceres_cal.report.pictures.overlay import in_8_bit_colour
 
     content = encoded(in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, jpeg_quality)
-    with finishing():
-        write_bytes(path, content)
+    save(path, content)
 
 
 def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
@@ -212,13 +207,7 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     from ceres_cal.scene.files import camera_to_json
 
     name, station, camera = _camera(args, calibration)
-    straight = straighten(
-        camera,
-        whole=args.whole,
-        size=args.size,
-        phi=args.phi,
-        angle_deg=args.angle,
-    )
+    straight = straighten(camera, whole=args.whole, size=args.size, phi=args.phi, angle_deg=args.angle)
     facts = {
         "camera": name,
         "station": station,
@@ -301,15 +290,13 @@ def _field(calibration: Calibration) -> Area:
 
 
 def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.calibration import Calibration as File
-    from ceres_cal.observations import Observations
     from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
     from ceres_cal.report.pictures.overlay import Layer, draw_overlay
 
     station, height = _station(args, calibration), arguments.metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
-    before = None if args.before is None else File.load(args.before)
-    observations = None if args.observations is None else Observations.load(args.observations)
+    before = None if args.before is None else read_calibration(args.before)
+    observations = None if args.observations is None else read_observations([args.observations])
     known = {} if observations is None else {f.name: f for f in frames_of(observations) if f.station == station}
 
     def layers(frame: Frame) -> Iterator[Layer]:

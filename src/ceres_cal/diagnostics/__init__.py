@@ -1,16 +1,9 @@
 """Reading what is left over: a table, what it says of the model, the choice of lens by held-out error."""
 
-from ceres_cal.diagnostics.checks import CHECKS as CHECKS
-from ceres_cal.diagnostics.checks import Check as Check
-from ceres_cal.diagnostics.checks import DiagnosisCase as DiagnosisCase
 from ceres_cal.diagnostics.checks import Noise as Noise
-from ceres_cal.diagnostics.checks import TestResults as TestResults
 from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE as FALSE_ALARM_RATE
 from ceres_cal.diagnostics.diagnose import Diagnosis as Diagnosis
 from ceres_cal.diagnostics.diagnose import diagnose as diagnose
-from ceres_cal.diagnostics.summaries import RadiusTrend as RadiusTrend
-from ceres_cal.diagnostics.summaries import Summaries as Summaries
 from ceres_cal.diagnostics.summaries import Summary as Summary
 from ceres_cal.diagnostics.table import ResidualTable as ResidualTable
-from ceres_cal.effects.effect import Amount as Amount
 from ceres_cal.effects.effect import Finding as Finding

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.tails import log_chi2_tail, log_f_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled
@@ -141,7 +142,6 @@ def _correlation(model: Linearised, pairs: tuple[Indices, Indices], variance: fl
     return float(total / (variance * max(float(np.sum(np.sqrt(kept))), 1e-9))), float(log_p)
 
 
-@dataclass(frozen=True, eq=False)
 class DiagnosisCase(Case):
     """What is diagnosed.
 
@@ -161,8 +161,7 @@ class DiagnosisCase(Case):
     effects: tuple[EffectEstimate, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class TestResults:
+class TestResults(Frozen):
     """A case, the effects that its residuals speak for, the noise that these leave, the rate of false alarms."""
 
     case: DiagnosisCase

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, numerical
 from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.shown import Shown, drawn, html_of, text_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -37,8 +37,7 @@ FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(Frozen):
     """What the residuals say.
 
     Attributes:
@@ -277,9 +276,8 @@ def _with_newcomers_placed(observations: Observations, problem: Problem, calibra
         return estimate
     fit, options = calibration.fit, calibration.options
     behind = Pose(np.eye(3), np.array([0.0, 0.0, -1e6]))  # no camera sees it: any pose is better
-    unplaced = {
-        name: estimate.stations[_first_station(observations, name)].cam_from_world.inverse @ behind for name in new
-    }
+    first = {view.placement: view.station for view in reversed(observations.views)}
+    unplaced = {name: estimate.stations[first[name]].cam_from_world.inverse @ behind for name in new}
     start = replace(estimate, placements={**estimate.placements, **unplaced})
     nothing = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
     blank = Inliers(*nothing, fit.point_scale, fit.curve_scale, np.empty(0), np.empty(0))
@@ -296,7 +294,3 @@ def _with_newcomers_placed(observations: Observations, problem: Problem, calibra
                 "points of it in one view, or leave its views out"
             )
     return posed
-
-
-def _first_station(observations: Observations, placement: str) -> str:
-    return next(view.station for view in observations.views if view.placement == placement)

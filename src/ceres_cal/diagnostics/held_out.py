@@ -8,15 +8,15 @@ below that of a field, by the same share whatever the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, rms
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, attempt
 from ceres_cal.base.executing import each
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 FOLDS = 5
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOut(Frozen):
     """Errors of prediction, each observation by a calibration that did not see its frame.
 
     Attributes:
@@ -67,8 +66,7 @@ class HeldOut:
     failed: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
+class Choice(Frozen):
     """Which lens the held-out error speaks for.
 
     Attributes:
@@ -135,8 +133,8 @@ def cross_validate(
     np.add.at(counts, frame[kept], 1.0)
     points = kept & (np.arange(len(kept)) < len(observations.points))
     return HeldOut(
-        label or label_of(options), coefficients_of(options), folds, failed, _rms(errors[points, 0]),
-        _rms(errors[kept & ~points, 0]), _rms(errors[kept, 0]), _rms(errors[kept, 1]), _rms(fit_px), names,
+        label or label_of(options), coefficients_of(options), folds, failed, rms(errors[points, 0]),
+        rms(errors[kept & ~points, 0]), rms(errors[kept, 0]), rms(errors[kept, 1]), rms(fit_px), names,
         squares, counts,
     )  # fmt: skip
 
@@ -211,7 +209,7 @@ def _without(
     observations: Observations, options: Options, whole: Calibration, kept: Mask, part: Mask
 ) -> Array | CalibrationError:
     """Errors (n, 2), px and mm, of a part's rows that count, by a calibration without it; or why there is none."""
-    trained = _attempt(_part(observations, ~part), options)
+    trained = _attempt(observations.part(*np.split(~part, [len(observations.points)])), options)
     if isinstance(trained, CalibrationError):
         return trained
     held = part & kept
@@ -220,10 +218,6 @@ def _without(
 
 def _inliers(calibration: Calibration, observations: Observations) -> Mask:
     return np.concatenate(calibration.inlier_masks(observations))
-
-
-def _part(observations: Observations, rows: Mask) -> Observations:
-    return observations.part(*np.split(rows, [len(observations.points)]))
 
 
 def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:
@@ -262,8 +256,3 @@ def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array
     px = np.concatenate([np.linalg.norm(there.points, axis=1), np.abs(there.curves)])
     px = np.where(np.isfinite(px), px, unseen_sigma * column_of(observations, "sigma_px"))
     return np.column_stack([px, np.abs(error_mm(equations, equations.residual, len(px)))])
-
-
-def _rms(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

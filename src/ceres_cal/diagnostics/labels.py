@@ -10,13 +10,13 @@ any other feature, for each observation; for several of one frame and label that
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.calibration import Calibration
@@ -30,8 +30,7 @@ from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
-class Mislabelled:
+class Mislabelled(Frozen):
     """Observations of one view under one label that fit another.
 
     Attributes:
@@ -82,8 +81,7 @@ def find_mislabelled(
     return mislabelled, tried
 
 
-@dataclass(frozen=True, eq=False)
-class _Sight:
+class _Sight(Frozen):
     """A target as a camera sees it from one pose."""
 
     target: Target
@@ -194,8 +192,7 @@ def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
 # ---- other names ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Renaming:
+class Renaming(Frozen):
     """What was seen of a feature in one view and lies where another one does.
 
     Attributes:

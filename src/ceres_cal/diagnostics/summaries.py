@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, numbers_of
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.diagnostics.checks import DiagnosisCase
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects.linearised import Linearised
@@ -19,8 +19,7 @@ RADIUS_BINS = 12
 """Rings of equal width, from the principal point to the farthest corner."""
 
 
-@dataclass(frozen=True, eq=False)
-class Summary:
+class Summary(Frozen):
     """Groups of observations, G of them.
 
     Attributes:
@@ -40,8 +39,7 @@ class Summary:
     rms_sigma: Array
 
 
-@dataclass(frozen=True, eq=False)
-class RadiusTrend:
+class RadiusTrend(Frozen):
     """What the residuals do along the radius, of one camera, in RADIUS_BINS rings.
 
     Attributes:
@@ -56,8 +54,7 @@ class RadiusTrend:
     sd_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Summaries:
+class Summaries(Frozen):
     """The table by frame ("station frame" where there are several stations), feature ("target/name"), region
     ("camera column,row" from the image's top left) and radius ("camera from-to px"), and each camera's radius trend.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask, numbers_of
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.shown import brief
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
@@ -26,8 +26,7 @@ REASONS = ("", "too far off", "cannot be seen from there", "a copy of another")
 """Why an observation was taken out, by its code in `ResidualTable.reason`."""
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualTable:
+class ResidualTable(Frozen):
     """N observations: the points by row, then the curve observations by row.
 
     Attributes:
@@ -163,7 +162,7 @@ def make_table(
     residual[equations.observation] = 0.0
     np.add.at(residual, equations.observation, equations.direction * equations.residual[:, None])
     distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
-    inlier = np.concatenate([inliers.points, inliers.curves])
+    inlier = inliers.rows
     original = np.concatenate(observations.copies.originals)
     seen = np.isfinite(residual[:, 0])
     return ResidualTable(

@@ -9,17 +9,16 @@ times amounts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.effects.linearised import Linearised
 
 
-@dataclass(frozen=True, eq=False)
-class EffectColumns:
+class EffectColumns(Frozen):
     """Columns of an effect over the equations, by group: each group has amounts of its own.
 
     Attributes:
@@ -62,8 +61,7 @@ def least_absolute(columns: Array, residual: Array) -> Array:
     return amount
 
 
-@dataclass(frozen=True, eq=False)
-class EffectSums:
+class EffectSums(Frozen):
     """What the equations say of each of an effect's G groups: X its columns beyond the free numbers of a model, and r
     the residuals, both in standard deviations.
 
@@ -145,8 +143,7 @@ class EffectSums:
         return np.cumsum(squares, axis=0)[:-1]
 
 
-@dataclass(frozen=True, eq=False)
-class SparseColumns:
+class SparseColumns(Frozen):
     """Columns of Q numbers over E equations, in standard deviations.
 
     Attributes:

@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import student_95
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.evidence import DEPENDENCE
@@ -90,8 +91,7 @@ def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[
     return scores, Dependence(tuple(kinds), None, max(private), inverse)
 
 
-@dataclass(frozen=True, eq=False)
-class _Average:
+class _Average(Frozen):
     """The mean over the grid.
 
     Attributes:
@@ -228,8 +228,7 @@ def _reach(correlation: Correlation) -> str:
     return over + (" in all views alike" if correlation.lasting else "")
 
 
-@dataclass(frozen=True, eq=False)
-class Scatter:
+class Scatter(Frozen):
     """How much more, or less, the shared numbers scatter than the model says.
 
     Attributes:

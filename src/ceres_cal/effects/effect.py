@@ -13,6 +13,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import EffectColumns
@@ -155,8 +156,7 @@ class Displacement(NamedTuple):
     observations: int
 
 
-@dataclass(frozen=True, eq=False)
-class Case:
+class Case(Frozen):
     """What effects are looked for in: a problem where its solve ended.
 
     Attributes:
@@ -224,8 +224,7 @@ class Case:
         return {names[number] for number in self.problem.layout.free[camera]} & set(lens.names)
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
+class Evidence(Frozen):
     """A group of an effect that the residuals speak for.
 
     Attributes:

@@ -24,12 +24,13 @@ scatter of the others explains (`Offsets`).
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
@@ -109,8 +110,7 @@ _Name = TypeVar("_Name", bound=Hashable)
 _NO_SCATTER, _AS_IS = np.zeros(1), np.ones(1)
 
 
-@dataclass(frozen=True, eq=False)
-class RandomEffects:
+class RandomEffects(Frozen):
     """What residuals say of Q numbers, in the R independent directions that they determine.
 
     Attributes:
@@ -229,8 +229,7 @@ def shifts_by(taken: Array, moment: Array) -> Array:
 # ---- amounts that repeat from view to view --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class RepeatedAmounts:
+class RepeatedAmounts(Frozen):
     """What the residuals say of Q amounts that are the same in all views, everything else free at its best.
 
     Attributes:
@@ -341,8 +340,7 @@ class RepeatedAmounts:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class Offsets:
+class Offsets(Frozen):
     """What residuals say of the offsets of G groups.
 
     Attributes:

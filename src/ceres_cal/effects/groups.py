@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.effects.evidence import DEPENDENCE
@@ -46,8 +47,7 @@ _LEAST_LEFT = 1.0
 _LOG_C = np.linspace(0.02, 6.0, 300)  # either way exponential of mean 1, where views do not scatter as expected
 
 
-@dataclass(frozen=True, eq=False)
-class GroupNormals:
+class GroupNormals(Frozen):
     """Normal equations of G groups of equations over K numbers, in standard deviations.
 
     Attributes:

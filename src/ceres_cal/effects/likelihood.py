@@ -14,12 +14,12 @@ serve all lengths.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.effects.strands import StrandFamily, decay
 from ceres_cal.observations import joined
 
@@ -66,8 +66,7 @@ _SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
 _Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
 
 
-@dataclass(frozen=True, eq=False)
-class Likelihoods:
+class Likelihoods(Frozen):
     """N places on the grid.
 
     Attributes:

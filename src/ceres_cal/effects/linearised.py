@@ -10,11 +10,11 @@ some sights, in directions of what all of them know (`linearise_within`) or of w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import ranges
@@ -31,8 +31,7 @@ SINGULAR = 1e-12
 """Share of its own information that a number must keep beside the others."""
 
 
-@dataclass(frozen=True, eq=False)
-class Weights:
+class Weights(Frozen):
     """How the E equations count.
 
     Attributes:
@@ -50,8 +49,7 @@ class Weights:
         return Weights(self.inverse_sigma * np.sqrt(self.robust), self.used, np.ones_like(self.robust))
 
 
-@dataclass(frozen=True, eq=False)
-class AddedNumbers:
+class AddedNumbers(Frozen):
     """What Q more free numbers would do to a model.
 
     Attributes:
@@ -81,8 +79,7 @@ class AddedNumbers:
         return float(self.step @ self.step)
 
 
-@dataclass(frozen=True, eq=False)
-class Linearised:
+class Linearised(Frozen):
     """Equations in standard deviations, and an orthonormal basis of what the free numbers do to them.
 
     Attributes:

@@ -9,11 +9,11 @@ amount that would mend it. Of those that the residuals speak for the strongest i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.columns import EffectColumns, EffectSums
 from ceres_cal.effects.linearised import LEAST_LEFT, Linearised, inverse_roots
@@ -26,8 +26,7 @@ _ALIKE = 7.0
 _LEAST_SHARE = 0.02
 
 
-@dataclass(frozen=True, eq=False)
-class ScoreTest:
+class ScoreTest(Frozen):
     """The score test of one group of an effect.
 
     Attributes:
@@ -103,8 +102,7 @@ def _robust_slope(model: Linearised) -> float:
 # ---- the choice among them ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Selection:
+class Selection(Frozen):
     """The alternatives chosen, and the model with all of them in.
 
     Attributes:

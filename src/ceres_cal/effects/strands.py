@@ -6,13 +6,13 @@ Some views are enough: what is sought are a few numbers (a length, a share, a va
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, median
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations import Observations
@@ -25,8 +25,7 @@ from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 _MOST_ROWS = 1_500  # of a kind in a view
 
 
-@dataclass(frozen=True, eq=False)
-class Strand:
+class Strand(Frozen):
     """Equations whose errors may go together: of one curve, or of one image axis at one target's points.
 
     Attributes:
@@ -120,8 +119,7 @@ def decay(distance: Array, length: float, smooth: bool) -> Array:
     return np.where(correlation < no_correlation, 0.0, correlation)
 
 
-@dataclass(frozen=True, eq=False)
-class StrandFamily:
+class StrandFamily(Frozen):
     """S strands side by side, of M rows each at most that are looked at.
 
     Attributes:

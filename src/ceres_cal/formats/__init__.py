@@ -5,7 +5,6 @@ from ceres_cal.formats.format import ExportFormat as ExportFormat
 from ceres_cal.formats.format import ExportLoss as ExportLoss
 from ceres_cal.formats.format import ExportRequest as ExportRequest
 from ceres_cal.formats.format import ImportFormat as ImportFormat
-from ceres_cal.formats.format import ImportRequest as ImportRequest
 from ceres_cal.formats.lookup import LookupTable as LookupTable
 from ceres_cal.formats.lookup import make_lookup_table as make_lookup_table
 from ceres_cal.formats.loss import loss_words as loss_words

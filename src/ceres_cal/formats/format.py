@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from msgspec import Struct
+
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, write_bytes
+from ceres_cal.base.frozen import Frozen, field, replace
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -18,8 +21,7 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True)
-class ExportLoss:
+class ExportLoss(Struct, frozen=True):
     """What a file gets wrong about one station, against the calibration that it was made from: 0 where it is exact.
 
     Attributes:
@@ -32,8 +34,7 @@ class ExportLoss:
     image_px: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Exported:
+class Exported(Frozen):
     """A calibration in a format.
 
     Attributes:
@@ -77,8 +78,7 @@ class Exported:
             write_bytes(folder / name, content)
 
 
-@dataclass(frozen=True, eq=False)
-class ExportRequest:
+class ExportRequest(Struct, frozen=True, eq=False):
     """What is to be exported.
 
     Attributes:
@@ -100,8 +100,7 @@ class NoOptions:
     """Of a format that leaves nothing to choose."""
 
 
-@dataclass(frozen=True)
-class ExportFormat:
+class ExportFormat(Struct, frozen=True):
     """A format.
 
     Attributes:
@@ -125,8 +124,7 @@ class ExportFormat:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class ImportRequest:
+class ImportRequest(Struct, frozen=True, eq=False):
     """What is to be read.
 
     Attributes:
@@ -143,8 +141,7 @@ class ImportRequest:
         return self.content.decode("utf-8-sig", errors="replace")
 
 
-@dataclass(frozen=True)
-class ImportFormat:
+class ImportFormat(Struct, frozen=True):
     """A format.
 
     Attributes:
@@ -162,8 +159,7 @@ class ImportFormat:
     options: type[Any] = NoOptions
 
 
-@dataclass(frozen=True, eq=False)
-class ImportedCameras:
+class ImportedCameras(Frozen):
     """What a file of cameras says.
 
     Attributes:

@@ -11,10 +11,11 @@ import struct
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from select import select
 from typing import TYPE_CHECKING, Any
+
+from msgspec import Struct
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import read_bytes
@@ -33,8 +34,7 @@ if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(Struct, frozen=True):
     """Where vision is published.
 
     Attributes:
@@ -88,8 +88,7 @@ def publish(packet: bytes, group: Group, times: int | None = None, period_s: flo
     return sent
 
 
-@dataclass(frozen=True)
-class Heard:
+class Heard(Struct, frozen=True):
     """A geometry that came over the network.
 
     Attributes:

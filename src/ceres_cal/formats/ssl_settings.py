@@ -7,10 +7,11 @@ settings.xml. ssl-vision reads it at its start and overwrites it at its end: edi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape
+
+from msgspec import Struct
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
@@ -39,8 +40,7 @@ _SIZES = {  # of the message: of the settings
 }
 
 
-@dataclass(frozen=True)
-class _Var:
+class _Var(Struct, frozen=True):
     """One value: the names on the way to it, its text, and which bytes of the file are its text.
 
     Attributes:

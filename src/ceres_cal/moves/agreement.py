@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, rms
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
@@ -33,7 +34,6 @@ from ceres_cal.scene.targets import Target
 FALSE_ALARMS = 0.01
 
 
-@dataclass(frozen=True, eq=False)
 class FieldDifference(ErrorMap):
     """Where two cameras locate the same pixels, over the field.
 
@@ -58,7 +58,7 @@ class FieldDifference(ErrorMap):
     @property
     def rms_mm(self) -> float:
         """Root mean square of the difference; infinite where the second has no answer somewhere."""
-        return np.inf if self.lost.any() else _root_mean_square(self.errors_mm)
+        return np.inf if self.lost.any() else rms(self.errors_mm)
 
     @property
     def most_mm(self) -> float:
@@ -68,16 +68,10 @@ class FieldDifference(ErrorMap):
     @property
     def known_mm(self) -> float:
         """Root mean square of what is expected."""
-        return _root_mean_square(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm))
+        return rms(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm))
 
 
-def _root_mean_square(values: Array) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
-
-
-@dataclass(frozen=True, eq=False)
-class MapChange:
+class MapChange(Frozen):
     """A station from one camera to another.
 
     Attributes:
@@ -94,8 +88,7 @@ class MapChange:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False)
-class ImageDifference:
+class ImageDifference(Frozen):
     """Where two cameras see the same directions, over the image.
 
     Attributes:
@@ -140,8 +133,7 @@ class Misfit:
     noise: tuple[float, float] = (np.nan, np.nan)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Agreement:
+class Agreement(Frozen, kw_only=True):
     """What is said of one station, camera or view; what was not asked is left at its default.
 
     Attributes:
@@ -174,8 +166,7 @@ class Agreement:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False)
-class Agreements(Mapping[str, Agreement]):
+class Agreements(Frozen, Mapping[str, Agreement]):
     """The answers by name, of stations or of cameras.
 
     Attributes:
@@ -296,7 +287,7 @@ def change_of(
         places = np.column_stack([grid.places, np.full(len(seen), grid.height_m)])
         shifts = np.linalg.norm(seen - after.project(places), axis=1)
     turned_deg, phi_px = float(np.degrees(turn)), (camera.phi, after.phi)
-    return MapChange(1e3 * shift_m, turned_deg, phi_px, _root_mean_square(shifts), maps)
+    return MapChange(1e3 * shift_m, turned_deg, phi_px, rms(shifts), maps)
 
 
 def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Array) -> FieldDifference:
@@ -308,8 +299,7 @@ def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Arra
 # ---- two statements about the same numbers --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class NormalDistribution:
+class NormalDistribution(Frozen):
     """A normal distribution of K numbers, seen from an estimate.
 
     Attributes:
@@ -321,8 +311,7 @@ class NormalDistribution:
     degrees_of_freedom: float
 
 
-@dataclass(frozen=True, eq=False)
-class Contrast:
+class Contrast(Frozen):
     """By how much the least squared distance to two statements falls when some numbers may differ between them.
 
     Attributes:

@@ -10,13 +10,13 @@ value is the cause that is named.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.errors import CalibrationError, InputError, attempt
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -67,8 +67,7 @@ def audit(foreign: Calibration, observations: Observations) -> Agreements:
 # ---- one station ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _AuditCase:
+class _AuditCase(Frozen):
     """One station's observations, those of them that count, and ours."""
 
     observations: Observations
@@ -241,9 +240,7 @@ def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]
 def resized(camera: Camera, scale: float, image_size: tuple[int, int]) -> Camera:
     """The camera of images that were scaled: a pixel's centre c goes to s (c + 1/2) - 1/2."""
     cx, cy = (scale * (c + 0.5) - 0.5 for c in camera.principal_point)
-    lens = camera.lens
-    if lens.acts_on_pixels:
-        lens = lens.with_values([v * scale ** (1 - order) for v, order in zip(lens.values, lens.orders, strict=True)])
+    lens = camera.lens.with_values(np.array(camera.lens.values) / camera.lens.scales(scale))
     return replace(camera, image_size=image_size, phi=scale * camera.phi, principal_point=(cx, cy), lens=lens)
 
 

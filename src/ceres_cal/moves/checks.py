@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, numerical
 from ceres_cal.base.errors import InputError, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
@@ -45,7 +45,6 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import layout_of
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.structure import make_structure
 
 # Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
 # -> 0.075 of 80 cases); at double nothing changes.
@@ -98,8 +97,7 @@ def check(
 # ---- one station ----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _CheckCase:
+class _CheckCase(Frozen):
     """One station's new observations and what was known of its numbers."""
 
     calibration: Calibration
@@ -152,9 +150,7 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
-    structure = make_structure(
-        observed.targets, calibration.options.tolerances, calibration.options.dimensions
-    ).carrying(old.structure)
+    structure = calibration.options.structure_of(observed.targets).carrying(old.structure)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.is_structure]

@@ -6,12 +6,12 @@ As long as the chosen freedom explains everything, nothing else is asked. Where 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
@@ -114,7 +114,7 @@ def _other_explanation(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solut
 def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     """Explanations that fit, and better than what was known, in words, with what to do."""
     old = old_poses(plan, search)
-    known = _least_misfit(search, old)
+    known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
     mirrored = relabelled(search.observations, MIRRORED)
     if mirrored is not None and _fits(_seen_as(search, mirrored), old, known):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
@@ -133,10 +133,6 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
     if noise < _NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
         yield f"with another lens they do: {WORDS['everything']}: calibrate it anew"
-
-
-def _least_misfit(search: PoseSearch, old: list[Pose]) -> float:
-    return min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
 
 
 def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
@@ -176,8 +172,7 @@ def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Pose
 # ---- where a solve is to be judged ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RefitVerdict:
+class RefitVerdict(Frozen):
     """How a solved refit stands to what was known before.
 
     Attributes:

@@ -7,12 +7,12 @@ old calibration saw; the least robust cost wins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, distinct, median
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
@@ -37,8 +37,7 @@ _ALIKE = (0.02, 0.01)
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class PoseCandidate:
+class PoseCandidate(Frozen):
     """A pose that a station may have.
 
     Attributes:
@@ -58,8 +57,7 @@ class PoseCandidate:
         return self.share >= _FITS_SHARE and self.scale <= _FITS_SCALE
 
 
-@dataclass(frozen=True, eq=False)
-class PoseSearch:
+class PoseSearch(Frozen):
     """What one station sees of the world, through a lens that is taken as known.
 
     Attributes:

@@ -6,12 +6,13 @@ The same observations under other names: a field turned by half a turn, mirrored
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked_fields
 from ceres_cal.base.words import no_such
@@ -25,7 +26,6 @@ from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import intrinsic_keys
 from ceres_cal.problem.ranges import require_possible_numbers
-from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.symmetry import counterparts
 from ceres_cal.scene.targets import target_from_spec
 
@@ -92,8 +92,7 @@ class RefitOptions:
             raise InputError(no_such("way to take labels", self.labels, LABELS))
 
 
-@dataclass(frozen=True, eq=False)
-class RefitPlan:
+class RefitPlan(Frozen):
     """A refit as it was asked for.
 
     Attributes:
@@ -188,9 +187,7 @@ def make_plan(
             calibration.cameras,
             {name: placed[name] for name in dict.fromkeys([*old, *stations]) if name in placed},
             {},
-            make_structure(observed.targets, options.tolerances, options.dimensions).carrying(
-                calibration.estimate.structure
-            ),
+            options.structure_of(observed.targets).carrying(calibration.estimate.structure),
         ),
         prior,
         scales,

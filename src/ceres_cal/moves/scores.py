@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, numerical
+from ceres_cal.base.arrays import Mask, numerical, rms
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -21,7 +21,7 @@ from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.problem.structure import EXACT, Structure, make_structure
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.start.initialise import Start
 from ceres_cal.start.world import chained_poses
 
@@ -80,11 +80,8 @@ def score(
 def sights_as_built(observations: Observations, calibration: Calibration) -> Sights:
     """The sights of targets as the calibration says that they were built."""
     sights = gather_sights(observations)
-    built: Structure = make_structure(
-        observations.targets, calibration.options.tolerances, calibration.options.dimensions
-    )
-    built = built.carrying(calibration.estimate.structure)
-    return replace(sights, points=built.points(sights), tracks=built.tracks(sights))
+    built = calibration.options.structure_of(observations.targets).carrying(calibration.estimate.structure)
+    return built.built_into(sights)
 
 
 def _start(
@@ -140,8 +137,4 @@ def _misfit(
     )
     points, curves = inside
     outliers = len(every) - len(points) - len(curves)
-    return Misfit(len(points), len(curves), outliers, _rms(points), _rms(curves), _rms(every), noise)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+    return Misfit(len(points), len(curves), outliers, rms(points, 0.0), rms(curves, 0.0), rms(every, 0.0), noise)

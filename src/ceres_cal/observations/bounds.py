@@ -1,14 +1,29 @@
-"""Pixels outside their camera's image: a few are strays, many mean that the image size is another one. And sigmas."""
+"""What is odd about observations: pixels outside their image, sigmas and sizes that cannot be; and rows there twice.
+
+A few pixels outside are strays, many mean that the image size is another one.
+
+Observations that are there twice: the same rows again, the same frame under another name, one file given twice.
+
+Two measurements of one thing never agree in every bit of a sub-pixel position, and two that are rounded to the same
+number share the error of rounding: either way the second says nothing new, and counting it would shrink every standard
+deviation. A copy is told bit for bit: a row by a row of the same frame, a whole view by an earlier view of the same
+target from the same station. A single row that comes again in another frame is not one: a static camera and a detector
+of whole pixels may well give it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ceres_cal.base.arrays import Array, Mask, median
+from ceres_cal.base.arrays import Array, Indices, Mask, median
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import Alone, Columns, Curves, each_block, view_label
+from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.lazy import cached_property
+from ceres_cal.observations.columns import Alone, Columns, Curves, Points, View, each_block, view_label
 from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
@@ -146,3 +161,170 @@ def odd_sizes(content: Content) -> Iterator[str]:
     for name, target in content.targets.items():
         if (reach_m := target.reach_m) > _LARGE_M:
             yield f"target {name!r} reaches {reach_m:.0f} m from its origin: are its numbers metres, or millimetres?"
+
+
+# ---- observations that are there twice ------------------------------------------------------------------------------
+
+Hashes = NDArray[np.uint64]
+
+COUNTED_ONCE = ": counted once"
+"""How a line about copies ends."""
+# Large odd numbers without pattern, those of splitmix64: what the parts of a row are multiplied with.
+_X, _FEATURE, _FRAME = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+
+
+class Copies(Frozen):
+    """Which observations repeat others.
+
+    Attributes:
+        points: (N,), curves: (M,) number of the view that each row is a copy out of; -1 for what is no copy.
+    """
+
+    points: Indices
+    curves: Indices
+
+    @property
+    def are_there(self) -> bool:
+        """Whether there is any."""
+        return any(len(source) and source.strides[0] and np.any(source >= 0) for source in (self.points, self.curves))
+
+    @cached_property
+    def originals(self) -> tuple[Mask, Mask]:
+        """(N,) of points and (M,) of curve observations: what counts."""
+        return self.points < 0, self.curves < 0
+
+    def words(self, views: Sequence[View], columns: tuple[Columns, Columns]) -> Iterator[str]:
+        """What was counted once: a line for copied frames, and one for rows that are there twice in theirs."""
+        if not self.are_there:
+            return
+        rows: Counter[tuple[str, str]] = Counter()
+        for column, source in zip(columns, (self.points, self.curves), strict=True):
+            copied = source >= 0
+            for (view, first), count in Counter(zip(column.view[copied], source[copied], strict=True)).items():
+                rows[views[view].frame, views[first].frame] += count
+        frames = [pair for pair in rows if pair[0] != pair[1]]
+        if frames:
+            more = f", and so do {len(frames) - 1} other frames" if len(frames) > 1 else ""
+            yield f"frame {frames[0][0]!r} repeats frame {frames[0][1]!r} point by point{more}{COUNTED_ONCE}"
+        twice = {frame: count for (frame, first), count in rows.items() if frame == first}
+        if twice:
+            some = ", ".join(map(repr, list(twice)[:3])) + (", ..." if len(twice) > 3 else "")
+            yield f"{sum(twice.values())} observations of frame {some} are there more than once{COUNTED_ONCE}"
+
+
+def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies:
+    """The observations that repeat earlier ones.
+
+    Hashes of the rows say in half a millisecond for 1000 frames that there are none; where some agree the rows
+    themselves are compared.
+    """
+    columns: tuple[Columns, Columns] = (points, curves)
+    place = _numbered((view.station, view.target, view.placement is None) for view in views)
+    if not any(_may_repeat(column, place) for column in columns):
+        none = [np.broadcast_to(np.int64(-1), len(column)) for column in columns]
+        return Copies(none[0], none[1])
+    sources = tuple(np.full(len(column), -1, dtype=np.int64) for column in columns)
+    hashes = [_row_hashes(column) for column in columns]
+    frame = _numbered((view.frame, number) for view, number in zip(views, place, strict=True))
+    for column, own, source in zip(columns, hashes, sources, strict=True):
+        _mark_rows(column, own, frame, source)
+    _mark_views(columns, hashes, place, sources)
+    return Copies(*sources)
+
+
+def _may_repeat(column: Columns, place: Indices) -> bool:
+    """Whether rows near one another agree or, of very many, whole views."""
+    of_views, repeat = np.zeros(len(place), dtype=np.uint64), False
+    for views, sums, some in each_block(_looked_at, column):
+        np.add.at(of_views, views, sums)
+        repeat |= some
+    if repeat:
+        return True
+    with_rows = np.flatnonzero(of_views)
+    of_views = np.sort(of_views[with_rows] + place[with_rows].astype(np.uint64) * _FRAME)
+    return bool(np.any(of_views[1:] == of_views[:-1]))
+
+
+def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
+    """Views, the sum of their rows' hashes, and whether rows agree."""
+    hashes = _row_hashes(block)
+    if not len(hashes):
+        return np.empty(0, dtype=np.int64), hashes, False
+    starts = np.flatnonzero(np.diff(block.view, prepend=-1))
+    sums = np.add.reduceat(hashes, starts)
+    hashes.sort()
+    return block.view[starts].astype(np.int64), sums, bool(np.any(hashes[1:] == hashes[:-1]))
+
+
+def _row_hashes(column: Columns) -> Hashes:
+    """(N,) of what each row says but for its view and its sigma: feature, side and both coordinates, to the last bit.
+
+    Equal where the rows are; of others hardly ever.
+    """
+    x, y = np.ascontiguousarray(column.pixels).view(np.uint64).T
+    hashes = column.feature.astype(np.uint64)
+    if isinstance(column, Curves):
+        hashes += column.side.astype(np.uint64) << np.uint64(32)
+    hashes *= _FEATURE
+    hashes += y
+    hashes += x * _X
+    return hashes
+
+
+def _repeated(hashes: Hashes) -> Mask:
+    """(N,) whether another one is the same."""
+    _, number, count = np.unique(hashes, return_inverse=True, return_counts=True)
+    return np.asarray(count[number] > 1)
+
+
+def _numbered(names: Iterable[Hashable]) -> Indices:
+    """The number of each name, in order of appearance."""
+    numbers: dict[Hashable, int] = {}
+    return np.array([numbers.setdefault(name, len(numbers)) for name in names], dtype=np.int64)
+
+
+def _parts(column: Columns, rows: Indices) -> tuple[NDArray[np.generic], ...]:
+    """What these rows say, each part a column."""
+    side = column.side[rows] if isinstance(column, Curves) else np.zeros(len(rows), np.int8)
+    return (*column.pixels[rows].T, side, column.feature[rows])
+
+
+def _mark_rows(column: Columns, hashes: Hashes, frame: Indices, source: Indices) -> None:
+    """Rows that repeat an earlier one of the same frame; `frame` (V,) is the number of each view's."""
+    rows = np.flatnonzero(_repeated(hashes + frame[column.view].astype(np.uint64) * _FRAME))
+    said = (*_parts(column, rows), frame[column.view[rows]])
+    order = np.lexsort(said)  # which is stable: of those that agree the earliest comes first
+    if not len(rows):
+        return
+    same = np.all([part[order][1:] == part[order][:-1] for part in said], axis=0)
+    first = np.maximum.accumulate(np.where(np.concatenate([[False], same]), 0, np.arange(len(rows))))
+    later = np.flatnonzero(first != np.arange(len(rows)))
+    source[rows[order[later]]] = column.view[rows[order[first[later]]]]
+
+
+def _mark_views(
+    columns: tuple[Columns, Columns], hashes: Sequence[Hashes], place: Indices, sources: tuple[Indices, ...]
+) -> None:
+    """Rows of views all of whose rows repeat those of an earlier one; `place` (V,): of the same station and target."""
+    least_rows = 4  # of a view that copies another: fewer whole pixels agree by chance
+    contents: list[list[Hashable]] = [[int(number)] for number in place]
+    sizes, differs = np.zeros(len(place), dtype=np.int64), np.zeros(len(place), dtype=bool)
+    own = [source < 0 for source in sources]
+    for column, values, counts in zip(columns, hashes, own, strict=True):
+        sizes += np.bincount(column.view[counts], minlength=len(place))
+        differs[column.view[counts][~_repeated(values[counts])]] = True
+    whole = np.flatnonzero((sizes >= least_rows) & ~differs)
+    for column, counts in zip(columns, own, strict=True):
+        rows = np.flatnonzero(counts & np.isin(column.view, whole))
+        said = _parts(column, rows)
+        order = np.lexsort((*said, column.view[rows]))
+        ends = np.searchsorted(column.view[rows], whole), np.searchsorted(column.view[rows], whole, side="right")
+        for view, start, stop in zip(whole, *ends, strict=True):
+            contents[view] += [part[order[start:stop]].tobytes() for part in said]
+    seen: dict[Hashable, int] = {}
+    first = np.arange(len(place))
+    for view in whole:
+        first[view] = seen.setdefault(tuple(contents[view]), int(view))
+    for column, counts, source in zip(columns, own, sources, strict=True):
+        copied = counts & (first[column.view] != column.view)
+        source[copied] = first[column.view[copied]]

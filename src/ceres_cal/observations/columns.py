@@ -15,6 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.typed import checked_fields, take_types
 
@@ -101,8 +102,7 @@ TYPES: dict[str, type[np.generic]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
+class Columns(Frozen):
     """Columns of observations, read-only: index of the view, index into the target's names, pixel, its sigma."""
 
     view: Indices32
@@ -140,7 +140,6 @@ class Points(Columns):
     """The point observations."""
 
 
-@dataclass(frozen=True, eq=False)
 class Curves(Columns):
     """The curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
 
@@ -220,8 +219,7 @@ def read_rows(rows: AnyArray | FileRows) -> AnyArray:
     return rows.read() if isinstance(rows, FileRows) else rows
 
 
-@dataclass(frozen=True, eq=False)
-class Alone:
+class Alone(Frozen):
     """A single column."""
 
     values: AnyArray

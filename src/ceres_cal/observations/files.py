@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from ceres_cal.base.files import (
     read_bytes,
     write_bytes,
 )
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.words import did_you_mean, no_such
 from ceres_cal.observations.columns import (
     NO_CURVES,
@@ -58,8 +58,7 @@ _COLUMNS: dict[str, Column] = {"header": (np.uint8, ("bytes",)), **_NUMBERS}
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class Content:
+class Content(Frozen):
     """What a file holds, not checked: see `Observations`."""
 
     targets: Mapping[str, Target]

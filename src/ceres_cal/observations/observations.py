@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -18,10 +17,11 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
-from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels
+from ceres_cal.observations.bounds import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (
     Alone,
     Columns,
@@ -34,7 +34,6 @@ from ceres_cal.observations.columns import (
     taken,
     view_label,
 )
-from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered_curves, gathered_points
 from ceres_cal.scene.targets import Target
@@ -42,7 +41,6 @@ from ceres_cal.scene.targets import Target
 _NAMES = attrgetter("camera", "station", "target", "placement")
 
 
-@dataclass(frozen=True, eq=False)
 class Observations(Content):
     """Everything that was observed.
 

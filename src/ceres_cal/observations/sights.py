@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import NamedTuple, TypeAlias
 
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.files import Content
@@ -45,8 +45,7 @@ class SightKey(NamedTuple):
         return f"station {self.station!r}" + (f", placement {self.placement!r}" if self.placement is not None else "")
 
 
-@dataclass(frozen=True, eq=False)
-class Sights(Sequence["Sights"]):
+class Sights(Frozen, Sequence["Sights"]):
     """Some sights, their observations one after the other; one sight is a `Sights` of length one.
 
     Attributes:

@@ -15,12 +15,12 @@ where all directions are well known.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import SolutionError, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import normal_cdf
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.bundle import Solution, solve
@@ -39,8 +39,7 @@ _FAR = 9.0
 _STEPS = (0.02, 0.35)  # of log phi
 
 
-@dataclass(frozen=True, eq=False)
-class Node:
+class Node(Frozen):
     """One point of the valley: phi held, everything else at its best.
 
     Attributes:
@@ -195,8 +194,7 @@ _HELD = 0.005  # of a step: how closely its end is held
 _FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
 
 
-@dataclass(frozen=True, eq=False)
-class Ends:
+class Ends(Frozen):
     """What the numbers do at the ends of weak directions.
 
     Attributes:
@@ -317,8 +315,7 @@ def ends_of(
     return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, tuple(others))
 
 
-@dataclass(frozen=True, eq=False)
-class _End:
+class _End(Frozen):
     """Where the numbers are (K,), in natural sizes from the estimate, and twice the cost there."""
 
     estimate: Estimate

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief, drawn
 from ceres_cal.base.transforms import Pose
@@ -31,8 +31,7 @@ from ceres_cal.problem.quantities import PixelSlopes, pixel_slopes
 from ceres_cal.scene.camera import Camera
 
 
-@dataclass(frozen=True, eq=False)
-class PointSpread:
+class PointSpread(Frozen):
     """What is known of N located points.
 
     Attributes:
@@ -116,8 +115,7 @@ class RadiusMap:
         return drawn("plot_map", self, ax)
 
 
-@dataclass(frozen=True, eq=False)
-class FieldGrid:
+class FieldGrid(Frozen):
     """Places on the field at one height: all x_m (X,) at all y_m (Y,)."""
 
     height_m: float
@@ -135,7 +133,6 @@ class FieldGrid:
         return np.column_stack([part.ravel() for part in np.meshgrid(self.x_m, self.y_m)])
 
 
-@dataclass(frozen=True, eq=False)
 class ErrorMap(FieldGrid, ABC):
     """Errors of one station over a grid."""
 
@@ -157,7 +154,6 @@ class ErrorMap(FieldGrid, ABC):
         return float(np.max(visible)) if len(visible) else np.nan
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class FieldMap(RadiusMap, ErrorMap):
     """How well one station locates points at one height, over a grid.
 
@@ -212,8 +208,7 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
 _STEPS = 32  # along the longer side
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ImageMap(RadiusMap):
+class ImageMap(Frozen, RadiusMap):
     """How well one camera knows its image, over a grid.
 
     Attributes:
@@ -227,8 +222,7 @@ class ImageMap(RadiusMap):
     radius_95_px: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
+class Picture(Frozen):
     """What a camera shows at N pixels, and how that moves when the camera is another one.
 
     Attributes:

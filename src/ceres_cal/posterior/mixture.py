@@ -9,12 +9,12 @@ deviations its moments.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED, normal_cdf
 from ceres_cal.problem.information import Information, Key, over
@@ -47,8 +47,7 @@ class Chain(NamedTuple):
     roots: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Mixture:
+class Mixture(Frozen):
     """What some numbers may be.
 
     Attributes:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief
 from ceres_cal.base.spread import Spread, without
@@ -21,8 +21,7 @@ from ceres_cal.problem.quantities import layout_of
 from ceres_cal.problem.reduced import Eliminated, ReducedInformation
 
 
-@dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Frozen):
     """What observations and priors say together, about the solution, at the noise that was estimated.
 
     It is kept as information because a covariance does not exist where something is unknown. Errors that go together
@@ -261,8 +260,7 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
     return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence, stated=stated)
 
 
-@dataclass(frozen=True, eq=False)
-class _Placements(Mapping[str, Information]):
+class _Placements(Frozen, Mapping[str, Information]):
     """Information about each eliminated placement, worked out when the first one is asked for.
 
     Attributes:

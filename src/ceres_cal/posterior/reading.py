@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.tails import NORMAL_95, normal_cdf
 from ceres_cal.posterior.bent import weak_axes
 from ceres_cal.posterior.mixture import FARTHER, Mixture, quantiles, radii
@@ -25,8 +25,7 @@ _ROUND = 2.447 / np.sqrt(2.0)  # radius that 95 % of errors alike in all directi
 _LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley widens out there
 
 
-@dataclass(frozen=True, eq=False)
-class Functional:
+class Functional(Frozen):
     """Something that is read off an estimate: N pairs of numbers, and how they move.
 
     Attributes:
@@ -37,8 +36,7 @@ class Functional:
     slopes: Callable[[Estimate, Sequence[Key]], Array]
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
+class Reading(Frozen):
     """What a posterior says of N pairs of numbers, from where the estimate has them.
 
     Attributes:

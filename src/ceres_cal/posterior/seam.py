@@ -6,11 +6,12 @@ How two cameras stand to each other: baseline and angle, with standard deviation
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, field_map, located_by, station_keys, visible_pixels
@@ -114,8 +115,7 @@ def predicted(
     return read(posterior, estimate, seam), visible
 
 
-@dataclass(frozen=True, eq=False)
-class Disagreement:
+class Disagreement(Frozen):
     """What two stations actually say of what both observed.
 
     Attributes:
@@ -140,8 +140,7 @@ class Disagreement:
         return float(np.sqrt(np.mean(self.expected_mm**2))) if len(self.off_mm) else np.nan
 
 
-@dataclass(frozen=True, eq=False)
-class _Sighting:
+class _Sighting(Frozen):
     """What one station saw of one thing, all frames taken together.
 
     Attributes:

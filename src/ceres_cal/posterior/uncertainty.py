@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import Shown, html_of, text_of
 from ceres_cal.base.spread import are_known
@@ -192,8 +193,7 @@ def ratio_sd(estimate: Estimate, posterior: Posterior, camera: str, station: str
     return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
 
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
+class Uncertainty(Frozen):
     """How well a calibration is known. It holds as far as the model does: see `Posterior`.
 
     Attributes:

@@ -10,7 +10,7 @@ coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a li
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ import pyceres
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales, unit_px
@@ -173,8 +174,7 @@ def as_built(
     return points._replace(places=structure.points(sights)), curves._replace(tracks=structure.tracks(sights))
 
 
-@dataclass(frozen=True, eq=False)
-class _Evaluation:
+class _Evaluation(Frozen):
     """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`)."""
 
     at: Array

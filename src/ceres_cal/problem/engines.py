@@ -9,15 +9,15 @@ import errno
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.native import keep_freed_memory
 from ceres_cal.base.threads import at_most, available, single_threaded_blas
 from ceres_cal.base.transforms import Poses
@@ -32,16 +32,6 @@ _RETRIES = 3  # of what a worker that was lost had to do
 _PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
 _NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
 _NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
-
-
-class Engine(Protocol):
-    """Where shares are asked."""
-
-    def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
-        """The sum of answer(share, *request) over all shares."""
-
-    def close(self) -> None:
-        """Let the shares go."""
 
 
 class InProcess:
@@ -206,11 +196,10 @@ def _lost(last: str) -> SolutionError:
     return SolutionError("workers were lost again and again: have they enough memory?" + f" ({last})" * bool(last))
 
 
-@dataclass(frozen=True, eq=False)
-class SharedObservations:
+class SharedObservations(Frozen):
     """The observations of an engine's shares, judged at an estimate; see `problem.Elsewhere`."""
 
-    engine: Engine
+    engine: InProcess | OnWorkers
     keys: tuple[SightKey, ...]
     equations: int
     judged_at: tuple[str, Estimate]

@@ -13,18 +13,19 @@ from where the pose is, so no pose is special, not even one turned by half a tur
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import Spread, known_inverses, without
 
 _TURNS = ("turn_x", "turn_y", "turn_z")
 STATION_QUANTITIES = ("x", "y", "height", *_TURNS)
 PLACEMENT_QUANTITIES = ("x", "y", "z", *_TURNS)
+POSE_QUANTITIES = {"station": STATION_QUANTITIES, "placement": PLACEMENT_QUANTITIES}
 _POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 _LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
 
@@ -71,8 +72,7 @@ def sigma_limits(keys: Sequence[Key]) -> Array:
 
 def pose_keys(kind: str, name: str) -> list[Key]:
     """The six keys of a station or a placement."""
-    quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
-    return [Key(kind, name, q, unit) for q, unit in zip(quantities, _POSE_UNITS, strict=True)]
+    return [Key(kind, name, q, unit) for q, unit in zip(POSE_QUANTITIES[kind], _POSE_UNITS, strict=True)]
 
 
 def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:
@@ -98,8 +98,7 @@ def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
 _VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
 
 
-@dataclass(frozen=True, eq=False)
-class Information:
+class Information(Frozen):
     """An information matrix, symmetric, not necessarily of full rank.
 
     Attributes:

@@ -6,12 +6,12 @@ Residuals are taken in units of their stated sigma; the noise scale is the facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.observations import Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.problem.parameters import Options
@@ -54,8 +54,7 @@ def by_leverage(counts: tuple[int, int], leverages: tuple[float, float]) -> Redu
     return points, curves
 
 
-@dataclass(frozen=True, eq=False)
-class Inliers:
+class Inliers(Frozen):
     """Which observations take part, and the noise scales they were judged by.
 
     Attributes:
@@ -109,6 +108,11 @@ class Inliers:
     def weighting(self, options: Options) -> Weighting:
         """Of the observations at these noise scales."""
         return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
+
+    @property
+    def rows(self) -> Mask:
+        """(N + M,) which observations take part, points by row and then curves by row."""
+        return np.concatenate([self.points, self.curves])
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -237,8 +241,7 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
-@dataclass(frozen=True)
-class LengthSums:
+class LengthSums(Frozen):
     """Number and sum of squares of the lengths within the rejection bound."""
 
     count: int

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
@@ -21,9 +22,10 @@ from ceres_cal.base.typed import checked_fields, take_types
 from ceres_cal.base.words import no_such
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
-from ceres_cal.problem.structure import Structure, Tolerance
+from ceres_cal.problem.structure import Structure, Tolerance, make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens, lens_class, make_lens
+from ceres_cal.scene.targets import Target
 
 AUTO = "auto"
 """The lens that the data ask for: which it is, a calibration says in its options (`calibration.lens_choice`)."""
@@ -142,6 +144,10 @@ class Options:
     def _which(self) -> str:
         return "a lens that is still to be chosen (name it)" if self.lens == AUTO else f"the {self.lens} lens"
 
+    def structure_of(self, targets: Mapping[str, Target]) -> Structure:
+        """What may be built otherwise than it is drawn of the targets, all of it as drawn."""
+        return make_structure(targets, self.tolerances, self.dimensions)
+
     @cached_property
     def held(self) -> Mapping[str, float]:
         """What `fixed` holds, and at 0 the coefficients that are not solved for."""
@@ -212,8 +218,7 @@ class Station:
     cam_from_world: Pose
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(Frozen):
     """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
 
     cameras: Mapping[str, Camera]
@@ -270,8 +275,7 @@ class Estimate:
         return Poses.of(poses).of_names(names)
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(Frozen):
     """Which numbers the solver may move.
 
     Attributes:

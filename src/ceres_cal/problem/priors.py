@@ -8,12 +8,12 @@ of a prior is root (x - mean) with root^T root = information.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
@@ -39,8 +39,7 @@ alone, let solves run away along their valley, to cameras that are none."""
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
 
 
-@dataclass(frozen=True, eq=False)
-class GaussianPrior:
+class GaussianPrior(Frozen):
     """A normal distribution of some intrinsics, stations and structure numbers.
 
     Attributes:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
@@ -62,8 +63,7 @@ class Elsewhere(Protocol):
         """Their normal equations by sight and kind, see `problem.reduced`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Frozen):
     """What is minimised, over what, under what was known before.
 
     Attributes:

@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log, skew
-from ceres_cal.problem.information import PLACEMENT_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
+from ceres_cal.problem.information import POSE_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
 from ceres_cal.problem.parameters import (
     Estimate,
     Layout,
@@ -112,15 +112,10 @@ def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
             at = [estimate.structure.names.index(keys[column].structure_name) for column in columns]
             values[columns] = estimate.structure.values[at]
         else:
-            is_station = kind == "station"
-            position = (
-                estimate.stations[owner].cam_from_world.position
-                if is_station
-                else estimate.placements[owner].translation
-            )
-            six = [*position.tolist(), 0.0, 0.0, 0.0]
-            quantities = STATION_QUANTITIES if is_station else PLACEMENT_QUANTITIES
-            values[columns] = [six[quantities.index(name)] for name in names]
+            held = estimate.placements[owner].translation if kind == "placement" else None
+            place = estimate.stations[owner].cam_from_world.position if held is None else held
+            six = [*place.tolist(), 0.0, 0.0, 0.0]
+            values[columns] = [six[POSE_QUANTITIES[kind].index(name)] for name in names]
     return values
 
 
@@ -211,8 +206,7 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
             values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[columns]
         else:
             change = np.zeros(6)
-            quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
-            change[[quantities.index(name) for name in names]] = step[columns]
+            change[[POSE_QUANTITIES[kind].index(name) for name in names]] = step[columns]
             if kind == "station":
                 old = stations[owner].cam_from_world
                 pose = Pose.looking(old.position + change[:3], rotation_exp(change[3:]) @ old.rotation)

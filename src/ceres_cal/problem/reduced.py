@@ -7,7 +7,6 @@ added up over what is shared, in the coordinates of `problem.information`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from operator import add
 
@@ -16,6 +15,7 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.base.threads import parts_of, run_parts
@@ -30,8 +30,7 @@ from ceres_cal.problem.residuals import camera_optics, curve_columns, point_colu
 _BATCH = 250_000  # numbers of normal equations worked on at once: they stay where the processor is quick
 
 
-@dataclass(frozen=True, eq=False)
-class Eliminated:
+class Eliminated(Frozen):
     """Private placements of one station: their own information, and how they follow the shared numbers.
 
     Attributes:
@@ -52,8 +51,7 @@ class Eliminated:
         return np.asarray(np.einsum("sij,sji->s", self.own, self.inverses))
 
 
-@dataclass(frozen=True, eq=False)
-class ReducedInformation:
+class ReducedInformation(Frozen):
     """J^T W J of everything shared, private placements eliminated.
 
     Attributes:
@@ -179,9 +177,10 @@ class _InformationSums:
         known = reduce(add, priors, Information.nothing(self._keys))
         every = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
         of_targets = [all(key.kind == "structure" for key in prior.keys) for prior in every]
+        each = list(zip(every, of_targets, strict=True))
         stated, built = (
-            reduce(add, (one.information for one, own in zip(every, of_targets, strict=True) if own == of), nothing)
-            for of, nothing in ((False, Information.nothing()), (True, Information.nothing()))
+            reduce(add, (one.information for one, own in each if own == of), Information.nothing())
+            for of in (False, True)
         )
         return ReducedInformation(points, curves, known, stated, built, tuple(eliminated), *self._leverages.tolist())
 

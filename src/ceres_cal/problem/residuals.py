@@ -10,13 +10,13 @@ moves on a target by `built`, the camera by `pose`.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations import Observations
@@ -34,8 +34,7 @@ from ceres_cal.scene.targets import Target
 _STRAY = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Residuals:
+class Residuals(Frozen):
     """Residuals in the order of the observations, px; NaN where the estimate cannot show an observation at all.
 
     Attributes:
@@ -182,8 +181,7 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
     return np.concatenate(nearest)
 
 
-@dataclass(frozen=True, eq=False)
-class Equations:
+class Equations(Frozen):
     """E scalar equations, sight after sight.
 
     Attributes:

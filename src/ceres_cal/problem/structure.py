@@ -11,13 +11,14 @@ The lengths that targets are drawn by, and how another value of one moves points
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import take_types
 from ceres_cal.base.words import no_such
@@ -57,8 +58,7 @@ class Tolerance:
                 raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")
 
 
-@dataclass(frozen=True, eq=False)
-class BuiltTarget:
+class BuiltTarget(Frozen):
     """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
 
     target: Target
@@ -66,8 +66,7 @@ class BuiltTarget:
     tracks: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Structure:
+class Structure(Frozen):
     """The corrections of all targets.
 
     Attributes:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 
@@ -69,8 +70,7 @@ _STYLE: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class Drawing:
+class Drawing(Struct, frozen=True):
     """What is drawn: `draw(axes, width_in)` into one pair of axes; `height` over width of the whole."""
 
     draw: Callable[[Axes, float], None]

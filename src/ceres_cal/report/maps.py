@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,12 +16,15 @@ from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
+from ceres_cal.report.residual_pictures import number_of, owner_suffix
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from ceres_cal.moves.agreement import Agreement
+    from ceres_cal.scene.camera import Camera
+    from ceres_cal.scene.targets import Target
 
 _SERIES = (
     (1.0, 2.0, 5.0),
@@ -35,50 +37,43 @@ _DOT, _DOT_ALPHA = 1.1, 0.45
 LABEL = "95 % within, mm"
 
 
-@dataclass(frozen=True, eq=False)
-class MapDrawing:
-    """What is drawn of a map over the field.
+def field_drawing(
+    grid: tuple[Array, Array],
+    values: Array,
+    label: str,
+    camera: Camera,
+    height_m: float,
+    fields: Iterable[Target],
+    worst_m: tuple[float, float] | None = None,
+    observed: Array | None = None,
+) -> Drawing:
+    """A map over the field, with the field's lines, the border of the image, and the camera on top.
 
-    Attributes:
-        x_m (X,), y_m (Y,), values (Y, X): mm, NaN where nothing is shown, infinite where nothing can be said.
-        label: of the scale of colours.
-        paint: (S, 2) m each, what lies in the world. border: (B, 2) m, of the image. camera: (3,) m.
+    Args:
+        grid: x (X,) and y (Y,) m. values: (Y, X) mm, NaN where nothing is shown, infinite where nothing can be said.
+        label: of the scale of colours. camera: that is posed over the fields; height_m: of the map.
         worst_m: the place that is ringed, where there is one. observed: (N, 2) m, where observations lie.
     """
+    x_m, y_m = grid
 
-    x_m: Array
-    y_m: Array
-    values: Array
-    label: str
-    paint: Sequence[Array]
-    border: Array
-    camera: Array
-    worst_m: tuple[float, float] | None = None
-    observed: Array | None = None
-
-    def draw(self, axes: Axes, width_in: float) -> None:
-        """The map with the field's lines, the border of the image, and the camera on top."""
-        fill(axes, MM, (self.x_m, self.y_m), self.values)
-        for line in self.paint:
-            axes.plot(*line.T, color="white", linewidth=1.8, alpha=0.8)
-            axes.plot(*line.T, color=QUIET, linewidth=0.6)
-        if self.observed is not None:
-            canvas.dots(axes, self.observed, MM.ink(self.values), _DOT, alpha=_DOT_ALPHA)
-        axes.plot(*self.border.T, color=QUIET, linewidth=0.8, dashes=(3, 2))
-        axes.plot(*self.camera[:2], "^", color=INK, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
-        if self.worst_m is not None:
-            axes.plot(*self.worst_m, "o", markersize=5, markerfacecolor="none", markeredgecolor=OUTLIER)
-        margin = 0.03 * (self.x_m[-1] - self.x_m[0])
-        axes.set(xlim=(self.x_m[0] - margin, self.x_m[-1] + margin), aspect="equal", xlabel="x, m", ylabel="y, m")
-        axes.set(ylim=(self.y_m[0] - margin, self.y_m[-1] + margin))
+    def draw(axes: Axes, width_in: float) -> None:
+        fill(axes, MM, grid, values)
+        for line in paint_of(fields):
+            axes.plot(*line[:, :2].T, color="white", linewidth=1.8, alpha=0.8)
+            axes.plot(*line[:, :2].T, color=QUIET, linewidth=0.6)
+        if observed is not None:
+            canvas.dots(axes, observed, MM.ink(values), _DOT, alpha=_DOT_ALPHA)
+        axes.plot(*image_border(camera, height_m).T, color=QUIET, linewidth=0.8, dashes=(3, 2))
+        axes.plot(*camera.position[:2], "^", color=INK, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
+        if worst_m is not None:
+            axes.plot(*worst_m, "o", markersize=5, markerfacecolor="none", markeredgecolor=OUTLIER)
+        margin = 0.03 * (x_m[-1] - x_m[0])
+        axes.set(xlim=(x_m[0] - margin, x_m[-1] + margin), aspect="equal", xlabel="x, m", ylabel="y, m")
+        axes.set(ylim=(y_m[0] - margin, y_m[-1] + margin))
         axes.grid(visible=False)
-        MM.bar(axes, self.label)
+        MM.bar(axes, label)
 
-    @property
-    def drawing(self) -> Drawing:
-        """As high as the field and the scale beneath it need."""
-        shape = float(np.ptp(self.y_m) / np.ptp(self.x_m))
-        return Drawing(self.draw, min(max(shape * 0.9 + 0.2, 0.4), 1.4))
+    return Drawing(draw, min(max(float(np.ptp(y_m) / np.ptp(x_m)) * 0.9 + 0.2, 0.4), 1.4))
 
 
 def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> None:
@@ -118,14 +113,13 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
     """One map of one station over the field, at one of its heights."""
     one, drawn = material.maps[station][number], material.drawn_maps[station][number]
     posed = material.calibration.stations[station]
-    map_drawing = MapDrawing(
-        drawn.x_m,
-        drawn.y_m,
+    drawing = field_drawing(
+        (drawn.x_m, drawn.y_m),
         drawn.radius_95_mm,
         LABEL,
-        [line[:, :2] for line in paint_of(material.fields)],
-        image_border(posed, one.height_m),
-        posed.position,
+        posed,
+        one.height_m,
+        material.fields,
         _worst_place(one) if np.isfinite(worst_radius(one)) else None,
         _within(posed.locate(material.observed(station)), one) if one.height_m == 0.0 else None,
     )
@@ -135,7 +129,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         where + _named(material, station),
         f"{_reading(one)}. Dashed: the border of the image, open beyond it. Triangle: the camera."
         + (" Dots: observations." if one.height_m == 0.0 else ""),
-        map_drawing.drawing,
+        drawing,
         grid_table(f"{LABEL}, at y \\ x", one.radius_95_mm[::-1], one.x_m, one.y_m[::-1], "{:.1f} m"),
         hover=Hover.of(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
     )
@@ -197,39 +191,34 @@ def _evenly(count: int, most: int) -> list[int]:
 # ---- over the image -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _OverImage:
-    """What is drawn over one image: radii (Y, X) at x (X,), y (Y,) px, observations (N, 2) px, and the scale."""
+def _over_image(
+    name: tuple[str, str, str],
+    image_size: tuple[int, int],
+    grid: tuple[Array, Array],
+    radii: Array,
+    observed: Array,
+    scale: Scale,
+) -> Figure:
+    """Radii (Y, X) at x (X,), y (Y,) px over one image, with observations (N, 2) px on top, and how much of it they
+    cover; `name`: of the figure, its title, and what it shows.
+    """
+    (width, height), unit = image_size, scale.unit
 
-    image_size: tuple[int, int]
-    x: Array
-    y: Array
-    radii: Array
-    observed: Array
-    scale: Scale
-
-    def draw(self, axes: Axes, width_in: float) -> None:
-        """The map with the observations on top."""
-        width, height = self.image_size
-        fill(axes, self.scale, (self.x, self.y), self.radii)
-        canvas.dots(axes, self.observed, self.scale.ink(self.radii), _DOT, alpha=_DOT_ALPHA)
+    def draw(axes: Axes, width_in: float) -> None:
+        fill(axes, scale, grid, radii)
+        canvas.dots(axes, observed, scale.ink(radii), _DOT, alpha=_DOT_ALPHA)
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px")
         axes.grid(visible=False)
-        self.scale.bar(axes, f"95 % within, {self.scale.unit}")
+        scale.bar(axes, f"95 % within, {unit}")
 
-    def figure(self, name: str, title: str, what: str) -> Figure:
-        """With how much of the image was observed."""
-        width, height = self.image_size
-        unit = self.scale.unit
-        return Figure(
-            name,
-            title,
-            f"{what} Dots: observations, in {_covered(self.observed, self.image_size)} of 192 parts of the image. "
-            "Where there are none, the lens model is extrapolated.",
-            Drawing(self.draw, 0.92 * height / width + 0.2),
-            grid_table(f"95 % within, {unit}, at y \\ x", self.radii, self.x, self.y, "{:.0f} px"),
-            hover=Hover.of(self.x, self.y, spoken(self.radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
-        )
+    return Figure(
+        *name[:2],
+        f"{name[2]} Dots: observations, in {_covered(observed, image_size)} of 192 parts of the image. Where there are "
+        "none, the lens model is extrapolated.",
+        Drawing(draw, 0.92 * height / width + 0.2),
+        grid_table(f"95 % within, {unit}, at y \\ x", radii, *grid, "{:.0f} px"),
+        hover=Hover.of(*grid, spoken(radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
+    )
 
 
 def _covered(pixels: Array, image_size: tuple[int, int]) -> int:
@@ -247,12 +236,12 @@ def image_figure(material: Material, station: str) -> Figure:
     shown = np.isfinite(posed.locate(pixels)).all(axis=1)
     assert material.uncertainty is not None
     radii[shown] = 1e3 * material.uncertainty.located(pixels[shown], 0.0, station).radius_95_m
-    drawn = _OverImage(posed.image_size, x, y, radii.reshape(len(y), len(x)), material.observed(station), MM)
-    return drawn.figure(
+    name = (
         f"image-{list(material.maps).index(station)}",
         f"On the floor, over the image{_named(material, station)}",
         "The same accuracy, drawn where the camera sees each place.",
     )
+    return _over_image(name, posed.image_size, (x, y), radii.reshape(len(y), len(x)), material.observed(station), MM)
 
 
 def lens_image_figure(material: Material, name: str) -> Figure:
@@ -261,15 +250,13 @@ def lens_image_figure(material: Material, name: str) -> Figure:
     known = material.uncertainty.map_px(name)
     stations = [s for s, owner in material.observations.stations.items() if owner == name]
     observed = np.concatenate([material.observed(station) for station in stations])
-    drawn = _OverImage(
-        material.calibration.cameras[name].image_size, known.x_px, known.y_px, known.radius_95_px, observed, PX
-    )
-    several = len(material.observations.cameras) > 1
-    return drawn.figure(
-        f"image-{list(material.observations.cameras).index(name)}",
-        "Over the image" + (f", {name}" if several else ""),
+    called = (
+        f"image-{number_of(material, name)}",
+        f"Over the image{owner_suffix(material, name)}",
         "How far off the pixel of a direction may be, with the camera turned to its best pose. Darker is worse.",
     )
+    size = material.calibration.cameras[name].image_size
+    return _over_image(called, size, (known.x_px, known.y_px), known.radius_95_px, observed, PX)
 
 
 # ---- where two calibrations differ ----------------------------------------------------------------------------------
@@ -278,15 +265,9 @@ def lens_image_figure(material: Material, name: str) -> Figure:
 def comparison_svg(comparison: Agreement, before: Calibration) -> str:
     """The map of one station's differences as a file of its own, over the field as the first calibration sees it."""
     assert comparison.change is not None
-    camera, (over,) = before.stations[comparison.name], comparison.change.maps
+    (over,) = comparison.change.maps
     fields = [target for target in before.targets.values() if not target.movable]
-    map_drawing = MapDrawing(
-        over.x_m,
-        over.y_m,
-        over.errors_mm,
-        f"{comparison.name}, {at_height(over.height_m)}: difference, mm ({over.mean_mm:.2f} on average)",
-        [line[:, :2] for line in paint_of(fields)],
-        image_border(camera, over.height_m),
-        camera.position,
-    )
-    return canvas.to_svg(map_drawing.drawing, canvas.WIDE_IN, "comparison", whole_file=True)
+    label = f"{comparison.name}, {at_height(over.height_m)}: difference, mm ({over.mean_mm:.2f} on average)"
+    grid, camera = (over.x_m, over.y_m), before.stations[comparison.name]
+    drawing = field_drawing(grid, over.errors_mm, label, camera, over.height_m, fields)
+    return canvas.to_svg(drawing, canvas.WIDE_IN, "comparison", whole_file=True)

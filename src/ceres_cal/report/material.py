@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, attempt
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -25,8 +26,7 @@ from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedForm:
+class ClosedForm(Struct, frozen=True, eq=False):
     """The paper's own method on the same observations.
 
     Attributes:
@@ -38,8 +38,7 @@ class ClosedForm:
     lengths: Array
 
 
-@dataclass(frozen=True, eq=False)
-class FramePhotographs:
+class FramePhotographs(Struct, frozen=True, eq=False):
     """Photographs by the names of their frames, and the calibration to compare with.
 
     Attributes:
@@ -51,7 +50,6 @@ class FramePhotographs:
     before: Calibration | None = None
 
 
-@dataclass(frozen=True, eq=False)
 class Material(Quality):
     """A calibration, observations, what the residuals between them say, and what was asked for besides.
 

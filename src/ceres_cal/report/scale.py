@@ -6,10 +6,10 @@ Lightness falls all the way, so that grey print and colour-blind readers have th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import short
@@ -24,8 +24,7 @@ _ON_LIGHT, _ON_DARK = "#26303a", "#eef5fb"
 _UNKNOWN = "#fcede4"
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(Struct, frozen=True):
     """Where one colour of `COLORS` ends and the next begins, in a unit."""
 
     borders: tuple[float, ...]

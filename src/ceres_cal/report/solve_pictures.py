@@ -15,6 +15,7 @@ from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.material import ClosedForm, Material
+from ceres_cal.report.residual_pictures import number_of, owner_suffix
 from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -218,8 +219,8 @@ def distortion(material: Material, name: str) -> Figure:
     steps = np.linspace(0.0, camera.corner_radius, _TABLE_STEPS + 1)[1:]
     table_rows = zip(steps.tolist(), ideal_radii(camera, steps).tolist(), strict=True)
     return Figure(
-        f"lens-{list(material.observations.cameras).index(name)}",
-        "The distortion curve" + (f", {name}" if len(material.observations.cameras) > 1 else ""),
+        f"lens-{number_of(material, name)}",
+        f"The distortion curve{owner_suffix(material, name)}",
         f"Radius of a pixel from the principal point, measured (horizontal) and without distortion (vertical), "
         f"{model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px. The dotted part is extrapolated.",
         Drawing(lambda axes, _: draw_distortion(axes, camera, reach), 0.66),

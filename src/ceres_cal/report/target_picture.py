@@ -10,9 +10,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, PAINT, POINT, WIDE_IN, Drawing
-from ceres_cal.scene.curves import Arc, Curve, curve_points
+from ceres_cal.scene.curves import Arc, Curve, crossings, curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.crossings import crossings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -2,23 +2,23 @@
 
 A part goes all the way of a calibration: the lens, what does not belong as a whole, targets as built. From its end,
 which is off by the standard deviations of a part, all observations are judged and solved for together, in shares that
-answer with sums (`shares`): here, or wherever an `Engine` has them.
+answer with sums (`shares`): here, or wherever workers have them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.bundle import Progress, Solution, solve
-from ceres_cal.problem.engines import Engine, InProcess, OnWorkers, SharedObservations, of_world
+from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
 from ceres_cal.problem.noise import (
     SAME,
     Inliers,
@@ -33,9 +33,9 @@ from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.problem.shares import Share, ShareRequest, cut
-from ceres_cal.problem.sums import Histogram, Looked, Used
+from ceres_cal.problem.shares import Histogram, Looked, Share, ShareRequest, Used, cut
 from ceres_cal.robust.competing import Explanation
+from ceres_cal.robust.groups import some_views
 from ceres_cal.robust.robust import RobustSolution, Rounds
 
 # Observations of the part, and views of it at least.
@@ -43,8 +43,7 @@ _PART, _FEWEST_VIEWS = 300_000, 200
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
 
 
-@dataclass(frozen=True, eq=False)
-class Subset:
+class Subset(Frozen):
     """Some of the observations: all that are not of the world, and whole views of it.
 
     Attributes:
@@ -56,8 +55,7 @@ class Subset:
     gone: Mask | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Settled:
+class Settled(Frozen):
     """Where all observations were solved for.
 
     Attributes:
@@ -88,7 +86,7 @@ class Bulk:
             {SightKey(v.camera, v.station, None): None for v in views if v.placement is None}
         )
 
-    def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> Engine:
+    def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> InProcess | OnWorkers:
         shares = list(cut(self.observations, left_out))
         engine = InProcess(shares) if self._client is None else OnWorkers(self._client, shares)
         self._engines.append(engine)
@@ -104,11 +102,10 @@ class Bulk:
     def part(self, besides: Indices | None = None) -> Subset:
         """Views of the world, evenly, and these besides; everything that is not of the world."""
         counts = np.diff(self.observations.ends[0]) + np.diff(self.observations.ends[1])
-        shown = np.flatnonzero(self._world & (counts > 0))
-        most = min(max(_FEWEST_VIEWS, len(shown) * _PART // int(counts[shown].sum())), len(shown))
         chosen = ~self._world
-        chosen[shown[np.linspace(0, len(shown) - 1, most).astype(np.int64)]] = True
-        chosen[besides if besides is not None else shown[:0]] = True
+        chosen[some_views(np.where(self._world, counts, 0), _PART, _FEWEST_VIEWS)] = True
+        if besides is not None:
+            chosen[besides] = True
         step = max(1, int(counts[chosen & self._world].sum()) // (2 * _PART))
         rows = [
             np.concatenate(
@@ -172,7 +169,7 @@ class Bulk:
         return (points, curves) if self._left_out is None else (points | self._left_out[0], curves | self._left_out[1])
 
     def look(
-        self, engine: Engine, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
+        self, engine: InProcess | OnWorkers, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
         along: tuple[tuple[str, Estimate], ...] = (),
     ) -> tuple[str, Looked]:  # fmt: skip
         """What residuals are like at an estimate, which is given a name. along: where feet were sought before."""
@@ -181,8 +178,7 @@ class Bulk:
         return here[0], engine.ask(Share.looked, ShareRequest(here[1], blank, weighting, here, bounds, (*along, here)))
 
 
-@dataclass(frozen=True, eq=False)
-class _BulkResiduals:
+class _BulkResiduals(Frozen):
     """Residuals at an estimate: the name of the shares' ones, what these are like, those of the part, and the lengths
     of these in stated sigmas.
     """
@@ -209,8 +205,7 @@ class _BulkResiduals:
         return self.looked.points + own[0], self.looked.curves + own[1]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _SumRound(RobustSolution):
+class _SumRound(RobustSolution, kw_only=True):
     """Where one round over all observations ended; inliers and residuals are the part's.
 
     Attributes:
@@ -233,7 +228,7 @@ class _SumRounds(Rounds[_SumRound]):
     """The rounds over sums, of shares that are anywhere."""
 
     def __init__(
-        self, bulk: Bulk, engine: Engine, part: Subset, problem: Problem, end: RobustSolution,
+        self, bulk: Bulk, engine: InProcess | OnWorkers, part: Subset, problem: Problem, end: RobustSolution,
         progress: Callable[[Progress], None] | None,
     ) -> None:  # fmt: skip
         self._bulk, self._engine, self._part, self._few = bulk, engine, part, part.observations

@@ -12,12 +12,12 @@ What is said of a group that may not belong: how far it lies aside, how surely, 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Indices, Mask, medians_known
 from ceres_cal.base.errors import CalibrationError, attempt, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.evidence import Offsets, measure_offsets
@@ -38,7 +38,6 @@ from ceres_cal.robust.groups import (
     excess,
     groups_compared,
     groups_of,
-    inliers_of,
     mostly_rejected,
     rows_compared,
 )
@@ -49,8 +48,7 @@ from ceres_cal.robust.usable import require_fits
 DOUBTFUL = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class Explanation:
+class Explanation(Frozen):
     """That a group of observations does not belong.
 
     Attributes:
@@ -167,8 +165,7 @@ _Suspects = tuple[ObservationGroups, tuple[int, ...]]
 """Groups of one kind, by their numbers."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
+class _Trial(Frozen):
     """What a solve without the suspects says of them.
 
     Attributes:
@@ -249,7 +246,7 @@ class _Competition:
         # -4.7.
         suspect = -4.4
         if isinstance(groups, ViewGroups):
-            above = excess(self._some.observations, groups, end, self._taking_part)
+            above = excess(groups, end, self._taking_part)
             if np.max(above) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(above)), 1))):
                 return
         chosen, offsets = self._offsets(end, groups, ())
@@ -316,7 +313,7 @@ class _Competition:
         """
         recalled = groups.among(np.array(back, dtype=np.int64)) & self._taking_part
         observations, problem = self._some.observations, self._some.problem
-        rows = rows_compared(observations, groups, end, self._taking_part, recalled)
+        rows = rows_compared(groups, end, self._taking_part, recalled)
         sights = self._some.of_rows(rows).sights
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
@@ -325,7 +322,7 @@ class _Competition:
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(problem, end.solution.estimate, equations, weights)
-        chosen, share = groups_compared(observations, groups, end, rows & (inliers_of(end) | recalled), back)
+        chosen, share = groups_compared(groups, end, rows & (end.inliers.rows | recalled), back)
         effect = groups.columns(equations, chosen)
         agreeing = model.used.copy()
         for number in back:

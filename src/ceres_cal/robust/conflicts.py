@@ -14,7 +14,7 @@ slope of the cost along it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import NamedTuple
@@ -23,6 +23,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.errors import CalibrationError, attempt, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt
@@ -178,8 +179,7 @@ _SUSPICIOUS = 0.028
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
-@dataclass(frozen=True, eq=False)
-class Conflicts:
+class Conflicts(Frozen):
     """What contradicts what, and how the numbers move with each of it.
 
     Attributes:

@@ -10,11 +10,11 @@ does with all of its amounts.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
@@ -34,8 +34,7 @@ from ceres_cal.robust.robust import RobustSolution, solve_robustly
 _MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
 
 
-@dataclass(frozen=True, eq=False)
-class EffectsEnd:
+class EffectsEnd(Frozen):
     """The end of a solve beside effects.
 
     Attributes:
@@ -92,8 +91,7 @@ def solve_beside_effects(
     return EffectsEnd(problem, end, tuple(amounts.estimates()), shifts_at)
 
 
-@dataclass(frozen=True, eq=False)
-class _EffectGroup:
+class _EffectGroup(Frozen):
     """A group of an effect, and which amounts are its own."""
 
     effect: Effect
@@ -102,8 +100,7 @@ class _EffectGroup:
     own: Indices
 
 
-@dataclass(frozen=True, eq=False)
-class _Amounts:
+class _Amounts(Frozen):
     """What the residuals say of the amounts of all effects.
 
     Attributes:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, median
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.evidence import FEATURE_ASIDE, VIEW_ASIDE, SizePrior
 from ceres_cal.observations import Columns, Observations, View
@@ -29,8 +29,7 @@ FEWEST_VIEWS = 4  # of which one may not belong
 FEWEST = 3  # observations of a group: two numbers of a line's offset, and one left over
 
 
-@dataclass(frozen=True, eq=False)
-class ObservationGroups(ABC):
+class ObservationGroups(Frozen, ABC):
     """The groups of one kind, by number, each of which may lie aside: an effect whose size is large. There are numbers
     of which nothing was observed.
 
@@ -142,7 +141,7 @@ class ViewGroups(ObservationGroups):
         return f"frame {view.frame!r}{_seen_by(observations, view)}"
 
     def standing_out(self, end: RobustSolution, taking_part: Mask) -> Array:
-        return excess(self.observations, self, end, taking_part)[_owner(self, column_of(self.observations, "view"))]
+        return excess(self, end, taking_part)[_owner(self, column_of(self.observations, "view"))]
 
 
 def _seen_by(observations: Observations, view: View) -> str:
@@ -195,7 +194,7 @@ def groups_of(observations: Observations, sights: Sights) -> Iterator[Observatio
             owner[number] = len(views) + placed.setdefault(view.placement, len(placed))
     owner[(owner < len(views)) & (frames == 0)] = -1
     if len(distinct(owner[owner >= 0])) >= FEWEST_VIEWS:
-        of = owner[np.concatenate([observations.points.view, observations.curves.view])]
+        of = owner[column_of(observations, "view")]
         yield ViewGroups(observations, of.astype(np.int32), len(views) + len(placed), frames)
 
 
@@ -226,8 +225,7 @@ _LEFT = 0.5
 _MOST_ASKED, _FEWEST_ASKED = 200_000, 200
 
 
-@dataclass(frozen=True, eq=False)
-class Subproblem:
+class Subproblem(Frozen):
     """The observations that are asked, with their problem and its end.
 
     Attributes:
@@ -260,23 +258,24 @@ def compared_part(every: Subproblem) -> Subproblem:
     there = np.zeros(points + len(observations.curves), dtype=bool)
     there[sights.point_rows] = there[points + sights.curve_rows] = True
     view = column_of(observations, "view")
-    chosen = _some_views(np.bincount(view[there], minlength=len(observations.views)))
+    chosen = np.zeros(len(observations.views), dtype=bool)
+    chosen[some_views(np.bincount(view[there], minlength=len(chosen)), _MOST_ASKED, _FEWEST_ASKED)] = True
     for groups in every.kinds:
         gone = mostly_rejected(groups, every.end, there)
         worst = np.argsort(-gone, kind="stable")[: min(most_rejected, np.count_nonzero(gone))]
-        chosen |= views_compared(observations, groups, every.end, there, groups.among(worst) & there)
+        chosen |= views_compared(groups, every.end, there, groups.among(worst) & there)
     there &= chosen[view]
     rows = np.flatnonzero(there)[:: max(1, int(np.count_nonzero(there)) // (2 * _MOST_ASKED))]
     return _part(every, rows, int(np.searchsorted(rows, points)))
 
 
-def _some_views(counts: Indices) -> Mask:
-    """(V,) some of the views that show anything, evenly: as many as hold what is asked, and no fewer than a few."""
+def some_views(counts: Indices, most: int, fewest: int) -> Indices:
+    """Numbers of some of the views that show anything, so many observations (V,) each, evenly: as many as hold what is
+    asked, and no fewer than a few.
+    """
     shown = np.flatnonzero(counts)
-    most = min(max(_FEWEST_ASKED, len(shown) * _MOST_ASKED // int(counts.sum())), len(shown))
-    chosen = np.zeros(len(counts), dtype=bool)
-    chosen[shown[np.linspace(0, len(shown) - 1, most).astype(np.int64)]] = True
-    return chosen
+    taken = min(max(fewest, len(shown) * most // int(counts.sum())), len(shown))
+    return np.asarray(shown[np.linspace(0, len(shown) - 1, taken).astype(np.int64)])
 
 
 def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
@@ -294,29 +293,25 @@ def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
 # ---- what is compared ----------------------------------------------------------------------------------------------
 
 
-def rows_compared(
-    observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
-) -> Mask:
+def rows_compared(groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask) -> Mask:
     """(N + M,) of some views, and of each group in them some.
 
     Args:
         taking_part: (N + M,) all that may be. recalled: (N + M,) what is compared whether or not it is an inlier.
     """
-    inside, view = taking_part & (inliers_of(end) | recalled), column_of(observations, "view")
-    rows = np.flatnonzero(inside & views_compared(observations, groups, end, inside, recalled)[view])
+    inside, view = taking_part & (end.inliers.rows | recalled), column_of(groups.observations, "view")
+    rows = np.flatnonzero(inside & views_compared(groups, end, inside, recalled)[view])
     inside[:] = False
-    key = groups.of[rows].astype(np.int64) * len(observations.views) + view[rows]
+    key = groups.of[rows].astype(np.int64) * len(groups.frames) + view[rows]
     inside[_thinned(rows, key, groups.of[rows] >= 0)] = True
     return inside
 
 
-def views_compared(
-    observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask
-) -> Mask:
+def views_compared(groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask) -> Mask:
     """(V,) those with what is recalled, those that stand out, some of the others, and some without any group."""
     most_others = 16  # views besides, which tell the lens
-    view = column_of(observations, "view")
-    shows_some = np.bincount(view[taking_part & (groups.of >= 0)], minlength=len(observations.views))
+    view = column_of(groups.observations, "view")
+    shows_some = np.bincount(view[taking_part & (groups.of >= 0)], minlength=len(groups.frames))
     largest, most = groups.standing_out(end, taking_part), groups.most_views
     with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
     chosen = np.zeros(len(shows_some), dtype=bool)
@@ -328,7 +323,7 @@ def views_compared(
 
 
 def groups_compared(
-    observations: Observations, groups: ObservationGroups, end: RobustSolution, rows: Mask, recalled: Sequence[int]
+    groups: ObservationGroups, end: RobustSolution, rows: Mask, recalled: Sequence[int]
 ) -> tuple[Indices, float]:
     """The numbers of those that have enough of the rows (N + M,), and which share of them that is.
 
@@ -338,31 +333,26 @@ def groups_compared(
     every = np.flatnonzero(groups.count(rows) >= FEWEST)
     if len(every) <= most_together:
         return every, 1.0
-    standing_out = every[np.argsort(-excess(observations, groups, end, rows)[every], kind="stable")]
+    standing_out = every[np.argsort(-excess(groups, end, rows)[every], kind="stable")]
     some = every[:: -(-2 * len(every) // most_together)]
     back = np.intersect1d(every, np.array(recalled, dtype=np.int64))
     chosen = distinct(np.concatenate([back, standing_out[: most_together // 2], some]))
     return chosen, len(chosen) / len(every)
 
 
-def inliers_of(end: RobustSolution) -> Mask:
-    """(N + M,) the observations that take part."""
-    return np.concatenate([end.inliers.points, end.inliers.curves])
-
-
 def mostly_rejected(groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Indices:
     """(size,) how many observations of each group are outliers, where most of them are; else 0."""
-    counts, used = groups.count(taking_part), groups.count(inliers_of(end) & taking_part)
+    counts, used = groups.count(taking_part), groups.count(end.inliers.rows & taking_part)
     return np.where((counts > FEWEST) & (used < _LEFT * counts), counts - used, 0)
 
 
-def excess(observations: Observations, groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Array:
+def excess(groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Array:
     """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
     median one.
     """
     lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
-    points, size = len(observations.points), groups.size + 1
-    of = np.where(inliers_of(end) & taking_part & (groups.of >= 0), groups.of, np.int64(groups.size))
+    points, size = len(groups.observations.points), groups.size + 1
+    of = np.where(end.inliers.rows & taking_part & (groups.of >= 0), groups.of, np.int64(groups.size))
     spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
     square = np.bincount(of, lengths**2, minlength=size)
     spare[-1] = square[-1] = 0.0  # of what is in none

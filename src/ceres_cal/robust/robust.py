@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Generic, Self, TypeVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Indices, numerical
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.effects.smoothness import with_smoothness
 from ceres_cal.observations import Observations
@@ -32,8 +32,7 @@ MOST_ROUNDS = 15
 AT_REST, AT_REST_AGAIN = 1e-2, 1e-5
 
 
-@dataclass(frozen=True, eq=False)
-class RobustSolution:
+class RobustSolution(Frozen):
     """Where a round ended, and where all of them did.
 
     Attributes:

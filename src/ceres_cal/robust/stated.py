@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.base.words import two_digits
 from ceres_cal.observations import Observations
@@ -67,8 +68,7 @@ class WaldTest(NamedTuple):
     sigmas: float
 
 
-@dataclass(frozen=True, eq=False)
-class Statement:
+class Statement(Frozen):
     """Priors on the same numbers, or numbers that are held (no prior)."""
 
     kind: str

@@ -193,7 +193,7 @@ def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
 
 def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterator[str]:
     """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
-    used = np.concatenate([inliers.points, inliers.curves])
+    used = inliers.rows
     for rows in wholes:
         used |= rows
     shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])

@@ -7,7 +7,6 @@ how much it misses: `error_px`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, make_lens
@@ -41,8 +41,7 @@ _GRID = (41, 31)  # pixels of the image over which a fit is made
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
 
 
-@dataclass(frozen=True, eq=False)
-class ForeignCamera:
+class ForeignCamera(Frozen):
     """A camera in the words of others.
 
     Attributes:
@@ -136,10 +135,10 @@ class ForeignCamera:
         with np.errstate(all="ignore"):
             if self.distort is not None:
                 places = self.distort(rays)
-            elif (lens := self.lens) is not None and lens.kind == KannalaBrandt.kind:
-                places = lens.distort(rays, 1.0)
             else:
-                places = _opencv(rays, self.coefficients)
+                lens = self.lens
+                assert lens is not None  # else it came with its own map
+                places = lens.unlimited(rays) if isinstance(lens, Brown) else lens.distort(rays, 1.0)
         return np.asarray(places * self.focal + self.centre)
 
     # ---- fitted ------------------------------------------------------------------------------------------------------
@@ -235,21 +234,6 @@ def lens_fitted(
         return None
     intrinsics = {"phi": float(end[0]), "aspect": float(end[1]), "principal_point": _two(end[2:4]), "lens": model}
     return {"image_size": foreign.image_size, **intrinsics}, _error(project(end), pixels)
-
-
-def _opencv(rays: Array, coefficients: Sequence[float]) -> Array:
-    """OpenCV's model with up to 12 coefficients, on places (x/z, y/z)."""
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (*coefficients, *[0.0] * (12 - len(coefficients)))
-    depth = np.where(rays[:, 2] > 0.0, rays[:, 2], np.nan)
-    x, y = rays[:, 0] / depth, rays[:, 1] / depth
-    r2 = x * x + y * y
-    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.column_stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + r2 * s4),
-        ]
-    )
 
 
 def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> Array:

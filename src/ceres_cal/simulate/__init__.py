@@ -27,5 +27,4 @@ from ceres_cal.simulate.simulation import CLEAN as CLEAN
 from ceres_cal.simulate.simulation import OUTLIER as OUTLIER
 from ceres_cal.simulate.simulation import WRONG_LABEL as WRONG_LABEL
 from ceres_cal.simulate.simulation import Simulation as Simulation
-from ceres_cal.simulate.simulation import Truth as Truth
 from ceres_cal.simulate.simulation import simulate as simulate

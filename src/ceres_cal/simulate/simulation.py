@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.observations import Curves, Observations, Points, View, joined, taken
 from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve
+from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve, is_crossing
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.crossings import is_crossing
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
+class Truth(Frozen):
     """What the rows of the points or of the curves of a simulation show in truth.
 
     Attributes:
@@ -37,8 +35,7 @@ class Truth:
         return np.flatnonzero(self.flag == flag)
 
 
-@dataclass(frozen=True, eq=False)
-class Simulation:
+class Simulation(Frozen):
     """Observations of a scene, and their truth row by row."""
 
     scene: Scene
@@ -49,8 +46,7 @@ class Simulation:
     curves: Truth
 
 
-@dataclass(frozen=True, eq=False)
-class _InView:
+class _InView(Frozen):
     """The N places on a target that a plan's camera can see: what all frames of the plan choose from.
 
     `position_m` is the place along the plan's curves laid end to end, and ascends; `neighbour` is the curve next to the

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
 from ceres_cal.kernels import plane_homographies
@@ -159,8 +160,7 @@ def ring_profile(measured_radius: Array, ring_radius: Array, unit_px: float) -> 
     return RadialProfile(tuple(float(c / kappa) for c in rest), unit_px), float(kappa)
 
 
-@dataclass(frozen=True, eq=False)
-class PlaneData:
+class PlaneData(Frozen):
     """Points of several sights of one camera, one sight after the other.
 
     Attributes:
@@ -342,8 +342,7 @@ def edge_over(camera: Camera, reach_px: float) -> float:
     return margin * max(1.0, camera.corner_radius / reach_px)
 
 
-@dataclass(frozen=True, eq=False)
-class LensProfile:
+class LensProfile(Frozen):
     """What a lens does: the angles (n,), rad, to the axis of what it shows at radii (n,), px, as far as was seen."""
 
     radii_px: Array

@@ -7,7 +7,6 @@ into stations and placements. Nothing here is the answer: the bundle is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, numerical
 from ceres_cal.base.errors import attempt
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
@@ -22,7 +22,6 @@ from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     RADII,
@@ -42,8 +41,7 @@ _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 
 
-@dataclass(frozen=True)
-class Start:
+class Start(Frozen):
     """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess".
 
     Attributes:
@@ -96,7 +94,7 @@ def _left(observations: Observations, sights: Sights, start: Start) -> float:
 def _initialised(observations: Observations, sights: Sights, options: Options) -> Start:
     posed = posed_sights(observations, sights, options)
     stations, placements = chained_poses(observations, sights, posed.numbers, posed.poses, open_numbers=posed.open)
-    structure = make_structure(observations.targets, options.tolerances, options.dimensions)
+    structure = options.structure_of(observations.targets)
     estimate = Estimate(posed.cameras, stations, placements, structure)
     others = tuple(
         replace(
@@ -109,8 +107,7 @@ def _initialised(observations: Observations, sights: Sights, options: Options) -
     return Start(estimate, posed.phi_from, others=others)
 
 
-@dataclass(frozen=True, eq=False)
-class PosedSights:
+class PosedSights(Frozen):
     """Cameras and the sights that they were posed by.
 
     Attributes:

@@ -7,12 +7,12 @@ against wrong labels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.base.errors import or_none
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.native import kept_signals
 from ceres_cal.observations import joined
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
@@ -39,8 +39,7 @@ _SUSPICIOUS = 8.0
 _NO_FIT = 0.01
 
 
-@dataclass(frozen=True, eq=False)
-class PlaneSight:
+class PlaneSight(Frozen):
     """A sight's observations on its plane z = height_m: points, and lines with the pixel that is seen on each.
 
     Attributes:
@@ -104,8 +103,7 @@ def _usual_height(sight: Sights, level: Mask) -> float:
     return float(heights[np.argmax(votes)]) if len(heights) else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Homographies:
+class Homographies(Frozen):
     """The homographies that a camera's sights determine.
 
     Attributes:

@@ -9,11 +9,11 @@ moments agree on is taken.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, median
+from ceres_cal.base.arrays import median
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.observations import Observations, View
 from ceres_cal.observations.sights import SightKey, gather_sights
@@ -24,8 +24,7 @@ from ceres_cal.start.initialise import posed_sights
 _START = Options(lens="radial")
 
 
-@dataclass(frozen=True)
-class Labels:
+class Labels(Frozen):
     """What was said of the labels.
 
     Attributes:
@@ -142,7 +141,8 @@ def _relabelled(observations: Observations, key: SightKey, turn: Pose) -> Observ
     for number, view in _views_of(observations, key):
         places = observations.targets[view.target].point_array
         rows = np.flatnonzero(points.view == number)
-        feature[rows] = _nearest(turn.inverse.transform(places[points.feature[rows]]), places)
+        sought = turn.inverse.transform(places[points.feature[rows]])
+        feature[rows] = np.argmin(np.linalg.norm(sought[:, None] - places, axis=2), axis=1)
     return replace(observations, points=replace(points, feature=feature))
 
 
@@ -150,7 +150,3 @@ def _views_of(observations: Observations, key: SightKey) -> Iterator[tuple[int, 
     for number, view in enumerate(observations.views):
         if SightKey(view.camera, view.station, view.placement) == key:
             yield number, view
-
-
-def _nearest(sought: Array, places: Array) -> Indices:
-    return np.asarray(np.argmin(np.linalg.norm(sought[:, None] - places, axis=2), axis=1))

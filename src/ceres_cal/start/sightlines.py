@@ -8,11 +8,10 @@ normal n that for arcs depends on d; over the length of its derivative by p it i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.transforms import skews
 
@@ -20,8 +19,7 @@ _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(Frozen):
     """K cameras that may be: frame_from_cam (K, 3, 3), position (K, 3) m, logarithm of phi in px (K,), and one more
     coefficient of w, of r squared (K,).
     """
@@ -60,8 +58,7 @@ class Candidates:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Sightlines:
+class Sightlines(Frozen):
     """Of N observations: points first, twice each (their rows in x, then those in y), then lines, then arcs.
 
     Attributes:

@@ -6,12 +6,12 @@ Poses of sights become stations and placements.
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
@@ -32,8 +32,7 @@ _APART = 0.05  # rad, and of the height: places that are nearer are one minimum
 _NAMES = ("direction", "direction", "direction", "x", "y", "height", "phi", "lens")
 
 
-@dataclass(frozen=True, eq=False)
-class CameraPlace:
+class CameraPlace(Frozen):
     """Where a camera stands, by one sight.
 
     Attributes:
@@ -45,8 +44,7 @@ class CameraPlace:
     profile: RadialProfile
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
+class Placed(Frozen):
     """The places that a sight may be seen from, the likeliest first.
 
     Attributes:

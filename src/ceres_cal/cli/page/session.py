@@ -10,13 +10,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.base.files import make_folder
 from ceres_cal.base.words import frame_of, mm
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.cli.page.state import Change, Commands, Drag, Made, Sitting, State, load_state, save_state, target_words
+from ceres_cal.cli.files import read_target
+from ceres_cal.cli.open_steps import make
+from ceres_cal.cli.page.state import Change, Drag, Made, Sitting, State, load_state, save_state, target_words
 from ceres_cal.detect.photographs import by_hand, check_photographs
 from ceres_cal.detect.photographs.clicks import FEWEST
 from ceres_cal.detect.photographs.facing import distinguishing_feature
@@ -55,9 +58,8 @@ class _Moment:
 class Session:
     """What the page works on. One thread at a time changes it: `lock` is held meanwhile."""
 
-    def __init__(self, sitting: Sitting, commands: Commands, state: State) -> None:
+    def __init__(self, sitting: Sitting, state: State) -> None:
         self.sitting: Sitting = sitting
-        self.commands: Commands = commands
         self.lock: Any = threading.RLock()
         self.revision: int = 0
         self.message: str = ""
@@ -98,7 +100,7 @@ class Session:
         if text not in self._targets:
             if not (text == self.sitting.target or text in targets_by_name() or text.startswith("{")):
                 raise InputError(f"the field {text!r} was not named on the command line, and is none of the list")
-            self._targets[text] = self.commands.target(text)
+            self._targets[text] = read_target(text, "field")
         return self._targets[text]
 
     def _base(self, target: Target) -> Camera:
@@ -182,7 +184,7 @@ class Session:
         moment = self._now
         target = self.target(moment.state)
         with tempfile.TemporaryDirectory(prefix="ceres-cal-") as folder:
-            made = self.commands.make(moment.state, target, Path(folder), auto=auto, known=None)
+            made = make(self.sitting, moment.state, target, Path(folder), auto=auto)
             observations = combine([Observations.load(Path(folder) / name) for name in made.observed])
             calibration = Calibration.load(made.calibration)
             found = Found(calibration, observations, known_of(quality_of(calibration, observations)))
@@ -199,7 +201,7 @@ class Session:
         if moment.made is None:
             raise InputError("find the lines first: there is no calibration to be written yet")
         target, folder = self.target(moment.state), make_folder(self.sitting.folder)
-        made = self.commands.make(moment.state, target, folder, auto=moment.auto, known=moment.made)
+        made = make(self.sitting, moment.state, target, folder, auto=moment.auto, known=moment.made)
         with self.lock:
             self.written, self.message = made.typed, ""
             self.revision += 1
@@ -328,8 +330,7 @@ class Session:
         return {one.name: _lines(model_of(found.calibration, one)) for one in frames if one.shown}
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
+class Found(Struct, frozen=True, eq=False):
     """What came of "find the lines"; `known`: what is said of it."""
 
     calibration: Calibration
@@ -367,10 +368,10 @@ def _about(target: Target, words: str) -> dict[str, Any]:
     }
 
 
-def opened(sitting: Sitting, commands: Commands, first: State) -> Session:
+def opened(sitting: Sitting, first: State) -> Session:
     """The session of a folder: what was kept there goes on, unless the command line says another field."""
     kept = sitting.folder / KEPT
     state = load_state(kept) if kept.exists() else first
     if first.target and first.target != state.target:
         state = first
-    return Session(sitting, commands, state)
+    return Session(sitting, state)

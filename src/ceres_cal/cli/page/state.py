@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta, Struct
@@ -75,8 +74,7 @@ class State(Struct, frozen=True, forbid_unknown_fields=True):
     exports: Annotated[tuple[Name, ...], FEW] = ()
 
 
-@dataclass(frozen=True)
-class Sitting:
+class Sitting(Struct, frozen=True):
     """What does not change while the page is open.
 
     Attributes:
@@ -93,8 +91,7 @@ class Sitting:
     other: Path | None = None
 
 
-@dataclass(frozen=True)
-class Made:
+class Made(Struct, frozen=True):
     """What the commands made of a state.
 
     Attributes:
@@ -105,21 +102,6 @@ class Made:
     observed: Mapping[str, bytes]
     calibration: Path
     boards: tuple[Path, ...] = ()
-
-
-class Commands(Protocol):
-    """How the page comes to answers: they are the commands'."""
-
-    def target(self, text: str) -> Target:
-        """The target of `--target`."""
-
-    def make(self, state: State, target: Target | None, folder: Path, *, auto: bool, known: Made | None) -> Made:
-        """Detect and calibrate into a folder.
-
-        Args:
-            auto: without a start. known: what was made before of this state: its observations are written again, and a
-                report and exports, too.
-        """
 
 
 class Change(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="change"):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.detect.photographs.candidates import (
     BUDGET_S,
     FieldSearch,
@@ -71,8 +72,7 @@ class SeveralWaysError(InputError):
         self.seen = seen
 
 
-@dataclass(frozen=True, eq=False)
-class SearchResult:
+class SearchResult(Frozen):
     """What came of looking for the field.
 
     Attributes:

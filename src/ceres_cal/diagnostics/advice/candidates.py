@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.diagnostics.advice.outlook import Outlook
 from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior
@@ -36,8 +36,7 @@ _MARKED = 1.1
 _NEARER = ("upper", "right", "lower", "left")  # the edge that leans towards the camera, by quarter turns
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
+class Measurement(Frozen):
     """What to measure besides what was observed.
 
     Attributes:
@@ -77,8 +76,7 @@ def together(parts: Sequence[Measurement], words: str) -> Measurement:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
+class Ground(Frozen):
     """What a measurement would add to.
 
     Attributes:
@@ -139,8 +137,7 @@ def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[Vi
 # ---- the best of each kind ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class CandidateSearch:
+class CandidateSearch(Frozen):
     """Where the best of each kind is looked for.
 
     Attributes:

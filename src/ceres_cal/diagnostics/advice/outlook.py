@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.spread import Spread
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
@@ -20,16 +20,14 @@ from ceres_cal.problem.quantities import moved
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`posterior.assess` leaves it there)
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
+class Errors(Frozen):
     """Largest and mean standard deviation of located points over what the image shows, mm; infinite where unknown."""
 
     worst_mm: float
     mean_mm: float
 
 
-@dataclass(frozen=True, eq=False)
-class Outlook:
+class Outlook(Frozen):
     """One station at one height.
 
     Attributes:

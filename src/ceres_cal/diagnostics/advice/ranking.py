@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.threads import single_threaded_blas
@@ -34,8 +34,7 @@ the best's, and what it takes off smaller by no more than the second share of th
 _MUST_LEAVE = 0.9
 
 
-@dataclass(frozen=True, eq=False)
-class Promise:
+class Promise(Frozen):
     """What one measurement would bring.
 
     Attributes:
@@ -60,8 +59,7 @@ class Promise:
         return min(worst), max(worst)
 
 
-@dataclass(frozen=True, eq=False)
-class Advice:
+class Advice(Frozen):
     """Measurements and their promises, the one that leaves the smallest worst error first.
 
     Attributes:

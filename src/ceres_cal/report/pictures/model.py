@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.transforms import Pose
@@ -16,16 +16,14 @@ from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
-class CurveOutline:
+class CurveOutline(Struct, frozen=True, eq=False):
     """One curve: its middle (S, 2) px, NaN where the camera does not show it, and both edges of wide paint."""
 
     middle: Array
     edges: tuple[Array, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Model:
+class Model(Struct, frozen=True, eq=False):
     """What is drawn into a photograph of `image_size`: lines, and points (N, 2) px."""
 
     image_size: tuple[int, int]

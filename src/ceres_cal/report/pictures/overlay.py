@@ -8,10 +8,10 @@ Where in a photograph something is that should be measured.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Image, Image8, Indices32, Mask
 from ceres_cal.detect.photographs.followed import Followed
@@ -45,8 +45,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
 
 
-@dataclass(frozen=True, eq=False)
-class Layer:
+class Layer(Struct, frozen=True, eq=False):
     """A model in one of COLOURS; its label stands in the legend."""
 
     model: Model
@@ -54,8 +53,7 @@ class Layer:
     colour: str
 
 
-@dataclass(frozen=True, eq=False)
-class Marks:
+class Marks(Struct, frozen=True, eq=False):
     """Observed pixels (N, 2) in one of COLOURS, with what they are; dots, or crosses for what was taken out."""
 
     pixels: Array

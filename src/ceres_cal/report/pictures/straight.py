@@ -6,9 +6,8 @@ and what lies far off the axis is stretched ever more: therefore an angle of vie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
@@ -23,8 +22,7 @@ _GRID, _ROUNDS, _SHRINK = 9, 24, 0.6
 _ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms
 
 
-@dataclass(frozen=True, eq=False)
-class Straight:
+class Straight(Struct, frozen=True, eq=False):
     """How photographs of one camera are straightened.
 
     Attributes:
@@ -122,8 +120,7 @@ def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
 # ---- what a photograph shows of the plane at depth 1 ----------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _ShownRegion:
+class _ShownRegion(Struct, frozen=True, eq=False):
     """The part of the plane at depth 1 that a photograph shows, without holes.
 
     Attributes:

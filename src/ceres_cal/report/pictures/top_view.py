@@ -5,9 +5,8 @@ x points right and y up, as on the field's drawing. What stands higher or lower 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
@@ -16,8 +15,7 @@ from ceres_cal.report.pictures.warp import Warp, make_warp, require_size
 from ceres_cal.scene.camera import Camera
 
 
-@dataclass(frozen=True)
-class TopViewGrid:
+class TopViewGrid(Struct, frozen=True):
     """What part of which plane a top view shows, and how large.
 
     Attributes:

@@ -7,10 +7,10 @@ outermost pixels; a new pixel that looks past that, or at what the camera has no
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Array32, Image, Mask
 from ceres_cal.base.errors import InputError
@@ -20,8 +20,7 @@ Plane = Array32
 MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767
 
 
-@dataclass(frozen=True, eq=False)
-class Warp:
+class Warp(Struct, frozen=True, eq=False):
     """Where in the photograph the pixels of a new picture lie.
 
     Where many pixels of the photograph fall into one of the picture, that one is the mean over `fine` x `fine` small

@@ -206,9 +206,14 @@ class Lens(ABC):
         return np.asarray(np.hypot(offsets[:, 0], offsets[:, 1]) <= self.monotone_radius(phi))
 
     @property
+    def lengths(self) -> tuple[int, ...]:
+        """The power of px that each coefficient's unit is; 0 of what acts on directions."""
+        return tuple(1 - order if self.acts_on_pixels else 0 for order in self.orders)
+
+    @property
     def units(self) -> tuple[str, ...]:
         """The unit of each coefficient."""
-        return tuple(f"px^{1 - order}" if self.acts_on_pixels and order != 1 else "1" for order in self.orders)
+        return tuple({0: "1", 1: "px"}.get(power, f"px^{power}") for power in self.lengths)
 
     @property
     def formula(self) -> str:
@@ -222,14 +227,12 @@ class Lens(ABC):
 
     def scales(self, unit_px: float) -> Array:
         """What to multiply each coefficient with so that it is of order one, for the solver (design, section 4)."""
-        if not self.acts_on_pixels:
-            return np.ones(len(self.names))
-        return np.asarray(float(unit_px) ** (np.asarray(self.orders) - 1.0))
+        return np.asarray(float(unit_px) ** -np.array(self.lengths, dtype=float))
 
     def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
         """The size of each coefficient that moves a pixel `unit_px` from the middle by as much."""
-        radius = unit_px if self.acts_on_pixels else unit_px / phi
-        return [radius ** (1 - order) for order in self.orders]
+        each = zip(self.lengths, self.orders, strict=True)
+        return [unit_px**power if power else (unit_px / phi) ** (1 - order) for power, order in each]
 
     def spanning(self, angle: float, phi: float, beyond: float, image_size: tuple[int, int]) -> Lens:
         """The model made for a picture of this size that is seen up to an angle, and `beyond` times as far in pixels;

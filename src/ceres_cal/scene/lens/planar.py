@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, Protocol
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.scene.lens.base import Lens
 
@@ -66,8 +66,7 @@ class Profile(Protocol):
     def slope(self, x: Array) -> Array: ...
 
 
-@dataclass(frozen=True, eq=False)
-class Ratio:
+class Ratio(Frozen):
     """p(x) / q(x): a profile of two polynomials, lowest power first, q(0) = 1; without the second, p alone.
 
     Attributes:
@@ -217,6 +216,10 @@ class Planar(Lens):
         if not self._is_round:
             flat = self._within(self._newton(flat, measured))
         return self._lifted(flat * (unit / phi))
+
+    def unlimited(self, rays: Array) -> Array:
+        """Where rays (N, 3) are measured, (N, 2) at focal length 1, also past the limit, where the map has folded."""
+        return self._map(self._flat(rays))
 
     def _newton(self, start: Array, measured: Array) -> Array:
         """Points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""

@@ -56,15 +56,8 @@ class Radial(Lens):
         return (*self.powers, *(2 for _ in self.names_of_terms))
 
     @property
-    def units(self) -> tuple[str, ...]:
-        return (*(f"px^{1 - power}" for power in self.powers), *("1" for _ in self.names_of_terms))
-
-    def scales(self, unit_px: float) -> Array:
-        of_powers = float(unit_px) ** (np.array(self.powers) - 1.0)
-        return np.append(of_powers, np.ones(len(self.names_of_terms)))
-
-    def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
-        return [*(unit_px ** (1 - power) for power in self.powers), *(phi / unit_px for _ in self.names_of_terms)]
+    def lengths(self) -> tuple[int, ...]:
+        return (*(1 - power for power in self.powers), *(0 for _ in self.names_of_terms))
 
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Radial:

@@ -123,11 +123,7 @@ class Spline(Planar):
 
     @property
     def orders(self) -> tuple[int, ...]:
-        return (0,) * len(self.names)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return tuple("1" if name in EXTENTS else "px" for name in self.names)
+        return tuple(1 if name in EXTENTS else 0 for name in self.names)
 
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Spline:
@@ -150,12 +146,6 @@ class Spline(Planar):
     @property
     def nodes(self) -> frozenset[str]:
         return frozenset(NODES) if self.terms else frozenset()
-
-    def scales(self, unit_px: float) -> Array:
-        return np.array([1.0 if name in EXTENTS else 1.0 / unit_px for name in self.names])
-
-    def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
-        return [1.0 if name in EXTENTS else unit_px for name in self.names]
 
     # ---- its start and its roughness ---------------------------------------------------------------------------------
 

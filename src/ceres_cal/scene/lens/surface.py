@@ -11,13 +11,13 @@ Quintic B-splines along a radius, with value and slope 0 at the axis and straigh
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, median
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 
 INTERVALS, DEGREE = 8, 5
@@ -82,8 +82,7 @@ def bending() -> Array:
     return np.asarray(rows.T @ rows / (2.0 * INTERVALS))
 
 
-@dataclass(frozen=True, eq=False)
-class Growth:
+class Growth(Frozen):
     """The profile u + G(u) in rims."""
 
     along: Array

@@ -11,8 +11,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.base.typed import checked
-from ceres_cal.scene.curves import Arc, Curve, Segment, xyz
-from ceres_cal.scene.targets.crossings import with_crossings
+from ceres_cal.scene.curves import Arc, Curve, Segment, with_crossings, xyz
 from ceres_cal.scene.targets.target import Target, TargetKind, require_places
 
 

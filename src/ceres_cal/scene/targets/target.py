@@ -6,7 +6,6 @@ What a printed target looks like: its sheet of paper, and what is on it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from inspect import signature
 from typing import Any, ClassVar
@@ -18,9 +17,9 @@ from msgspec import Struct
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.lazy import cached_property
-from ceres_cal.scene.curves import Arc, Curve, along_curve
-from ceres_cal.scene.targets.crossings import aliases
+from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
 class Square(Struct, frozen=True):
@@ -98,8 +97,7 @@ class Grid(Struct, frozen=True):
     checkered: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
+class Target(Frozen):
     """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
 
     Attributes:

@@ -1,0 +1,35 @@
+"""Frozen data: classes of annotated fields, given once, that are equal to themselves alone."""
+
+from __future__ import annotations
+
+from dataclasses import Field, FrozenInstanceError, dataclass
+from dataclasses import field as field
+from dataclasses import replace as replace
+from typing import Any, ClassVar, dataclass_transform
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
+class Frozen:
+    """A dataclass whose instances do not change and are not compared by what they hold, which may be arrays.
+
+    What `dataclass(frozen=True, eq=False)` writes for each class anew stands here once: a class is made four times as
+    fast, and hundreds are made before a command begins.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls, *, kw_only: bool = False, **others: Any) -> None:
+        super().__init_subclass__(**others)
+        dataclass(repr=False, eq=False, kw_only=kw_only)(cls)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in self.__dict__ or name not in self.__dataclass_fields__:
+            raise FrozenInstanceError(f"cannot assign to field {name!r}")
+        self.__dict__[name] = value
+
+    def __delattr__(self, name: str) -> None:
+        raise FrozenInstanceError(f"cannot delete field {name!r}")
+
+    def __repr__(self) -> str:
+        held = ", ".join(f"{name}={self.__dict__[name]!r}" for name in self.__dataclass_fields__)
+        return f"{type(self).__qualname__}({held})"

@@ -1,0 +1,62 @@
+"""Frozen data: what is given once does not change, and is equal to itself alone."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import FrozenInstanceError, fields
+
+import numpy as np
+import pytest
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.lazy import cached_property
+
+
+class Ring(Frozen):
+    """A ring."""
+
+    places: Array
+    name: str = "ring"
+    notes: list[str] = field(default_factory=list)
+
+    @cached_property
+    def size(self) -> int:
+        return len(self.places)
+
+
+class Coloured(Ring, kw_only=True):
+    """With a number that is given by name."""
+
+    colour: int
+
+
+def test_what_is_given_does_not_change() -> None:
+    ring = Ring(np.zeros(3))
+    for name in ("places", "name", "size", "other"):
+        with pytest.raises(FrozenInstanceError, match=name):
+            setattr(ring, name, None)
+        with pytest.raises(FrozenInstanceError, match=name):
+            delattr(ring, name)
+    assert ring.size == 3
+    assert ring.name == "ring"
+    assert not ring.notes
+
+
+def test_it_is_equal_to_itself_alone() -> None:
+    ring = Ring(np.zeros(3))
+    assert ring == ring
+    assert ring != replace(ring)
+    assert len({ring, replace(ring)}) == 2
+
+
+def test_it_is_a_dataclass_to_everybody() -> None:
+    ring = Coloured(np.zeros(2), "red", colour=1)
+    assert [one.name for one in fields(ring)] == ["places", "name", "notes", "colour"]
+    assert replace(ring, colour=2).colour == 2
+    assert repr(ring) == "Coloured(places=array([0., 0.]), name='red', notes=[], colour=1)"
+    for again in (copy.copy(ring), pickle.loads(pickle.dumps(ring))):
+        assert (again.name, again.colour, again.size) == ("red", 1, 2)
+    with pytest.raises(TypeError, match="colour"):
+        Coloured(np.zeros(2))  # type: ignore[call-arg]
