@@ -109,7 +109,7 @@ def known_photographs(folder: Path) -> list[Known]:
 
 
 def shared_rows(folders: Iterable[Path]) -> Iterator[Row]:
-    """Every photograph without a start and from four rough clicks; other fields must be refused, not trusted, or solved for."""
+    """Every photograph without a start and from four rough clicks; other fields are refused, not trusted, or right."""
     every = [shown for folder in folders for shown in known_photographs(folder)]
     asked = [(shown, how) for shown in every for how in shown.ways]
     found: dict[str, list[Outcome]] = {}
