@@ -74,7 +74,7 @@ class _Fields(Frozen):
     """Makes each class below it a frozen dataclass, whose fields are given by name."""
 
     def __init_subclass__(cls) -> None:
-        super().__init_subclass__(kw_only=True)
+        super().__init_subclass__(eq=True, kw_only=True)
 
 
 class Arguments(_Fields):
