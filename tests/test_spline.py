@@ -202,7 +202,7 @@ def test_where_nothing_was_seen_nothing_is_known() -> None:
 
 
 def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
-    calibration = solved("brown", 0.0)
+    calibration = solved("brown-rational", 0.0)
     calibration.save(tmp_path / "a.json")
     loaded = Calibration.load(tmp_path / "a.json")
     assert loaded.cameras == calibration.cameras and loaded.options == calibration.options
@@ -212,7 +212,7 @@ def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
 
 def test_how_smooth_it_is_needs_no_options() -> None:
     """Advice poses problems without any: its command ended in an unknown lens."""
-    calibration, observations = solved("brown", 0.0), seen("brown", 0.0).observations
+    calibration, observations = solved("brown-rational", 0.0), seen("brown-rational", 0.0).observations
     problem = Problem(gather_sights(observations), make_layout(observations, calibration.options))
     (camera,) = calibration.cameras.values()
     assert len(problem.priors_at(calibration.estimate)) == len(camera.lens.roughness) > 0
