@@ -230,9 +230,11 @@ def test_a_refit_of_it_contradicts_nothing() -> None:
 
 @pytest.mark.usefixtures("real_data")
 def test_a_real_fisheye_to_93_degrees() -> None:
-    """BabelCalib's OV-plane: kannala-brandt leaves 0.482 px of its training views, plain least squares."""
+    """A third of BabelCalib's OV-plane: kannala-brandt leaves 0.212 px of these views, plain least squares."""
     plain = Options(lens="spline", powers=(2, 3), free_aspect=True, loss="trivial", reject_sigma=1e9)
-    assert calibrate(ov_plane("train"), plain).fit.points_rms_px < 0.472  # measured 0.468
+    every = ov_plane("train")
+    few = every.part(every.points.view % 3 == 0, np.zeros(len(every.curves), dtype=bool))
+    assert calibrate(few, plain).fit.points_rms_px < 0.19  # measured 0.182
 
 
 def test_what_is_finer_than_its_knots_is_named() -> None:
