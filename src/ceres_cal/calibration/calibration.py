@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
@@ -56,8 +56,7 @@ _ALIKE = (
 """What the file has as it is."""
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(Frozen):
     """Calibrated cameras and where they stood.
 
     Attributes:

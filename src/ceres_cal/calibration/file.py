@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PixelOrigin, Units, convert
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.base.version import __version__
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
@@ -162,8 +163,7 @@ class Fit:
         return float((total / max(self.points + self.curves, 1)) ** 0.5)
 
 
-@dataclass(frozen=True, eq=False)
-class Refitted:
+class Refitted(Frozen):
     """How a calibration came from an earlier one.
 
     Attributes:

@@ -12,10 +12,7 @@ from ceres_cal.cli.command import COMMANDS, Arguments, Command, Parser, argument
 from ceres_cal.report.document import Document, Section
 
 _FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
-_EXAMPLES = (
-    "bash > ~/.local/share/bash-completion/completions/ceres-cal",
-    "zsh > ~/.zfunc/_ceres-cal",
-)
+_EXAMPLES = ("bash > ~/.local/share/bash-completion/completions/ceres-cal", "zsh > ~/.zfunc/_ceres-cal")
 
 
 class CompletionArguments(Arguments):

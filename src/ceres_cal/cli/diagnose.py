@@ -20,7 +20,7 @@ class DiagnoseArguments(arguments.ReportArguments):
     new_data: bool = switch("the observations are others than those it was made from")
     held_out: bool = switch(
         "also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
-        "lens predicts best",
+        "lens predicts best"
     )
     strict: bool = switch("exit with 1 for any finding, also one that does no harm")
     folds: int = option(

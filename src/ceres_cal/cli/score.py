@@ -21,7 +21,7 @@ class ScoreArguments(Arguments):
     calibration: Path = calibration_argument()
     observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together")
     hold_stations: bool = switch(
-        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
+        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too"
     )
     loss: Loss | None = option("default: the calibration's")
     reject_sigma: float | None = option(

@@ -207,13 +207,7 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     from ceres_cal.scene.files import camera_to_json
 
     name, station, camera = _camera(args, calibration)
-    straight = straighten(
-        camera,
-        whole=args.whole,
-        size=args.size,
-        phi=args.phi,
-        angle_deg=args.angle,
-    )
+    straight = straighten(camera, whole=args.whole, size=args.size, phi=args.phi, angle_deg=args.angle)
     facts = {
         "camera": name,
         "station": station,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import (
     LEAST_BLUR_PX,
@@ -26,8 +26,7 @@ _WINDOWS = 150  # that tell a blur
 _SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
 
 
-@dataclass(frozen=True, eq=False)
-class Blur:
+class Blur(Frozen):
     """What makes the lines wider at N places.
 
     Attributes:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, along_curve, along_track, curve_points, nearest_on_curve
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
-class Course:
+class Course(Frozen):
     """N places on painted curves as the camera should see them, curve after curve and in order along each.
 
     Attributes:

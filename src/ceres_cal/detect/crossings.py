@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.scene.camera import Camera, in_image
@@ -18,8 +17,7 @@ from ceres_cal.scene.targets import Target
 _AS_STATED = 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class Crossings:
+class Crossings(Frozen):
     """Points of a target as their branches tell.
 
     Attributes:
@@ -33,8 +31,7 @@ class Crossings:
     used: Mask
 
 
-@dataclass(frozen=True, eq=False)
-class _Branch:
+class _Branch(Frozen):
     """A curve at a point: its normal in the image, how far along it the paint lies, its variance, its places."""
 
     normal: Array

@@ -6,12 +6,11 @@ does not look like paint of that width, or does not go on as its neighbours do, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.detect.blur import blur_of, no_blur, with_coma
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
@@ -52,8 +51,7 @@ _APART = 3
 _SCATTER_PX = np.concatenate([[0.0], np.geomspace(0.002, 1.0, 60)])
 
 
-@dataclass(frozen=True, eq=False)
-class Lines:
+class Lines(Frozen):
     """What was measured of a course.
 
     Attributes:
@@ -204,15 +202,7 @@ def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | fl
     offset, sigma = offset - aside, np.hypot(np.hypot(fits.sigma_px, drawn), remains)
     sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
     found = _goes_on(course, found, offset, sigma)
-    return Lines(
-        course,
-        found,
-        np.where(found, offset, np.nan),
-        sigma,
-        contrast,
-        blur.usual_px,
-        blur.stretch,
-    )
+    return Lines(course, found, np.where(found, offset, np.nan), sigma, contrast, blur.usual_px, blur.stretch)
 
 
 def _window_px(course: Course, beyond_px: float) -> Array:

@@ -8,7 +8,6 @@ offset.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32, Image
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import most_bytes
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.images import light
 
 MOST_PICTURES = 25
@@ -31,8 +31,7 @@ _BAND, _EVERY = 64, 31  # rows worked on at once; pixels apart that tell the noi
 _NEAR = 3.0  # times the noise
 
 
-@dataclass(frozen=True, eq=False)
-class Merged:
+class Merged(Frozen):
     """One picture of several.
 
     Attributes:
@@ -121,8 +120,7 @@ def _sharpness(grey: Image) -> float:
     return float(np.mean(np.asarray(cv2.Laplacian(_smooth(grey), cv2.CV_32F)) ** 2))
 
 
-@dataclass(frozen=True, eq=False)
-class _Reference:
+class _Reference(Frozen):
     """A picture at its clearest pixels.
 
     Attributes:

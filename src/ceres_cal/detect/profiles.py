@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Mask
+from ceres_cal.base.frozen import Frozen
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
@@ -37,8 +38,7 @@ _STEPS = 6
 _TINY = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Windows:
+class Windows(Frozen):
     """Pixels around N places.
 
     Attributes:
@@ -56,8 +56,7 @@ class Windows:
         return Windows(self.values[rows], self.distance[rows], self.inside[rows])
 
 
-@dataclass(frozen=True, eq=False)
-class Profiles:
+class Profiles(Frozen):
     """What fits the windows of N places best.
 
     Attributes:
@@ -233,8 +232,7 @@ def normal_step(x: Array) -> tuple[Array, Array]:
 # ---- least squares over many small problems -------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Steps:
+class _Steps(Frozen):
     """Steps at `edges` (N, E) beside each c, blurred by `blur` (N,), smeared over `smear` (N,) px that `lean` (N,)."""
 
     edges: Array

@@ -5,13 +5,13 @@ A photograph is reduced to how near each pixel is to something thin and bright; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 
 import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.courses import Course
 
 _REDUCED = 4
@@ -19,8 +19,7 @@ _NEAR_PX = 8.0
 _TURNS_DEG = np.arange(-7.5, 7.6, 1.25)
 
 
-@dataclass(frozen=True, eq=False)
-class Nearness:
+class Nearness(Frozen):
     """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, `reduced` times smaller."""
 
     plane: Array32

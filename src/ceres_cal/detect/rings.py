@@ -8,7 +8,6 @@ edge (a shadow, a hand) does not shift the count of those beyond it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,6 +15,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profiles, fit_shape
@@ -43,8 +43,7 @@ _FAR = 5.0
 _MOST_MISFIT = 0.004
 
 
-@dataclass(frozen=True, eq=False)
-class RingsDetection:
+class RingsDetection(Frozen):
     """What `detect_rings` found.
 
     Attributes:
@@ -97,8 +96,7 @@ def detect_rings(
 # ---- following ring after ring --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Track:
+class _Track(Frozen):
     """A ring's edge around the centre: its radius over the angle as a Fourier series, and which way it steps."""
 
     series: Array
@@ -215,8 +213,7 @@ def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], ex
 # ---- measuring ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Edges:
+class _Edges(Frozen):
     """Measured edges: number of the ring (from 0), pixels (N, 2), sigma_px (N,), radius from the centre (N,) px."""
 
     ring: Indices32

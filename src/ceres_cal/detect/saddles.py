@@ -25,13 +25,12 @@ flat the board is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Mask, medians_known
+from ceres_cal.base.frozen import Frozen
 
 REACH = 0.6
 """Radius of the disc around a corner as a part of the distance to the next edges: further, they would be in it."""
@@ -52,8 +51,7 @@ _BLUR = 0.8  # sharpness times the standard deviation of a Gaussian blur: tanh t
 _SHARP, _CONTRAST, _LEFT, _FITTED = 4, 8, 11, 14
 
 
-@dataclass(frozen=True, eq=False)
-class Saddles:
+class Saddles(Frozen):
     """Measured corners of one board.
 
     Attributes:

@@ -6,12 +6,11 @@ across is most negative, at its sub-pixel top. What is connected and straight ov
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.images import negative
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
@@ -41,8 +40,7 @@ _BORDER_PX = 3
 _GAP_PX, _DENSE = 3, 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class Strokes:
+class Strokes(Frozen):
     """N strokes: their ends (N, 2, 2) px and how bright a ridge each is (N,), in grey levels per px squared."""
 
     ends: Array
@@ -128,8 +126,7 @@ def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, in
     return np.asarray(np.median(plane[y, x], axis=0), float)
 
 
-@dataclass(frozen=True, eq=False)
-class _Ridge:
+class _Ridge(Frozen):
     """Points on ridges: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
 
     pixels: Array

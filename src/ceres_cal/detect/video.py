@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,6 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, require_room, write_bytes
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.detect.images import encoded
 
@@ -19,8 +19,7 @@ MOST_FRAMES = 200_000
 """Of a video, an hour and a half: each has to be passed over."""
 
 
-@dataclass(frozen=True, eq=False)
-class Video:
+class Video(Frozen):
     """A video that OpenCV can read, and how many frames it has, as it says or, where it does not, as were counted."""
 
     path: Path

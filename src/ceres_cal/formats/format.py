@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, write_bytes
+from ceres_cal.base.frozen import Frozen, field, replace
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -33,8 +34,7 @@ class ExportLoss(Struct, frozen=True):
     image_px: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Exported:
+class Exported(Frozen):
     """A calibration in a format.
 
     Attributes:
@@ -159,8 +159,7 @@ class ImportFormat(Struct, frozen=True):
     options: type[Any] = NoOptions
 
 
-@dataclass(frozen=True, eq=False)
-class ImportedCameras:
+class ImportedCameras(Frozen):
     """What a file of cameras says.
 
     Attributes:

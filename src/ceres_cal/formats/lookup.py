@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
@@ -40,8 +41,7 @@ _COLUMNS: dict[str, Column] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class LookupTable:
+class LookupTable(Frozen):
     """Where on the field the nodes of a grid over the image look.
 
     Attributes:

@@ -21,11 +21,7 @@ Box = tuple[Array, Array]
 
 
 def field_error_mm(
-    camera: Camera,
-    locate: Callable[[Array, float], Array],
-    pixels: Array,
-    box_m: Box,
-    heights_m: Sequence[float],
+    camera: Camera, locate: Callable[[Array, float], Array], pixels: Array, box_m: Box, heights_m: Sequence[float]
 ) -> dict[float, tuple[float, float]]:
     """height_m -> root mean square and largest error of located pixels, mm.
 

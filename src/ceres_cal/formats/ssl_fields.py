@@ -24,13 +24,7 @@ _SIZES = {  # of the message: the target's
     "goal_center_to_penalty_mark": "goal_center_to_penalty_mark_m",
 }
 _A_LENGTH_MM = 10500  # between divisions B and A
-_RULES = {
-    "goal_depth": 180,
-    "goal_height": 155,
-    "boundary_width": 300,
-    "ball_radius": 21.5,
-    "max_robot_radius": 90.0,
-}
+_RULES = {"goal_depth": 180, "goal_height": 155, "boundary_width": 300, "ball_radius": 21.5, "max_robot_radius": 90.0}
 _SHAPES = "CenterCircle TopTouchLine BottomTouchLine LeftGoalLine RightGoalLine HalfwayLine CenterLine"
 _PENALTY = "LeftPenalty RightPenalty LeftFieldLeftPenalty LeftFieldRightPenalty RightFieldLeftPenalty"
 _TYPES = {*_SHAPES.split(), *(f"{name}Stretch" for name in f"{_PENALTY} RightFieldRightPenalty".split())}

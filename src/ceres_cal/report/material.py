@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, attempt
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -50,7 +50,6 @@ class FramePhotographs(Struct, frozen=True, eq=False):
     before: Calibration | None = None
 
 
-@dataclass(frozen=True, eq=False)
 class Material(Quality):
     """A calibration, observations, what the residuals between them say, and what was asked for besides.
 

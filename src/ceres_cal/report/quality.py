@@ -6,7 +6,6 @@ By how much what is named as wrong with the model moves a result: places on the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -14,6 +13,7 @@ from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, attempt
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
@@ -114,8 +114,7 @@ def quality_of(calibration: Calibration, observations: Observations) -> Quality:
     return Quality(calibration, observations, found)
 
 
-@dataclass(frozen=True, eq=False)
-class Quality:
+class Quality(Frozen):
     """A calibration, the observations beside it, and how well it is known.
 
     Attributes:

@@ -9,12 +9,12 @@ dimensions that are others: a spike and slab prior (Mitchell and Beauchamp, JASA
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects
@@ -44,8 +44,7 @@ _MOST_MISFIT = 6.0
 _APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
 
 
-@dataclass(frozen=True, eq=False)
-class FieldAsBuilt:
+class FieldAsBuilt(Frozen):
     """What explains best how curves lie.
 
     Attributes:
@@ -179,8 +178,7 @@ def _curve_of(name: str) -> str:
     return name.partition("/")[2].partition(".")[0]
 
 
-@dataclass(frozen=True, eq=False)
-class _CurveNumbers:
+class _CurveNumbers(Frozen):
     """What is left of the curves' Q numbers once the camera followed, and what moves them.
 
     Attributes:

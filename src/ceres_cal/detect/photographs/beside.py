@@ -7,12 +7,12 @@ them apart: for every choice a camera is solved for, and hardly more than one fi
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Mask, median
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import peaks
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observations_of, refit_camera
@@ -26,8 +26,7 @@ _LEAST = 0.35  # of a curve's places, those on a line that runs along it
 _MOST_BESIDE, _MOST_CHOICES = 3, 48
 
 
-@dataclass(frozen=True, eq=False)
-class _PaintLine:
+class _PaintLine(Frozen):
     """Paint that runs along a curve: rows of the course, and where paint is from there, px along the normal."""
 
     rows: Indices

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.errors import answer_or_reason
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.photographs.clicks import FEWEST, Clicks, starts_from_clicks, unknown_optics
 from ceres_cal.detect.photographs.refit import NOTHING, ROBUST, PointHints, observations_of, refit_camera
@@ -27,8 +27,7 @@ _FREED = ((8, ("phi",)), (12, ("phi", "a3")), (24, ("phi", "a3", "cx", "cy")), (
 _AGAINST = 4.0  # standard deviations of a hand by which a click contradicts the others
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
+class Shown(Frozen):
     """What somebody showed, as rows.
 
     Attributes:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
 from itertools import product
 from time import thread_time
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array32
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
@@ -45,8 +45,7 @@ field is asked for, whose lines fit in ever more places, the search took more th
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
-@dataclass(frozen=True, eq=False)
-class FieldSearch:
+class FieldSearch(Frozen):
     """A photograph and the target that it may show.
 
     Attributes:

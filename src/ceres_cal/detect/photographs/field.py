@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import CalibrationError, InputError, NothingShownError, attempt, naming, or_none
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.base.threads import single_threaded_blas
@@ -43,8 +44,7 @@ _FIELD_M = 500.0
 _SAME_PLACE_PX = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class FieldDetections:
+class FieldDetections(Frozen):
     """What `detect_field` found.
 
     Attributes:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines
@@ -21,8 +20,7 @@ _LEAST_IF_WORN = 0.3
 _ABSENT, _MOST_ABSENT = 0.2, 0.08
 
 
-@dataclass(frozen=True, eq=False)
-class Followed:
+class Followed(Frozen):
     """A field's lines as they were followed.
 
     Attributes:

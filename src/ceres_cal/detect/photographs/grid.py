@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.scene.curves import Arc, Segment, curve_points
 from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Target
@@ -19,8 +19,7 @@ _OUTLINE = 300
 _SHORT = 0.015  # of the length of all straight lines: what is shorter is no line to find the target by
 
 
-@dataclass(frozen=True, eq=False)
-class LineGrid:
+class LineGrid(Frozen):
     """A target's lines in its main direction and across.
 
     Attributes:
@@ -49,8 +48,7 @@ class LineGrid:
         return places_along(self, _OUTLINE).grid
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
+class Places(Frozen):
     """Places (P, 2) along the painted curves in the grid's frame; `first` (P,) is 1 where a curve begins."""
 
     grid: Array

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.photographs.candidates import FieldSearch
 from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
@@ -130,8 +129,7 @@ def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = Fal
     return float(np.average(on_it[strong], weights=strokes.length_px[inside][strong]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Parallel:
+class _Parallel(Frozen):
     """The N strokes on the floor, in the grid: their middles (N, 2), half a pixel there (N,), whether they run along
     its lines, or across, (N,) each, and between which corners (2, 2) the target lies.
     """

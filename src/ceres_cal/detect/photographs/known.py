@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.calibration import Calibration
@@ -22,8 +22,7 @@ from ceres_cal.scene.targets import Target
 _REACH = f"{FAR_PX:.0f} px or 5 degrees"
 
 
-@dataclass(frozen=True, eq=False)
-class KnownDetections:
+class KnownDetections(Frozen):
     """What `detect_known` found.
 
     Attributes:

@@ -8,12 +8,12 @@ floor whose z points up, and a rotation mirrors nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from math import gcd
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.detect.photographs.grid import LineGrid, Places, places_along
 from ceres_cal.detect.photographs.upright import Upright
@@ -36,8 +36,7 @@ CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run 
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
 
-@dataclass(frozen=True, eq=False)
-class Match:
+class Match(Frozen):
     """A hypothesis: how good it is, and the camera's place (3,) and turn (3, 3) camera from target."""
 
     score: float
@@ -45,8 +44,7 @@ class Match:
     rotation: Array
 
 
-@dataclass(frozen=True, eq=False)
-class StrokeMap:
+class StrokeMap(Frozen):
     """The strokes of a photograph, how near each pixel is to them, and the lens's centre (2,) px."""
 
     strokes: Strokes
@@ -97,8 +95,7 @@ def divergence(share: Array | float, other: Array | float) -> Array:
     return np.asarray(share * np.log(share / other) + (1.0 - share) * np.log((1.0 - share) / (1.0 - other)))
 
 
-@dataclass(frozen=True, eq=False)
-class FloorLines:
+class FloorLines(Frozen):
     """Where lines lie on the floor, in increasing order: x of those that run along y, and y of those along x.
 
     In camera heights from the place below the camera.
@@ -162,10 +159,7 @@ def _hypotheses(lines: FloorLines, grid: LineGrid) -> Array:
     x, y = lines.x, lines.y
     height_y, place_y = _pairs(y, grid.along)
     height_x, place_x = _pairs(x, grid.across)
-    parts = [
-        _crossed(height_y, place_y, x, grid.across)[:, [0, 2, 1]],
-        _crossed(height_x, place_x, y, grid.along),
-    ]
+    parts = [_crossed(height_y, place_y, x, grid.across)[:, [0, 2, 1]], _crossed(height_x, place_x, y, grid.along)]
     every = np.concatenate(parts)
     every = every[every[:, 0] > 0.0]
     cells = np.column_stack([np.log(every[:, 0]), every[:, 1:] / every[:, :1]]) / _CELL

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.errors import or_none
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.bundle import solve
@@ -26,8 +25,7 @@ _QUICK = Options(max_iterations=30, threads=1)
 ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
-@dataclass(frozen=True, eq=False)
-class PointHints:
+class PointHints(Frozen):
     """What somebody showed: points by their index (P,) among the target's, pixels (P, 2), sigma_px (P,), and places
     (N, 2) px of curves (N,), with sigmas (N,).
     """
@@ -40,8 +38,7 @@ class PointHints:
     place_sigma_px: Array = field(default_factory=lambda: NOTHING[2])
 
 
-@dataclass(frozen=True, eq=False)
-class FreeIntrinsics:
+class FreeIntrinsics(Frozen):
     """What of the camera, and of the target, a photograph may change besides the pose.
 
     Attributes:

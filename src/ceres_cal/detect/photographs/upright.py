@@ -11,11 +11,10 @@ that straightens them. Of a floor that is seen from straight above no line tells
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
@@ -42,8 +41,7 @@ _FROM_EACH, _REFINED = 2, 14  # of each lens and focal length, and of all
 _APART = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Upright:
+class Upright(Frozen):
     """One answer.
 
     Attributes:

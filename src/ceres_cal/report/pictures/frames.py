@@ -112,10 +112,7 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     here = [np.isin(columns.view, frame.views) for columns in both]
     pixels = np.concatenate([columns.pixels[rows] for columns, rows in zip(both, here, strict=True)])
     used = np.concatenate([mask[rows] for mask, rows in zip(inliers, here, strict=True)])
-    marks = (
-        Marks(pixels[used], "observed", "used"),
-        Marks(pixels[~used], "taken out", "taken out", crosses=True),
-    )
+    marks = (Marks(pixels[used], "observed", "used"), Marks(pixels[~used], "taken out", "taken out", crosses=True))
     return tuple(one for one in marks if len(one.pixels))
 
 
