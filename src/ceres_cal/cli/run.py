@@ -92,7 +92,8 @@ def _require_fitting(args: RunArguments) -> None:
     if args.target is None and args.board is None:
         raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
     COMMANDS["calibrate"].parse(["observations.json", "--lens", args.lens])
-    field = require_shown(args.target, args.board, args.prior, args.camera, args.lens)
+    images, _ = images_and_videos(args.images)
+    field = require_shown(images, args.target, args.board, args.prior, args.camera, args.lens)
     if field is not None:
         lengths = arguments.parse_estimates(args.estimate, {"field": field})
         sides = dict(map(arguments.parse_facing, args.facing))

@@ -94,17 +94,6 @@ def approach(
     return next(_Tracker(grey, target, curves, free, reached=reached, rest_px=_NEARLY_PX).tried([camera]))
 
 
-def look_again(
-    grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics
-) -> Followed:
-    """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen, or in a
-    picture that was stretched.
-    """
-    tracker = _Tracker(grey, target, curves, free)
-    told = tracker.told(seen)
-    return told if told.is_field else tracker.as_drawn(tracker.squared(seen))
-
-
 def refine(
     grey: Array32,
     target: Target,
@@ -113,8 +102,8 @@ def refine(
     free: FreeIntrinsics,
     lacking: Sequence[tuple[str, ...]] = (),
 ) -> Followed:
-    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside; where that
-    looks like another field, the one that is drawn in a picture that was stretched.
+    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside, as drawn
+    next to where lines were followed that look like another field's, or in a picture that was stretched.
 
     Args:
         lacking: parts that this field is known to lack.
@@ -258,14 +247,13 @@ class _Tracker:
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
     def told(self, followed: Followed) -> Followed:
-        """The same refined, with square pixels; unless these suit clearly worse, another field too, and the one that is
-        drawn is there in a picture that was stretched one way.
+        """The same refined, with square pixels; unless these suit clearly worse, by other dimensions as well, than the
+        field in a picture that was stretched one way.
         """
         square = self.squared(followed)
         if self._suits_worse(square, followed):
             stretched = self.refined(followed)
-            is_drawn = stretched.is_field and not stretched.built.dimensions
-            if is_drawn and self._suits_worse(self._with(square).as_built(square)[1], stretched):
+            if stretched.is_field and self._suits_worse(self._with(square).as_built(square)[1], stretched):
                 return stretched
         return self.refined(square)
 
