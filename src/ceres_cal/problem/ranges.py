@@ -7,12 +7,12 @@ A range is wide: what lies beyond is impossible, not unusual. Whatever lies with
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance, dimensions_of
@@ -28,8 +28,7 @@ _FINEST = 1e-6
 it is solved for without loss; at a ten-thousandth the solve no longer converges."""
 
 
-@dataclass(frozen=True)
-class Range:
+class Range(Frozen, eq=True):
     """What a number of one kind can be.
 
     Attributes:
