@@ -26,6 +26,13 @@ class Ring(Frozen):
         return len(self.places)
 
 
+class Size(Frozen, eq=True):
+    """A size."""
+
+    width: int
+    height: int = 1
+
+
 class Coloured(Ring, kw_only=True):
     """With a number that is given by name."""
 
@@ -49,6 +56,11 @@ def test_it_is_equal_to_itself_alone() -> None:
     assert ring == ring
     assert ring != replace(ring)
     assert len({ring, replace(ring)}) == 2
+
+
+def test_or_by_what_it_holds() -> None:
+    assert Size(2) == Size(2, 1) != Size(2, 2)
+    assert {Size(2): "a"}[Size(2, 1)] == "a"
 
 
 def test_it_is_a_dataclass_to_everybody() -> None:

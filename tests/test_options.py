@@ -9,6 +9,7 @@ from typing import Any, Literal
 import pytest
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.cli.arguments import ReportArguments, length
 from ceres_cal.cli.calibrate import CalibrateArguments
 from ceres_cal.cli.command import (
@@ -126,7 +127,7 @@ def test_the_help_says_the_default_and_what_may_be_repeated() -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_argument_of_a_command_is_described_where_it_is_defined(name: str) -> None:
     kind = COMMANDS[name].arguments
-    assert issubclass(kind, Arguments) and kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
+    assert issubclass(kind, Arguments) and issubclass(kind, Frozen)
     parser = argparse.ArgumentParser()
     add_options(parser, kind)
     helps = {action.dest: action.help for action in parser._actions}

@@ -15,6 +15,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.cli.command import COMMANDS, flag
 from ceres_cal.detect import images, video
+from ceres_cal.detect.photographs import field
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import ssl_field
@@ -202,6 +203,21 @@ def test_before_anything_is_searched(
     code = main([*command.split(), *words, *output])
     out, err = capsys.readouterr()
     assert code == 2 and out == "" and err.count("\n") == 1 and said in err, err
+
+
+@pytest.mark.parametrize("command", ["run", "open"])
+def test_a_focal_length_in_mm_is_refused_by_the_size_of_the_picture(
+    command: str,
+    names: dict[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One photograph is read, and nothing is searched."""
+    monkeypatch.setattr(field, "_looked_for", None)
+    ask = [names["PHOTO"], "--target", "ssl-b", "--prior", "phi=4.2:0.1", "-o", str(tmp_path / "made")]
+    assert main([command, *ask]) == 2
+    assert "the prior on phi is 4.2 px, but it is at least 40 px" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", WRONG)

@@ -16,6 +16,7 @@ from ceres_cal.cli.run import _short
 from ceres_cal.detect.video import sharpest_frames
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "ssl_field"
+PHOTOGRAPH = str(SAMPLE / "photographs" / "0001.jpg")
 FIELD = ("--target", "ssl-b", "--facing", "LeftGoalLine=top")
 
 
@@ -62,7 +63,7 @@ def test_what_cannot_be_trusted_is_not_exported_and_advice_may_fail(
         raise SolutionError("no advice can be given")
 
     monkeypatch.setattr("ceres_cal.diagnostics.advice.advise", fails)
-    wrong = ("--prior", "height_m=3:5mm", "--to", "paper", "-o", str(tmp_path))
+    wrong = ("--lens", "radial", "--prior", "height_m=3:5mm", "--to", "paper", "-o", str(tmp_path))
     assert main(["run", str(photographs / "0001.jpg"), *FIELD, *wrong]) == 1
     said = capsys.readouterr()
     assert "error     no advice: no advice can be given\n" in said.out
@@ -95,9 +96,9 @@ def test_boards_alone_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[s
     "arguments, words",
     [
         (("x.jpg",), "say what the photographs show: --target ssl-b, --board 9x6x25mm, or both"),
-        (("x.jpg", "--board", "9x6"), "board '9x6': write COLUMNSxROWSxSQUARE"),
+        ((PHOTOGRAPH, "--board", "9x6"), "board '9x6': write COLUMNSxROWSxSQUARE"),
         (("x.jpg", "--target", "ssl-b"), "x.jpg: no such file"),
-        (("x.jpg", "--target", "ssl-b", "--to", "atlantis"), "there is no export format 'atlantis'"),
+        ((PHOTOGRAPH, "--target", "ssl-b", "--to", "atlantis"), "there is no export format 'atlantis'"),
     ],
 )
 def test_wrong_usage(

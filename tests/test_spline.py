@@ -202,7 +202,7 @@ def test_where_nothing_was_seen_nothing_is_known() -> None:
 
 
 def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
-    calibration = solved("brown", 0.0)
+    calibration = solved("brown-rational", 0.0)
     calibration.save(tmp_path / "a.json")
     loaded = Calibration.load(tmp_path / "a.json")
     assert loaded.cameras == calibration.cameras and loaded.options == calibration.options
@@ -212,7 +212,7 @@ def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
 
 def test_how_smooth_it_is_needs_no_options() -> None:
     """Advice poses problems without any: its command ended in an unknown lens."""
-    calibration, observations = solved("brown", 0.0), seen("brown", 0.0).observations
+    calibration, observations = solved("brown-rational", 0.0), seen("brown-rational", 0.0).observations
     problem = Problem(gather_sights(observations), make_layout(observations, calibration.options))
     (camera,) = calibration.cameras.values()
     assert len(problem.priors_at(calibration.estimate)) == len(camera.lens.roughness) > 0
@@ -230,9 +230,11 @@ def test_a_refit_of_it_contradicts_nothing() -> None:
 
 @pytest.mark.usefixtures("real_data")
 def test_a_real_fisheye_to_93_degrees() -> None:
-    """BabelCalib's OV-plane: kannala-brandt leaves 0.482 px of its training views, plain least squares."""
+    """A third of BabelCalib's OV-plane: kannala-brandt leaves 0.212 px of these views, plain least squares."""
     plain = Options(lens="spline", powers=(2, 3), free_aspect=True, loss="trivial", reject_sigma=1e9)
-    assert calibrate(ov_plane("train"), plain).fit.points_rms_px < 0.472  # measured 0.468
+    every = ov_plane("train")
+    few = every.part(every.points.view % 3 == 0, np.zeros(len(every.curves), dtype=bool))
+    assert calibrate(few, plain).fit.points_rms_px < 0.19  # measured 0.182
 
 
 def test_what_is_finer_than_its_knots_is_named() -> None:

@@ -29,6 +29,7 @@ from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import problem_of
 from ceres_cal.problem.ranges import require_possible_numbers
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT, make_structure
 from ceres_cal.robust.as_built import AS_DRAWN, Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
@@ -163,11 +164,14 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)
-    if calibration.as_built and not chosen.built.every:
-        # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone.
+    too_few = chosen.choice.share < 1.0 and _asks_for_more(calibration, observations, sights)
+    if too_few or (calibration.as_built and not chosen.built.every):
+        # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
+        # all views leave in the same places need not show in the few of them that lenses were compared by.
         near = replace(calibration.estimate, structure=EXACT)
         before, anew = chosen, replace(start, estimate=near)
-        chosen = choose_lens(observations, options, anew, Built(calibration.as_built, calibration.estimate.structure))
+        built = Built(calibration.as_built, calibration.estimate.structure)
+        chosen = choose_lens(observations, options, anew, built, by_most=too_few)
         if chosen.choice.chosen != before.choice.chosen:
             calibration, chosen = chosen.first_solved(solved, papers(options), start)
     said = []
@@ -186,6 +190,20 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
             said.append(f"other lenses could not be compared, so {without}: {others.failed}")
     warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]), *said)
     return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
+
+
+def _asks_for_more(calibration: Calibration, observations: Observations, sights: Sights) -> bool:
+    """Whether views of placements agree on what the lens leaves in the same places: lines of a floor that are painted
+    aside do so before a camera that stands still.
+    """
+    from ceres_cal.posterior.other_lenses import LeftOver
+
+    placed = np.array([key.placement is not None for key in sights.keys])
+    if not placed.any():
+        return False
+    seen = sights.take(np.flatnonzero(placed)).used(*calibration.inlier_masks(observations))
+    there = residuals(observations, sights, calibration.estimate)
+    return LeftOver.of(seen, there, calibration.fit.scales, calibration.estimate).asks_for_more
 
 
 def _part(bulk: Bulk, options: Options) -> Subset:

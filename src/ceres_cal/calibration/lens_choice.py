@@ -194,12 +194,15 @@ class Comparison:
         return _compared(self.seen, self.share, self.as_good, self.start, others)
 
 
-def choose_lens(observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN) -> Chosen:
+def choose_lens(
+    observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN, *, by_most: bool = False
+) -> Chosen:
     """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
 
     Args:
         options: their lens is not looked at. start: of everything, with whatever lens.
         built: how targets were found to be built; where nothing is given that is found, too.
+        by_most: whether most of the observations are asked, not some of them, which left what goes together.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
@@ -209,8 +212,8 @@ def choose_lens(observations: Observations, options: Options, start: Start, buil
     )
 
     def compared() -> Chosen:
-        seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built)
-        return _among(seen, share, as_good, start, kinds).outcome
+        seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built, by_most=by_most)
+        return _among(seen, share, as_good, start, kinds, is_asked=by_most).outcome
 
     chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
     if isinstance(chosen, CalibrationError):
@@ -243,7 +246,9 @@ def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candida
     return [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
 
 
-def _among(seen: InlierRows, share: float, as_good: float, start: Start, kinds: Sequence[Kind]) -> Comparison:
+def _among(
+    seen: InlierRows, share: float, as_good: float, start: Start, kinds: Sequence[Kind], *, is_asked: bool
+) -> Comparison:
     """The paper's lens, where it gives an answer, and the longest of each kind come first: only where it is not as good
     as the best of them are the shorter ones looked at.
     """
@@ -256,7 +261,7 @@ def _among(seen: InlierRows, share: float, as_good: float, start: Start, kinds: 
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
-    more = tuple(last_resort(seen, found.chosen))
+    more = tuple(last_resort(seen, found.chosen, is_asked=is_asked))
     found = replace(found, tried=(*found.tried, *more))
     clearly = next((one for one in more if one.clearly_beats(found.chosen)), None)
     return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)

@@ -92,21 +92,22 @@ _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong va
 
 
 def compared_kinds(
-    observations: Observations, options: Options, start: Estimate, built: Built = AS_DRAWN
+    observations: Observations, options: Options, start: Estimate, built: Built = AS_DRAWN, *, by_most: bool = False
 ) -> tuple[InlierRows, list[Kind], float]:
     """The observations that take part, each kind near its best over them, at the noise of the one that explains the
     most, and their share of all.
 
     Args:
         built: how targets were found to be built; where nothing is given that is found, too.
+        by_most: whether most of the observations take part, up to where that takes long.
 
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
     """
-    least_rows, share, fewest_frames = 1_000, 0.025, 24  # of the observations, how many take part
+    least_rows, most_rows, share, fewest_frames = 1_000, 12_000, 0.025, 24  # of the observations, how many take part
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
-    few = thinned(observations, max(least_rows, int(share * total)), fewest_frames)
+    few = thinned(observations, most_rows if by_most else max(least_rows, int(share * total)), fewest_frames)
     sights = built.held(gather_sights(few), few)
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
@@ -172,15 +173,18 @@ def _noise_px(end: RobustSolution) -> float:
 _TOGETHER = 1.5
 
 
-def last_resort(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:
-    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together.
+def last_resort(seen: InlierRows, chosen: Candidate, *, is_asked: bool = False) -> Iterator[Candidate]:
+    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together, or all
+    observations asked for more than the lens of some.
 
     Not of so few placements that their features are held out one by one: what goes together within each would be
     predicted, too. Nor where some camera has one view, of a floor: a line that is painted aside bends there as by a
     lens.
     """
     views = [len(seen.sights.of_camera(name)) for name in seen.sights.cameras]
-    if min(views) > 1 and not seen.splits_placements and _between_cells(seen, chosen.of) > _TOGETHER:
+    if min(views) == 1 or seen.splits_placements:
+        return
+    if is_asked or _between_cells(seen, chosen.of) > _TOGETHER:
         for forms in without_formula():
             yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
 

@@ -145,7 +145,7 @@ class Candidate:
         """Whether it predicts so much better that a lens which few programs know is worth it."""
         if self.squares is None or other.squares is None or self.fault:
             return False
-        return standard_errors(other.squares, self.squares) > AS_GOOD and self.rms_px < CLEARLY * other.rms_px
+        return standard_errors(other.squares, self.squares) > CLEARLY
 
     @cached_property
     def estimate(self) -> Estimate:

@@ -23,7 +23,7 @@ from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
-from ceres_cal.posterior.other_lenses import AGREES, agreement
+from ceres_cal.posterior.other_lenses import AGREES, LeftOver
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress, Solution
 from ceres_cal.problem.parameters import Estimate, Layout, Options
@@ -272,7 +272,7 @@ def _as_long_as_asked(
     problem, end = _named(problem), replace(end, problem=_named(end.problem))
     longer = replace(options, terms=tuple(options.blank_lens.more_terms))
     may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
-    if may_grow and agreement(end, observations.cameras) > AGREES:
+    if may_grow and LeftOver.of_end(end).in_cells > AGREES:
         near = _seen_longer(end.solution.estimate, longer)
         try_of = problem_of(observations, problem.sights, longer, near)
         # quiet: the lens without these terms stays; what it leaves is diagnosed

@@ -12,11 +12,12 @@ import argparse
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, fields
 from types import NoneType
-from typing import Any, ClassVar, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.lazy import LazyTable
 from ceres_cal.base.words import did_you_mean, sentence
 from ceres_cal.report.document import Document
@@ -69,13 +70,11 @@ def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
-class _Fields:
-    """Makes each class below it a frozen dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+class _Fields(Frozen):
+    """Makes each class below it a frozen dataclass, whose fields are given by name."""
 
     def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, kw_only=True)(cls)
+        super().__init_subclass__(eq=True, kw_only=True)
 
 
 class Arguments(_Fields):
@@ -219,8 +218,7 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}{meant or f': see `{self.prog} --help`'}")
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(Frozen, eq=True):
     """One command.
 
     Attributes:

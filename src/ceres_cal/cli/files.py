@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ceres_cal.diagnostics import Diagnosis
     from ceres_cal.diagnostics.held_out import Choice
     from ceres_cal.observations import Observations
+    from ceres_cal.problem.ranges import Range
     from ceres_cal.report import FramePhotographs
     from ceres_cal.scene.targets import Target
 
@@ -58,27 +59,35 @@ def read_target(text: str, name: str) -> Target:
 
 
 def require_shown(
-    target: str | None, board: str | None, priors: Sequence[str], camera: str, lens: str = "auto"
+    images: Sequence[Path],
+    target: str | None,
+    board: str | None,
+    priors: Sequence[str],
+    camera: str = "camera",
+    lens: str = "auto",
 ) -> Target | None:
-    """The field that photographs are to show; InputError, before any is read, where what is said of it, of the board or
-    of the camera cannot be.
+    """The field that photographs are to show; InputError, before any is searched, where what is said of it, of the
+    board or of the camera cannot be.
     """
+    from ceres_cal.detect.boards import finder_of
+    from ceres_cal.detect.images import read_colour
     from ceres_cal.problem.parameters import Options
-    from ceres_cal.problem.ranges import place_range
+    from ceres_cal.problem.ranges import camera_ranges, place_range
+    from ceres_cal.scene.targets import checkerboard
 
     least = 0.1  # of the picture's diagonal, that a field is large which can be found
     if board is not None:
-        from ceres_cal.detect.boards import finder_of
-        from ceres_cal.scene.targets import checkerboard
-
         finder_of(checkerboard(*parse_board(board)))
     field = None if target is None else read_target(target, "field")
     for prior in parse_priors(priors, {"station": [camera], "camera": [camera]}, Options(lens=lens)):
+        bounds: list[Range] = []
         if field is not None and prior.owner == "station":
-            for value in prior.value:
-                place_range(field.places, least, "a tenth of the picture").require(
-                    value, f"the prior on {prior.quantity}"
-                )
+            bounds = [place_range(field.places, least, "a tenth of the picture")] * len(prior.value)
+        elif images and prior.owner == "camera":
+            height, width = read_colour(images[0]).shape[:2]
+            bounds = list(camera_ranges(prior.quantity, (width, height), None))
+        for bound, value in zip(bounds, prior.value, strict=False):
+            bound.require(value, f"the prior on {prior.quantity}")
     return field
 
 

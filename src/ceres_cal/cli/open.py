@@ -49,9 +49,10 @@ def _run(args: OpenArguments) -> Document:
         import aiohttp  # noqa: F401 what `ceres_cal.cli.page.server` serves with
     except ImportError:
         raise InputError("open needs aiohttp: pip install 'ceres-cal[page]'") from None
-    require_shown(args.target, args.board, args.prior, "camera")
+    require_shown((), args.target, args.board, args.prior)
     require_folder(args.output)
     sitting = _sitting(args)
+    require_shown(sitting.photographs, None, None, args.prior)
     from ceres_cal.cli.page.session import opened
     from ceres_cal.cli.page.state import State
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -34,8 +33,7 @@ LARGER = 1.15
 _FEWEST_PAIRS = 20
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(Frozen, eq=True):
     """The noise of one kind, with the named causes taken off.
 
     Attributes:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,8 +48,7 @@ from ceres_cal.problem.residuals import Residuals
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
 
 
-@dataclass(frozen=True)
-class Correlation:
+class Correlation(Frozen, eq=True):
     """How the errors of one kind of observation go together.
 
     Attributes:
@@ -195,8 +193,7 @@ _LIKELY = 0.5  # probability from which on a cause is named
 _OVER = {"points": "errors are correlated between a target's points", "curves": "errors are correlated along lines"}
 
 
-@dataclass(frozen=True)
-class Dependence:
+class Dependence(Frozen, eq=True):
     """What the residuals say of the errors' dependence.
 
     Attributes:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -34,8 +33,7 @@ SMALL = 0.4
 Wrong = Literal["model", "calibration", "observations"]
 
 
-@dataclass(frozen=True)
-class Amount:
+class Amount(Frozen, eq=True):
     """One number that would mend it: its name, value, standard deviation and unit ("mm", "deg", "px", "")."""
 
     name: str
@@ -49,8 +47,7 @@ def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[
     return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
 
 
-@dataclass(frozen=True)
-class AsBuilt:
+class AsBuilt(Frozen, eq=True):
     """By how much the features of one kind lie off a target's drawing.
 
     Attributes:
@@ -73,8 +70,7 @@ class AsBuilt:
         return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
 
 
-@dataclass(frozen=True)
-class EffectEstimate:
+class EffectEstimate(Frozen, eq=True):
     """A group of an effect that was solved for.
 
     Attributes:
@@ -107,8 +103,7 @@ class ShiftsAt(Protocol):
     ) -> tuple[Sequence[Key], Sequence[Array]]: ...
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(Frozen, eq=True):
     """One cause of what is left over.
 
     Attributes:

@@ -24,7 +24,6 @@ scatter of the others explains (`Offsets`).
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -35,8 +34,7 @@ from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
 
-@dataclass(frozen=True)
-class SizePrior:
+class SizePrior(Frozen, eq=True):
     """What is expected of an effect's size before anything was seen.
 
     Attributes:

@@ -20,7 +20,6 @@ number of views that would say as much if all said the same.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -209,8 +208,7 @@ def _posed(normals: Array) -> Array:
 # ---- how groups scatter ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class GroupScatter:
+class GroupScatter(Frozen, eq=True):
     """How views or placements scatter.
 
     Attributes:

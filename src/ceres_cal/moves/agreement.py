@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -113,8 +112,7 @@ class ImageDifference(Frozen):
         return np.asarray(np.linalg.norm(self.difference_px, axis=2))
 
 
-@dataclass(frozen=True)
-class Misfit:
+class Misfit(Frozen, eq=True):
     """What observations leave.
 
     Attributes:

@@ -172,7 +172,7 @@ def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Pose
 # ---- where a solve is to be judged ----------------------------------------------------------------------------------
 
 
-class RefitVerdict(Frozen):
+class RefitVerdict(Frozen, eq=True):
     """How a solved refit stands to what was known before.
 
     Attributes:

@@ -6,7 +6,6 @@ The same observations under other names: a field turned by half a turn, mirrored
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -70,8 +69,7 @@ LABELS = ("check", "as-given", "turned")
 
 
 @checked_fields
-@dataclass(frozen=True)
-class RefitOptions:
+class RefitOptions(Frozen, eq=True):
     """What a refit takes for granted.
 
     Attributes:

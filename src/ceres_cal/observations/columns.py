@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -20,8 +19,7 @@ from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.typed import checked_fields, take_types
 
 
-@dataclass(frozen=True)
-class View:
+class View(Frozen, eq=True):
     """What one frame shows of one target. `placement` None: the target lies in the world, as a field does."""
 
     frame: str
@@ -36,8 +34,7 @@ PRIOR_OWNERS = ("camera", "station", "target")
 
 
 @checked_fields
-@dataclass(frozen=True)
-class Prior:
+class Prior(Frozen, eq=True):
     """What is known beforehand: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
 
     Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's

@@ -193,8 +193,6 @@ def with_doubts(
 
 def with_roughness(posterior: Posterior, end: RobustSolution, observations: Observations) -> Posterior:
     """Wider by what a lens without a formula leaves in the same places of all views."""
-    if not end.problem.options.blank_lens.roughness:
-        return posterior
     from ceres_cal.posterior.other_lenses import shifts_by_roughness
 
     return posterior.widened(*shifts_by_roughness(end, observations))

@@ -39,7 +39,7 @@ from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.problem.residuals import Equations, equations_of
+from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 
@@ -149,45 +149,70 @@ def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iter
             yield picture_slopes(picture, keys, name), lenses.shifts(name)
 
 
-AGREES = 3.0
-"""From how many standard deviations on a lens leaves something: of one that leaves nothing one in a thousand does."""
+AGREES = 2.5
+"""From how many standard deviations on a lens leaves something: of one that leaves nothing one in 160 does."""
 # Observations on average; cells along the image: some show what is long, many what a surface's nodes do not follow.
 _IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
 
 
-def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> float:
-    """By how many standard deviations sums of residuals over a cell have one sign in all sights; 0 of one sight.
+@dataclass(frozen=True, eq=False)
+class LeftOver:
+    """What a lens leaves of some sights.
 
-    Args:
-        end: of all rounds; what took part is asked. sizes: of the images of each camera, px.
+    Attributes:
+        points, curves: (N, 2), (M,) residuals, in standard deviations. cameras: by name.
     """
-    sights = _some(end)
-    points, curves = _in_sigmas(end, sights)
-    of_points, of_curves = _sight_of(sights.point_bounds), _sight_of(sights.curve_bounds)
-    sight = np.concatenate([of_points, of_points, of_curves])
-    left = np.concatenate([points[:, 0], points[:, 1], curves])
-    return max(_agreement(cells_of(sights, sizes, most), sight, left) for most in (_MOST_CELLS, _FINE_CELLS))
 
+    sights: Sights
+    points: Array
+    curves: Array
+    cameras: Mapping[str, Camera]
 
-def agreement_in_rings(end: RobustSolution) -> float:
-    """The same of sums over rings about the principal point, of what points lie farther out; of cameras the most."""
-    rings = 24  # from the middle to the farthest observation
-    agree, some = 0.0, _some(end)
-    for name, camera in end.solution.estimate.cameras.items():
-        sights = some.of_camera(name)
-        offsets = camera.offsets(sights.pixels)
-        radius = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
-        ring = (rings / np.max(radius, initial=1e-12) * radius).astype(int)
-        outward = np.einsum("ij,ij->i", offsets, _in_sigmas(end, sights)[0]) / radius
-        agree = max(agree, _agreement(ring, _sight_of(sights.point_bounds), outward))
-    return agree
+    @classmethod
+    def of(cls, sights: Sights, there: Residuals, scales: tuple[float, float], estimate: Estimate) -> LeftOver:
+        """At an estimate; of very many equations those of some sights.
 
+        Args:
+            sights: of what took part. scales: of the noise of points and curves, over what is stated.
+        """
+        most_compared = 50_000
+        every = -(-sights.equations // most_compared)
+        some = sights if every <= 1 else sights[::every]
+        points = there.points[some.point_rows] / (scales[0] * some.sigma_px[:, None])
+        return cls(some, points, there.curves[some.curve_rows] / (scales[1] * some.curve_sigma_px), estimate.cameras)
 
-def _some(end: RobustSolution) -> Sights:
-    most_compared = 50_000  # of more, those of some sights
-    sights = end.problem.sights
-    every = -(-sights.equations // most_compared)
-    return sights if every <= 1 else sights[::every]
+    @classmethod
+    def of_end(cls, end: RobustSolution) -> LeftOver:
+        """At the end of all rounds, of what took part."""
+        return cls.of(end.problem.sights, end.residuals, end.problem.weighting.scales, end.solution.estimate)
+
+    @property
+    def in_cells(self) -> float:
+        """By how many standard deviations sums of residuals over a cell have one sign in all sights; 0 of one sight."""
+        sizes = {name: camera.image_size for name, camera in self.cameras.items()}
+        of_points, of_curves = _sight_of(self.sights.point_bounds), _sight_of(self.sights.curve_bounds)
+        sight = np.concatenate([of_points, of_points, of_curves])
+        left = np.concatenate([self.points[:, 0], self.points[:, 1], self.curves])
+        return max(_agreement(cells_of(self.sights, sizes, most), sight, left) for most in (_MOST_CELLS, _FINE_CELLS))
+
+    @property
+    def in_rings(self) -> float:
+        """The same of sums over rings about the principal point, of how far out points lie; of cameras the most."""
+        rings = 24  # from the middle to the farthest observation
+        agree = 0.0
+        for name, camera in self.cameras.items():
+            own = np.repeat([key.camera == name for key in self.sights.keys], np.diff(self.sights.point_bounds))
+            offsets = camera.offsets(self.sights.pixels[own])
+            radius = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
+            ring = (rings / np.max(radius, initial=1e-12) * radius).astype(int)
+            outward = np.einsum("ij,ij->i", offsets, self.points[own]) / radius
+            agree = max(agree, _agreement(ring, _sight_of(self.sights.point_bounds)[own], outward))
+        return agree
+
+    @property
+    def asks_for_more(self) -> bool:
+        """Whether another lens would leave less in the same places of all sights."""
+        return max(self.in_cells, self.in_rings) > AGREES
 
 
 def _sight_of(bounds: Indices) -> Indices:
@@ -195,13 +220,6 @@ def _sight_of(bounds: Indices) -> Indices:
     most_groups = 200  # of sights: products within one do not count, a half of a percent
     sights = len(bounds) - 1
     return np.repeat(np.arange(sights) * min(sights, most_groups) // max(sights, 1), np.diff(bounds))
-
-
-def _in_sigmas(end: RobustSolution, sights: Sights) -> tuple[Array, Array]:
-    """(N, 2), (M,) residuals of points and curve observations, in standard deviations."""
-    of_points, of_curves = end.problem.weighting.scales
-    points = end.residuals.points[sights.point_rows] / (of_points * sights.sigma_px[:, None])
-    return points, end.residuals.curves[sights.curve_rows] / (of_curves * sights.curve_sigma_px)
 
 
 def _agreement(place: Indices, sight: Indices, left: Array) -> float:
@@ -232,17 +250,16 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
     return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
 
 
-_ALONG, _OVER = (
-    36,
-    (6, 12, 24),
-)  # bumps from the middle to the farthest observation, or along the longer side of the image
+# Bumps from the middle to the farthest observation, and along the longer side of the image: with one size more between
+# them rays are as far off over what is stated, and it takes four times as long.
+_ALONG, _OVER = 36, (7, 21)
 
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
     lenses do to them; none where views do not agree on anything that is left.
     """
-    if max(agreement(end, observations.cameras), agreement_in_rings(end)) <= AGREES:
+    if not LeftOver.of_end(end).asks_for_more:
         return (), ()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     model = _linearised(end, observations, reduced)
@@ -285,13 +302,17 @@ def _shifts_of(model: Linearised, name: str, camera: Camera) -> Array:
 
 
 def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:
-    """(E, Q) px per px of bumps along the radius and over the image, as far as a camera's own equations (E,) reach."""
+    """(E, Q) px per px of bumps along the radius and over the image, as far as a camera's own equations (E,) reach;
+    none so small that most of them have fewer than eight.
+    """
     offsets = camera.offsets(equations.pixel)
     radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     outward = np.sum(equations.direction * offsets * (1.0, camera.aspect), axis=1) / radius
     yield _hats(radius / np.max(radius[own], initial=1e-12) * _ALONG, _ALONG) * outward[:, None]
     for count in _OVER:
         step_px = max(camera.image_size) / count
+        if 2 * _IN_A_CELL * np.prod([side / step_px for side in camera.image_size]) > np.count_nonzero(own):
+            break
         x, y = (_hats(equations.pixel[:, k] / step_px, -int(-camera.image_size[k] // step_px)) for k in (0, 1))
         over = (x[:, :, None] * y[:, None, :]).reshape(len(x), -1)
         yield np.hstack([over * equations.direction[:, axis, None] for axis in (0, 1)])

@@ -6,7 +6,6 @@ How two cameras stand to each other: baseline and angle, with standard deviation
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,8 +26,7 @@ from ceres_cal.scene.targets import Target
 _STEP = 1e-6  # of a number's natural size, either way, for derivatives
 
 
-@dataclass(frozen=True)
-class RigPair:
+class RigPair(Frozen, eq=True):
     """Two stations, and how the second stands to the first.
 
     Attributes:

@@ -7,7 +7,6 @@ it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -43,8 +42,7 @@ _IN_WORDS = 0.3
 _TOGETHER = 0.1
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(Frozen, eq=True):
     """What is known of one number.
 
     Attributes:
@@ -68,8 +66,7 @@ class Verdict:
     factor: float = 1.0
 
 
-@dataclass(frozen=True)
-class WeakDirection:
+class WeakDirection(Frozen, eq=True):
     """A combination of numbers that the observations hardly tell.
 
     Attributes:

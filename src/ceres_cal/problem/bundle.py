@@ -306,12 +306,14 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
 
 def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> Any:
     dense_limit = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
+    dense_blocks = 2000  # of few full blocks: of two with 850 a sparse step takes half a minute, a dense one .1 s
     most_invalid = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in problem.layout.free.values()) + len(assembly.blocks.structure)
-    few = kept + 6 * len(problem.layout.stations) < dense_limit
+    left = kept + 6 * len(problem.layout.stations)
+    few = left < dense_limit
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
-    if few and not assembly.blocks.placements:  # nothing is left to be eliminated
+    if not assembly.blocks.placements and left < dense_blocks:  # nothing is left to be eliminated, and blocks are full
         solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
     solver.max_num_iterations = problem.options.max_iterations
     solver.max_num_consecutive_invalid_steps = most_invalid

@@ -241,7 +241,7 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
-class LengthSums(Frozen):
+class LengthSums(Frozen, eq=True):
     """Number and sum of squares of the lengths within the rejection bound."""
 
     count: int

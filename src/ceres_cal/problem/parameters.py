@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
@@ -37,8 +36,7 @@ LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
 @checked_fields
-@dataclass(frozen=True)
-class Options:
+class Options(Frozen, eq=True):
     """What to solve for and how.
 
     Attributes:
@@ -210,15 +208,14 @@ def with_intrinsics(camera: Camera, vector: Array) -> Camera:
     return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens, skew=float(vector[-1]))
 
 
-@dataclass(frozen=True)
-class Station:
+class Station(Frozen, eq=True):
     """One fixed pose of a camera over the field."""
 
     camera: str
     cam_from_world: Pose
 
 
-class Estimate(Frozen):
+class Estimate(Frozen, eq=True):
     """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
 
     cameras: Mapping[str, Camera]
@@ -275,7 +272,7 @@ class Estimate(Frozen):
         return Poses.of(poses).of_names(names)
 
 
-class Layout(Frozen):
+class Layout(Frozen, eq=True):
     """Which numbers the solver may move.
 
     Attributes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import chain
 from typing import Any, Protocol
 
@@ -24,8 +23,7 @@ from ceres_cal.scene.lens import Lens
 _CONVEX = ("trivial", "huber", "soft_l1")
 
 
-@dataclass(frozen=True)
-class Weighting:
+class Weighting(Frozen, eq=True):
     """How residuals become costs.
 
     Attributes:

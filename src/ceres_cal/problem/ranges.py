@@ -7,12 +7,12 @@ A range is wide: what lies beyond is impossible, not unusual. Whatever lies with
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance, dimensions_of
@@ -28,8 +28,7 @@ _FINEST = 1e-6
 it is solved for without loss; at a ten-thousandth the solve no longer converges."""
 
 
-@dataclass(frozen=True)
-class Range:
+class Range(Frozen, eq=True):
     """What a number of one kind can be.
 
     Attributes:
@@ -95,8 +94,7 @@ def _ranges(prior: Prior, observations: Observations, options: Options) -> Itera
     """The range of each of a prior's numbers."""
     if prior.owner == "camera":
         lens = None if options.lens == "auto" else options.blank_lens
-        names = ("cx", "cy") if prior.quantity == "principal_point" else (prior.quantity,)
-        yield from (_of_camera(name, observations.cameras[prior.name], lens) for name in names)
+        yield from camera_ranges(prior.quantity, observations.cameras[prior.name], lens)
     elif prior.owner == "station":
         yield from [_of_place(prior.name, observations)] * len(prior.value)
     elif prior.dimension:
@@ -105,6 +103,12 @@ def _ranges(prior: Prior, observations: Observations, options: Options) -> Itera
             yield dimension_range(drawn_m)
     elif prior.curve:
         yield Range(0.0, 0.0, "m", _FINEST, "an offset is about 0")
+
+
+def camera_ranges(quantity: str, image_size: tuple[int, int], lens: Lens | None) -> Iterator[Range]:
+    """Of each number of a quantity that a prior on a camera may name."""
+    names = ("cx", "cy") if quantity == "principal_point" else (quantity,)
+    yield from (_of_camera(name, image_size, lens) for name in names)
 
 
 def dimension_range(drawn_m: float) -> Range:

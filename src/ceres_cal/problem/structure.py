@@ -11,7 +11,6 @@ The lengths that targets are drawn by, and how another value of one moves points
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -33,8 +32,7 @@ WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
 """What the warp of a board is made of: see `bends_of`."""
 
 
-@dataclass(frozen=True)
-class Tolerance:
+class Tolerance(Frozen, eq=True):
     """Standard deviations of a target as built; 0 means exactly as drawn.
 
     Attributes:

@@ -15,7 +15,7 @@ together tell, are. The posterior has them under their sigmas like any tolerance
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ from ceres_cal.robust.robust import RobustSolution, judge_at, solve_robustly
 from ceres_cal.scene.targets import Target
 
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
+_STILL = 0.5  # standard deviations by which offsets may still move: what five bows are is known to a hundredth
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +47,13 @@ class Built:
     """How targets are likely built.
 
     Attributes:
-        every: the kinds of features that are not where they are drawn. whole: their likeliest offsets.
+        every: the kinds of features that are not where they are drawn. whole: their likeliest offsets. sd: of these;
+            infinite where nothing was found.
     """
 
     every: tuple[AsBuilt, ...] = ()
     whole: Structure = EXACT
+    sd: Array = field(default_factory=lambda: np.empty(0))
 
     def held(self, sights: Sights, observations: Observations) -> Sights:
         """The sights of targets that are drawn as they are built."""
@@ -93,16 +96,16 @@ def solve_as_built(
         if built.every:
             end, explanations = compete(problem, observations, solved(now), solver)
         return end, problem, explanations, ()
-    before, rounds, change = now, 1, _change(now.every, built.every)
+    before, rounds, change = now, 1, _change(now, built)
     end = solved(before)
-    while change > 2.0 * _AT_REST and rounds < _MOST_ROUNDS:  # the next one is less than half of it
+    while change > 2.0 and rounds < _MOST_ROUNDS:  # the next one is less than half of it
         now = estimate_as_built(problem, observations, _freed(end, problem, freed(before)))
-        change = _change(now.every, before.every) if now.every else 0.0
-        if change > _AT_REST:
+        change = _change(now, before) if now.every else 0.0
+        if change > 1.0:
             before, rounds = now, rounds + 1
             end = solved(before)
     every, structure = before.every, freed(before)
-    if _change(every, built.every) > _AT_REST:
+    if _change(before, built) > 1.0:
         end, explanations = compete(_held(problem, before, observations), observations, end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
@@ -155,12 +158,17 @@ def taking_part(problem: Problem, observations: Observations, explanations: Sequ
     return replace(part, layout=part.layout.of(part.sights.keys))
 
 
-def _change(some: Sequence[AsBuilt], others: Sequence[AsBuilt]) -> float:
-    """By how much the logarithm of a sigma is another one at most; infinite where they are not of the same kinds."""
-    sigmas = {(one.target, one.kind): one.sigma_m for one in others}
-    if {(one.target, one.kind) for one in some} != set(sigmas):
+def _change(now: Built, before: Built) -> float:
+    """By how much a sigma, or the offsets, are others at most, over what is no other one; infinite where they are not
+    of the same kinds.
+    """
+    sigmas = {(one.target, one.kind): one.sigma_m for one in before.every}
+    if {(one.target, one.kind) for one in now.every} != set(sigmas):
         return np.inf
-    return max((abs(float(np.log(one.sigma_m / sigmas[one.target, one.kind]))) for one in some), default=0.0)
+    logs = [abs(float(np.log(one.sigma_m / sigmas[one.target, one.kind]))) for one in now.every]
+    steps = (now.whole.values - now.whole.carrying(before.whole).values) / now.sd
+    moved = float(np.linalg.norm(steps)) / max(int(np.count_nonzero(steps)), 1) ** 0.5
+    return float(max(max(logs, default=0.0) / _AT_REST, moved / _STILL))
 
 
 def _measured(every: Sequence[AsBuilt], structure: Structure, observations: Observations) -> Iterator[AsBuilt]:
@@ -269,9 +277,10 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
     numbers = [kinds[one.target, one.kind] for one in every]
     moved = np.concatenate([np.empty(0, dtype=np.int64), *numbers])
     sigmas = np.repeat([one.sigma_m for one in every], [len(own) for own in numbers])
-    values = as_stated.values.copy()
-    values[moved] = repeats.amounts(moved, sigmas)[0]
-    return Built(every, structure.with_values(values))
+    values, sd = as_stated.values.copy(), np.full(len(as_stated.values), np.inf)
+    values[moved], covariance = repeats.amounts(moved, sigmas)
+    sd[moved] = np.sqrt(np.diagonal(covariance))
+    return Built(every, structure.with_values(values), sd)
 
 
 def _some(sights: Sights, most: int) -> Sights:

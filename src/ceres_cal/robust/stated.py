@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -27,8 +26,7 @@ _FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 
 _STATED = {"prior": "stated", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
 
 
-@dataclass(frozen=True)
-class Conflict:
+class Conflict(Frozen, eq=True):
     """Something known beforehand that everything else contradicts.
 
     Attributes:

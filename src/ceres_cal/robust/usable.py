@@ -23,12 +23,10 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets.target import HANDY_M
 
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
 _NEARER = 0.5
-_LARGEST_M = HANDY_M  # of a target that somebody holds before a camera: no larger one can be made
 _BELOW = 0.5  # of the camera's height over the floor: noise sinks a board by centimetres
 
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens

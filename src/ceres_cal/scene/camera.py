@@ -6,7 +6,6 @@ x_cam = R (x_world - t) with t the camera's position (paper, section 3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from numbers import Real
 from typing import Any
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.shown import drawn, html_of
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.base.typed import numbers_in, rows, size_in
@@ -33,8 +33,7 @@ from ceres_cal.scene.foreign import (
 from ceres_cal.scene.lens import Lens
 
 
-@dataclass(frozen=True)
-class Camera:
+class Camera(Frozen, eq=True):
     """One camera at one pose.
 
     Attributes:

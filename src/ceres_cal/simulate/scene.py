@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import did_you_mean
 from ceres_cal.problem.parameters import Station
@@ -16,8 +16,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import SIDES, Target
 
 
-@dataclass(frozen=True)
-class ViewPlan:
+class ViewPlan(Frozen, eq=True):
     """What frames taken at one station show of one target: one view per frame.
 
     The frames of a plan differ in their noise, outliers, wrong labels and hidden stretches only; many frames in one
@@ -44,8 +43,7 @@ class ViewPlan:
     side: str = "centre"
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(Frozen, eq=True):
     """The truth of a simulation: everything that is, and what is looked at.
 
     Attributes:
@@ -109,8 +107,7 @@ class Scene:
         return Pose.identity() if placement is None else self.placements[placement]
 
 
-@dataclass(frozen=True)
-class Disturbance:
+class Disturbance(Frozen, eq=True):
     """What disturbs the observations of every frame; nothing does by default.
 
     Attributes:

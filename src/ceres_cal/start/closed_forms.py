@@ -11,7 +11,6 @@ What a lens does along the radius, as a start finds it, and the lens of a kind t
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,8 +28,7 @@ from ceres_cal.scene.lens import Lens
 _WRONG = 8.0
 
 
-@dataclass(frozen=True)
-class RadialProfile:
+class RadialProfile(Frozen, eq=True):
     """w(r) = 1 + sum c_k r^(2k), r in units of `unit_px`."""
 
     coefficients: tuple[float, ...]

@@ -41,7 +41,7 @@ _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 
 
-class Start(Frozen):
+class Start(Frozen, eq=True):
     """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess".
 
     Attributes:

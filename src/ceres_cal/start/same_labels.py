@@ -24,7 +24,7 @@ from ceres_cal.start.initialise import posed_sights
 _START = Options(lens="radial")
 
 
-class Labels(Frozen):
+class Labels(Frozen, eq=True):
     """What was said of the labels.
 
     Attributes:
