@@ -75,12 +75,14 @@ def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     places, bright = _seen(grey, target, camera, curves, _NEAR)
     share = np.maximum(bright / np.maximum(places, 1.0), BY_CHANCE)
     sure = places * divergence(share, BY_CHANCE) > _SURELY
+    if not np.any(sure):
+        return ()
     course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
     x, y = np.round(course.pixels + 4.0 * course.width_px[:, None] * course.normals).astype(int).T
     beside = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)]
     paint = search(grey, course, 0.5 * _NEAR * float(np.hypot(*camera.image_size)))[1] * sure[course.curve]
     if np.any(paint > 0.0):
-        low, high = np.quantile(beside[paint > np.median(paint[paint > 0.0])], (_DARKEST, 1.0 - _DARKEST))
+        low, high = np.quantile(beside[paint >= np.median(paint[paint > 0.0])], (_DARKEST, 1.0 - _DARKEST))
         other = (beside < low / _ANOTHER) | (beside > high * _ANOTHER)
         sure |= np.bincount(course.curve, other, len(places)) > 0.5 * np.maximum(places, 1.0)
     return tuple(name for name in curves if sure[target.curve_index[name]])
