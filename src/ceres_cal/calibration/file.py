@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from typing import Any
 
@@ -31,8 +31,7 @@ COPY = "a copy"
 """How the reason begins of an observation that repeats another one, and was not taken out for its residual."""
 
 
-@dataclass(frozen=True)
-class Rejected:
+class Rejected(Frozen, eq=True):
     """One observation that was taken out: its permanent id (kind and row), what it shows, and why it was taken out."""
 
     kind: str
@@ -58,8 +57,7 @@ _NOT_CHOSEN = (
 )
 
 
-@dataclass(frozen=True)
-class TriedLens:
+class TriedLens(Frozen, eq=True):
     """A lens that was compared with others.
 
     Attributes:
@@ -78,8 +76,7 @@ class TriedLens:
     probability: float | None = None
 
 
-@dataclass(frozen=True)
-class LensChoice:
+class LensChoice(Frozen, eq=True):
     """Which lens was chosen, over what, and by how much.
 
     Attributes:
@@ -115,8 +112,7 @@ class LensChoice:
         return _NOT_CHOSEN.format(taken.failed, taken.label) if taken.failed else ""
 
 
-@dataclass(frozen=True)
-class Fit:
+class Fit(Frozen, eq=True):
     """How well the observations fit.
 
     Attributes:

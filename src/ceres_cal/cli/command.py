@@ -12,12 +12,12 @@ import argparse
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, fields
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.lazy import LazyTable
 from ceres_cal.base.words import did_you_mean, sentence
 from ceres_cal.report.document import Document
@@ -218,8 +218,7 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}{meant or f': see `{self.prog} --help`'}")
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(Frozen, eq=True):
     """One command.
 
     Attributes:

@@ -14,7 +14,6 @@ import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, as_completed
-from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -24,6 +23,7 @@ import msgspec
 
 from ceres_cal.base.errors import CalibrationError, InputError, answer_or_reason, attempt
 from ceres_cal.base.files import convert, parse_json, read_bytes
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.version import __version__
 from ceres_cal.base.words import printable
 from ceres_cal.base.written import note
@@ -34,8 +34,7 @@ LEVELS = ("failed", "no", "care", "good")
 """What needs attention first."""
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(Frozen, eq=True):
     """One command of a plan.
 
     Attributes:
@@ -67,8 +66,7 @@ def _files(inputs: Iterable[Path]) -> list[Path]:
     return [file for files in inside for file in files]
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(Frozen, eq=True):
     """What came of a job.
 
     Attributes:

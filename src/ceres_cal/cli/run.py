@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.images import IMAGE_ENDINGS, images_and_videos
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
@@ -43,8 +43,7 @@ class RunArguments(QuietArguments):
     frames: int = arguments.frames_option()
 
 
-@dataclass(frozen=True)
-class _Step:
+class _Step(Frozen, eq=True):
     """A command as one would type it, what is worth showing of its answer, that answer, and its exit code."""
 
     command: str

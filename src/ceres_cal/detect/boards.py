@@ -6,7 +6,6 @@ OpenCV finds the board; its sub-pixel search, `saddles` or `markers` then measur
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.threads import in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
@@ -50,8 +50,7 @@ _UNEVEN = 0.45  # natural logarithm: 1.57 times; a skipped square makes 2, persp
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
 
-@dataclass(frozen=True)
-class BoardDetections:
+class BoardDetections(Frozen, eq=True):
     """What `detect_boards` found.
 
     Attributes:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.markers import dictionary_of
 
 
-@dataclass(frozen=True)
-class CharucoSpec:
+class CharucoSpec(Frozen, eq=True):
     """The markers of a ChArUco board; its squares are those of the checkerboard target.
 
     Attributes:

@@ -18,8 +18,6 @@ by q from -1 to 1. Then c is where their mean lies. Only means are seen at one p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Mask
@@ -76,8 +74,7 @@ class Profiles(Frozen):
         return Profiles(self.offset_px[rows], self.sigma_px[rows], self.heights[rows], self.noise[rows])
 
 
-@dataclass(frozen=True)
-class EdgeShape:
+class EdgeShape(Frozen, eq=True):
     """What a picture makes of edges: blur_px, the Gaussian's standard deviation; stretch, a factor on the edges'
     distances; smear_px, how far a camera that moved, or coma at the image's corner, smears them, 0 of none.
     """

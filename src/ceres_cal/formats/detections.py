@@ -8,7 +8,6 @@ import base64
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from ceres_cal.base.archives import read_foreign_npz
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
@@ -26,8 +26,7 @@ from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, target_named, targets_by_name
 
 
-@dataclass(frozen=True)
-class CornerOptions:
+class CornerOptions(Frozen, eq=True):
     """What the board was, and the image: the file does not say it."""
 
     columns: int = field(default=0, metadata={"help": "corners along a row of the board"})
@@ -79,8 +78,7 @@ def _with_sigma(points: Points, sigma_px: Array) -> Points:
 # ---- named columns --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TableOptions:
+class TableOptions(Frozen, eq=True):
     """What the columns do not say."""
 
     target: str = field(default="", metadata={"help": "whose features are named, such as ssl-b; without it X_m, Y_m"})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,8 +94,7 @@ class ExportRequest(Struct, frozen=True, eq=False):
     existing: bytes | None = None
 
 
-@dataclass(frozen=True)
-class NoOptions:
+class NoOptions(Frozen, eq=True):
     """Of a format that leaves nothing to choose."""
 
 

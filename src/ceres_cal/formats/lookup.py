@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,8 +183,7 @@ def _rays(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
 # ---- as an export format --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class LookupOptions:
+class LookupOptions(Frozen, eq=True):
     """How fine the table is: see `make_lookup_table`."""
 
     error_mm: float = field(default=0.1, metadata={"help": "largest interpolation error on the field; default: 0.1"})

@@ -7,13 +7,13 @@ src opencv/opencv samples/cpp/calibration.cpp, stereo_calib.cpp.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import (
     Exported,
@@ -118,8 +118,7 @@ def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class OpenCvOptions:
+class OpenCvOptions(Frozen, eq=True):
     """What a file may not say."""
 
     image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px, where the file does not say it"})

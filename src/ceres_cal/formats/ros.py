@@ -7,13 +7,13 @@ src ros-perception/image_common camera_calibration_parsers/src/parse_yml.cpp.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose, quaternion, rotation_of
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
@@ -23,8 +23,7 @@ from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
 _MODELS = {"opencv5": "plumb_bob", "opencv8": "rational_polynomial", FISHEYE: "equidistant"}
 
 
-@dataclass(frozen=True)
-class RosOptions:
+class RosOptions(Frozen, eq=True):
     """Names of frames."""
 
     world_frame: str = field(default="field", metadata={"help": "parent of the static transform; default: field"})

@@ -8,13 +8,13 @@ height would trade off.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.base.words import HEIGHTS_M
@@ -30,8 +30,7 @@ NAMES = ("focal_length", "principal_point_x", "principal_point_y", "distortion",
 _POSITION = tuple(f"derived_camera_world_{name}" for name in _SHIFT)
 
 
-@dataclass(frozen=True)
-class SslOptions:
+class SslOptions(Frozen, eq=True):
     """Whose camera is whose."""
 
     camera_id: str = field(

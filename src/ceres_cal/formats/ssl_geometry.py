@@ -7,10 +7,10 @@ only the lines of `calib` are replaced.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from ceres_cal.base.errors import InputError, attempt
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import SslOptions, as_before, reader_traps, to_camera, to_entries
@@ -88,8 +88,7 @@ def _checked(data: Mapping[str, Any]) -> dict[str, Any]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class SslReadOptions:
+class SslReadOptions(Frozen, eq=True):
     """What a message may not say."""
 
     image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px of cameras that do not say theirs"})

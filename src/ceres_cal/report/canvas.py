@@ -9,13 +9,13 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import Frozen, replace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,8 +77,7 @@ class Drawing(Struct, frozen=True):
     height: float
 
 
-@dataclass(frozen=True)
-class Hover:
+class Hover(Frozen, eq=True):
     """What is said beside the pointer, by the nearest of places that lie evenly over the axes.
 
     Attributes:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from msgspec import Struct
 
 from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.base.files import make_folder
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import frame_of, mm
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -44,8 +44,7 @@ _BY_HAND = Options(
 )
 
 
-@dataclass(frozen=True)
-class _Moment:
+class _Moment(Frozen, eq=True):
     """A state and what was found of it, by which commands; `auto`: without a start. `base`: what was found before."""
 
     state: State

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.base.words import no_such
 from ceres_cal.scene.camera import Camera
@@ -36,8 +36,7 @@ _LONG = 0.4  # of the longest curve: one that people know by its name
 _MIDDLE = 0.02  # of the target's size: nearer to its middle a feature lies on no side
 
 
-@dataclass(frozen=True)
-class Facing:
+class Facing(Frozen, eq=True):
     """A named curve or point of the target lies towards a side of the picture, seen from the target's middle.
 
     It need not be in the picture: of a half field the goal line of the other half lies towards some side too.

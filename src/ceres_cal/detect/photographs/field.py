@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -62,8 +61,7 @@ class FieldDetections(Frozen):
     __repr__ = brief
 
 
-@dataclass(frozen=True)
-class FieldOptions:
+class FieldOptions(Frozen, eq=True):
     """What observations of a field are to be.
 
     Attributes:

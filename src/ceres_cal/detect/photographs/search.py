@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,8 +48,7 @@ _NO_LINES = (
 )
 
 
-@dataclass(frozen=True)
-class Auto:
+class Auto(Frozen, eq=True):
     """No start: the field is to be found in the photograph.
 
     Attributes:

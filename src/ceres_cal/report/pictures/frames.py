@@ -6,7 +6,6 @@ Photographs out of image files, and pictures as bytes of them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Image, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.words import frame_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.images import encoded, read_colour
@@ -25,8 +25,7 @@ Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(Frozen, eq=True):
     """One photograph: its frame's name, the station that took it, what it shows, and numbers of its views."""
 
     name: str
