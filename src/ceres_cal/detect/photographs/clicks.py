@@ -134,7 +134,7 @@ def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prio
     if np.any(np.abs(camera.principal_point - centre) > 3.0 * off * size):
         centre, off = np.array(camera.principal_point), 2.0 * off
     priors = (
-        Prior("camera", CAMERA, "phi", (camera.phi,), (0.5 * camera.phi,)),
+        Prior("camera", CAMERA, "phi", (camera.phi,), (0.3 * camera.phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(centre), (off * size[0],) * 2),
         Prior("camera", CAMERA, "aspect", (1.0,), (STRETCH,)),
     )

@@ -18,6 +18,8 @@ _SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12
 BY_CHANCE = 0.3  # of the places on any lines, those that look like paint: what is brighter than the others does
 _R3 = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 _NEAR = 0.012  # the same where they are known to lie
+# Of the floor beside the curves that are seen, the darkest and the lightest share, times which it is another floor.
+_DARKEST, _ANOTHER = 0.25, 1.4
 # Log-likelihood ratio from which on paint along a curve is none by chance.
 _SURELY = 3.0
 # Of the places on lines, at most, where lines that are not painted look like paint: 0.3 by chance, 0.8 of worn ones.
@@ -68,11 +70,19 @@ def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
 
 def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
     """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
-    other paint, to be measured.
+    other paint, to be measured; and those that something covers, by what is beside them: no floor that the others have.
     """
     places, bright = _seen(grey, target, camera, curves, _NEAR)
     share = np.maximum(bright / np.maximum(places, 1.0), BY_CHANCE)
     sure = places * divergence(share, BY_CHANCE) > _SURELY
+    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
+    x, y = np.round(course.pixels + 4.0 * course.width_px[:, None] * course.normals).astype(int).T
+    beside = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)]
+    paint = search(grey, course, 0.5 * _NEAR * float(np.hypot(*camera.image_size)))[1] * sure[course.curve]
+    if np.any(paint > 0.0):
+        low, high = np.quantile(beside[paint > np.median(paint[paint > 0.0])], (_DARKEST, 1.0 - _DARKEST))
+        other = (beside < low / _ANOTHER) | (beside > high * _ANOTHER)
+        sure |= np.bincount(course.curve, other, len(places)) > 0.5 * np.maximum(places, 1.0)
     return tuple(name for name in curves if sure[target.curve_index[name]])
 
 
