@@ -80,7 +80,7 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 DECIDING: tuple[Constant, ...] = (
     *_of("problem.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
     *_of("problem.ranges", "PHI_RANGE _BUILT _REDRAWN", "calibrate"),
-    *_of("observations.bounds", "_SIGMA_RATIO _FAR", "calibrate"),
+    *_of("observations.oddities", "_SIGMA_RATIO _FAR", "calibrate"),
     *_of("robust.usable", "_OFF_CENTRE", "calibrate"),
     *_of("robust.usable", "_NO_FIT", "calibrate"),
     *_of("calibration.lens_forms", "AS_GOOD ALIKE CLEARLY", "lens"),
@@ -90,7 +90,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),
     *_of("posterior.other_lenses", "AGREES", "lens"),
     *_of("calibration.outcome", "_RESTING", "calibrate"),
-    *_of("observations.bounds", "_LARGE_M", "calibrate"),
+    *_of("observations.oddities", "_LARGE_M", "calibrate"),
     *_of("robust.robust", "AT_REST", "calibrate"),
     *_of("robust.robust", "_ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),
     *_of("robust.robust", "AT_REST_AGAIN", "refit"),

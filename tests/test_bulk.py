@@ -13,7 +13,7 @@ from test_competing import NOISE, half_field, moved_aside, wholes
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.observations import Observations, thinning
+from ceres_cal.observations import Observations, sights
 from ceres_cal.problem import shares
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.quantities import difference
@@ -35,7 +35,7 @@ def in_shares(monkeypatch: pytest.MonkeyPatch) -> Calibrated:
 
     def calibrated(observations: Observations, progress: Callable[[Progress], None] | None = None) -> Calibration:
         with monkeypatch.context() as patch:
-            patch.setattr(thinning, "MANY", 100)
+            patch.setattr(sights, "MANY", 100)
             patch.setattr(bulk, "_PART", 2_000)
             patch.setattr(bulk, "_FEWEST_VIEWS", 16)
             patch.setattr(bulk, "_STANDING_OUT", 2)

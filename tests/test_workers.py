@@ -19,7 +19,7 @@ from test_competing import half_field
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.observations import Observations, thinning
+from ceres_cal.observations import Observations, sights
 from ceres_cal.observations.columns import FileRows, read_rows
 from ceres_cal.problem import engines, shares
 from ceres_cal.problem.bundle import Progress
@@ -33,7 +33,7 @@ distributed = pytest.importorskip("distributed", reason="Dask is an extra: pip i
 
 @pytest.fixture(autouse=True)
 def in_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thinning, "MANY", 100)
+    monkeypatch.setattr(sights, "MANY", 100)
     monkeypatch.setattr(bulk, "_PART", 2_000)
     monkeypatch.setattr(bulk, "_FEWEST_VIEWS", 16)
     monkeypatch.setattr(shares, "_ROWS", 250)

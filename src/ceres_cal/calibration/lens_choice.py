@@ -24,6 +24,7 @@ from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_a
 from ceres_cal.calibration.lens_forms import (
     AS_GOOD,
     AS_GOOD_BESIDE_LENGTHS,
+    CLEARLY,
     PAPER,
     decide,
     papers,
@@ -263,7 +264,9 @@ def _among(
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
     more = tuple(last_resort(seen, found.chosen, is_asked=is_asked))
     found = replace(found, tried=(*found.tried, *more))
-    clearly = next((one for one in more if one.clearly_beats(found.chosen)), None)
+    # What leaves the same in all views is no rival any more; else one that few programs know must be worth it.
+    least = AS_GOOD if is_asked else CLEARLY
+    clearly = next((one for one in more if one.beats(found.chosen, least)), None)
     return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)
 
 

@@ -14,7 +14,7 @@ from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.calibration.lens_forms import AS_GOOD, CLEARLY, PAPER, Form, standard_errors, surprise
+from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
@@ -141,11 +141,11 @@ class Candidate:
             return True
         return standard_errors(self.squares, best.squares) <= AS_GOOD
 
-    def clearly_beats(self, other: Candidate) -> bool:
-        """Whether it predicts so much better that a lens which few programs know is worth it."""
+    def beats(self, other: Candidate, least: float) -> bool:
+        """Whether it predicts better by so many standard errors."""
         if self.squares is None or other.squares is None or self.fault:
             return False
-        return standard_errors(other.squares, self.squares) > CLEARLY
+        return standard_errors(other.squares, self.squares) > least
 
     @cached_property
     def estimate(self) -> Estimate:

@@ -24,8 +24,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.lens_forms import any_lens, candidates, coefficients_of, decide, label_of, size_of, surprise
 from ceres_cal.diagnostics.table import error_mm
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights
-from ceres_cal.observations.thinning import column_of, frames_of, thinned
+from ceres_cal.observations.sights import Sights, column_of, frames_of, gather_sights, thinned
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.parameters import Estimate, Layout, Options
 from ceres_cal.problem.problem import Problem, Weighting

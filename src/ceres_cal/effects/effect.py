@@ -6,8 +6,8 @@ What is found of it: the cause by name, how large, how sure; and what is solved 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -93,14 +93,9 @@ class EffectEstimate(Frozen, eq=True):
         return f"{self.sentence}; it was solved for"
 
 
-class ShiftsAt(Protocol):
-    """By how much effects let numbers scatter at an estimate: the numbers, and shifts of them whose products with
-    themselves, added up, go into their covariance. Under other priors, where these are given.
-    """
-
-    def __call__(
-        self, estimate: Estimate, priors: Sequence[GaussianPrior] | None = None, /
-    ) -> tuple[Sequence[Key], Sequence[Array]]: ...
+ShiftsAt = Callable[[Estimate, Sequence[GaussianPrior] | None], tuple[Sequence[Key], Sequence[Array]]]
+"""By how much effects let numbers scatter at an estimate, under other priors where these are given: the numbers, and
+shifts of them whose products with themselves, added up, go into their covariance."""
 
 
 class Finding(Frozen, eq=True):

@@ -21,7 +21,6 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
-from ceres_cal.observations.bounds import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (
     Alone,
     Columns,
@@ -36,6 +35,7 @@ from ceres_cal.observations.columns import (
 )
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered_curves, gathered_points
+from ceres_cal.observations.oddities import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.scene.targets import Target
 
 _NAMES = attrgetter("camera", "station", "target", "placement")

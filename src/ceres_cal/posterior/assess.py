@@ -74,7 +74,7 @@ def assess(
         if shifts_at is None:
             return by_scatter
         by_model = by_scatter.by_model or by_scatter.information
-        return replace(by_scatter.widened(*shifts_at(there)), by_model=by_model)
+        return replace(by_scatter.widened(*shifts_at(there, None)), by_model=by_model)
 
     posterior = known(estimate, reduced)
     width = posterior.half_width

@@ -20,11 +20,11 @@ lens is. By what the free numbers take up of them they are off.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.lazy import cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import HEIGHTS_M
@@ -53,8 +53,7 @@ _PARTS = (1.0, 0.1)
 _COUNTED = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class OtherLenses:
+class OtherLenses(Frozen):
     """Other lenses than the chosen one, solved for from the same observations.
 
     Attributes:
@@ -155,8 +154,7 @@ AGREES = 2.5
 _IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
 
 
-@dataclass(frozen=True, eq=False)
-class LeftOver:
+class LeftOver(Frozen):
     """What a lens leaves of some sights.
 
     Attributes:

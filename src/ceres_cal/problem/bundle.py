@@ -13,6 +13,7 @@ import pyceres
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import SightKey, Sights
@@ -27,8 +28,7 @@ _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SU
 _POSED = 1e-2
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(Frozen, eq=True):
     """One iteration of a solve, as the progress callback gets it."""
 
     iteration: int
@@ -36,8 +36,7 @@ class Progress:
     step_norm: float
 
 
-@dataclass(frozen=True)
-class Solution:
+class Solution(Frozen, eq=True):
     """The end of one solve.
 
     Attributes:

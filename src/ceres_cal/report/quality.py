@@ -20,7 +20,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.effects.effect import Finding
 from ceres_cal.observations import Observations
-from ceres_cal.observations.thinning import thinned
+from ceres_cal.observations.sights import thinned
 from ceres_cal.posterior.maps import FieldMap, ImageMap, locate_slopes, visible_pixels
 from ceres_cal.posterior.seam import Disagreement
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict

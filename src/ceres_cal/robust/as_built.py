@@ -15,13 +15,13 @@ together tell, are. The posterior has them under their sigmas like any tolerance
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
@@ -42,8 +42,7 @@ _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no
 _STILL = 0.5  # standard deviations by which offsets may still move: what five bows are is known to a hundredth
 
 
-@dataclass(frozen=True, eq=False)
-class Built:
+class Built(Frozen):
     """How targets are likely built.
 
     Attributes:

@@ -75,9 +75,7 @@ def solve_beside_effects(
             break
     last, solved = end, end.solution.estimate
 
-    def shifts_at(
-        there: Estimate, priors: Sequence[GaussianPrior] | None = None
-    ) -> tuple[Sequence[Key], Sequence[Array]]:
+    def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
         # Along a valley, and without what was stated, numbers go together differently.
         own = amounts
         if there is not solved or priors is not None:

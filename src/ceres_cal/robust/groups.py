@@ -18,8 +18,7 @@ from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.evidence import FEATURE_ASIDE, VIEW_ASIDE, SizePrior
 from ceres_cal.observations import Columns, Observations, View
-from ceres_cal.observations.sights import Sights
-from ceres_cal.observations.thinning import column_of
+from ceres_cal.observations.sights import Sights, column_of
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Equations
 from ceres_cal.robust.robust import RobustSolution
