@@ -192,16 +192,16 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
 
 def _asks_for_more(calibration: Calibration, observations: Observations, sights: Sights) -> bool:
-    """Whether views of placements agree on what the lens leaves in the same places: lines of a floor that are painted
-    aside do so before a camera that stands still.
-    """
-    from ceres_cal.posterior.other_lenses import LeftOver
+    """Whether the lens leaves the same in views of different placements."""
+    from ceres_cal.posterior.other_lenses import LeftOver, of_placements
 
-    placed = np.array([key.placement is not None for key in sights.keys])
-    if not placed.any():
+    seen = of_placements(sights)
+    if not len(seen):
         return False
-    seen = sights.take(np.flatnonzero(placed)).used(*calibration.inlier_masks(observations))
-    there = residuals(observations, sights, calibration.estimate)
+    seen, there = (
+        seen.used(*calibration.inlier_masks(observations)),
+        residuals(observations, seen, calibration.estimate),
+    )
     return LeftOver.of(seen, there, calibration.fit.scales, calibration.estimate).asks_for_more
 
 

@@ -180,9 +180,10 @@ class LeftOver(Frozen):
         return cls(some, points, there.curves[some.curve_rows] / (scales[1] * some.curve_sigma_px), estimate.cameras)
 
     @classmethod
-    def of_end(cls, end: RobustSolution) -> LeftOver:
-        """At the end of all rounds, of what took part."""
-        return cls.of(end.problem.sights, end.residuals, end.problem.weighting.scales, end.solution.estimate)
+    def of_end(cls, end: RobustSolution, sights: Sights | None = None) -> LeftOver:
+        """At the end of all rounds, of some sights or of all that took part."""
+        sights = end.problem.sights if sights is None else sights
+        return cls.of(sights, end.residuals, end.problem.weighting.scales, end.solution.estimate)
 
     @property
     def in_cells(self) -> float:
@@ -211,6 +212,13 @@ class LeftOver(Frozen):
     def asks_for_more(self) -> bool:
         """Whether another lens would leave less in the same places of all sights."""
         return max(self.in_cells, self.in_rings) > AGREES
+
+
+def of_placements(sights: Sights) -> Sights:
+    """Those of what lies elsewhere in each view. Lines of a floor that are painted aside leave the same in all views of
+    a camera that stands still, whatever its lens.
+    """
+    return sights.take(np.flatnonzero([key.placement is not None for key in sights.keys]))
 
 
 def _sight_of(bounds: Indices) -> Indices:
@@ -257,12 +265,14 @@ def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tupl
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
     lenses do to them; none where views do not agree on anything that is left.
     """
-    if not LeftOver.of_end(end).asks_for_more:
+    every = end.problem.sights
+    asked = every if end.problem.options.blank_lens.roughness else of_placements(every)
+    if not len(asked) or not LeftOver.of_end(end, asked).asks_for_more:
         return (), ()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     model = _linearised(end, observations, reduced)
-    every = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]
-    return reduced.shared.keys, [shift for shifts in every for shift in shifts]
+    shifts = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]
+    return reduced.shared.keys, [shift for own in shifts for shift in own]
 
 
 def _linearised(end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> Linearised:
