@@ -37,8 +37,8 @@ PROBLEMS = tuple(scenes.PROBLEMS)
 
 @cache
 def found(problem: str, outliers: float) -> limit.Efficiency:
-    runs = RUNS[problem] // 2 if outliers else RUNS[problem]  # without any, a few percent are to be told
-    return limit.efficiency(scenes.PROBLEMS[problem](), replace(scenes.CLEAN_NOISE, outliers=outliers), range(runs))
+    noise = replace(scenes.CLEAN_NOISE, outliers=outliers)
+    return limit.efficiency(scenes.PROBLEMS[problem](), noise, range(RUNS[problem]))
 
 
 # ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------

@@ -504,7 +504,7 @@ def test_unknown_is_null_for_scripts(say: Say, tmp_path: Path) -> None:
 def test_says_how_two_cameras_agree(say: Say, tmp_path: Path) -> None:
     say("simulate", "two-cameras", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json")
-    assert "seam      left - right: ± 0.6 mm on the floor" in said.out
+    assert "seam      left - right: ± 0.62 mm on the floor" in said.out
     assert "found 1.5 mm where 1.7 were expected (rms of 41 points and stretches that both observed)" in said.out
 
 
