@@ -198,11 +198,9 @@ def _asks_for_more(calibration: Calibration, observations: Observations, sights:
     seen = of_placements(sights)
     if not len(seen):
         return False
-    seen, there = (
-        seen.used(*calibration.inlier_masks(observations)),
-        residuals(observations, seen, calibration.estimate),
-    )
-    return LeftOver.of(seen, there, calibration.fit.scales, calibration.estimate).asks_for_more
+    there = residuals(observations, seen, calibration.estimate)
+    taking_part = seen.used(*calibration.inlier_masks(observations))
+    return LeftOver.of(taking_part, there, calibration.fit.scales, calibration.estimate).asks_for_more
 
 
 def _part(bulk: Bulk, options: Options) -> Subset:

@@ -214,7 +214,7 @@ def choose_lens(
 
     def compared() -> Chosen:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built, by_most=by_most)
-        return _among(seen, share, as_good, start, kinds, is_asked=by_most).outcome
+        return _among(seen, share, as_good, start, kinds, by_most=by_most).outcome
 
     chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
     if isinstance(chosen, CalibrationError):
@@ -248,7 +248,7 @@ def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candida
 
 
 def _among(
-    seen: InlierRows, share: float, as_good: float, start: Start, kinds: Sequence[Kind], *, is_asked: bool
+    seen: InlierRows, share: float, as_good: float, start: Start, kinds: Sequence[Kind], *, by_most: bool
 ) -> Comparison:
     """The paper's lens, where it gives an answer, and the longest of each kind come first: only where it is not as good
     as the best of them are the shorter ones looked at.
@@ -262,10 +262,10 @@ def _among(
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
-    more = tuple(last_resort(seen, found.chosen, is_asked=is_asked))
+    more = tuple(last_resort(seen, found.chosen, by_most=by_most))
     found = replace(found, tried=(*found.tried, *more))
-    # What leaves the same in all views is no rival any more; else one that few programs know must be worth it.
-    least = AS_GOOD if is_asked else CLEARLY
+    # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.
+    least = AS_GOOD if by_most else CLEARLY
     clearly = next((one for one in more if one.beats(found.chosen, least)), None)
     return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)
 

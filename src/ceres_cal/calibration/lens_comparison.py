@@ -172,9 +172,9 @@ def _noise_px(end: RobustSolution) -> float:
 _TOGETHER = 1.5
 
 
-def last_resort(seen: InlierRows, chosen: Candidate, *, is_asked: bool = False) -> Iterator[Candidate]:
-    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together, or all
-    observations asked for more than the lens of some.
+def last_resort(seen: InlierRows, chosen: Candidate, *, by_most: bool = False) -> Iterator[Candidate]:
+    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together, or most
+    of the observations are asked. Within views, too: eight of a lens that no formula has do not agree by two sd.
 
     Not of so few placements that their features are held out one by one: what goes together within each would be
     predicted, too. Nor where some camera has one view, of a floor: a line that is painted aside bends there as by a
@@ -183,7 +183,7 @@ def last_resort(seen: InlierRows, chosen: Candidate, *, is_asked: bool = False) 
     views = [len(seen.sights.of_camera(name)) for name in seen.sights.cameras]
     if min(views) == 1 or seen.splits_placements:
         return
-    if is_asked or _between_cells(seen, chosen.of) > _TOGETHER:
+    if by_most or _between_cells(seen, chosen.of) > _TOGETHER:
         for forms in without_formula():
             yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
 

@@ -9,7 +9,7 @@ coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a li
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -58,7 +58,11 @@ _CostFunction: Any = pyceres.CostFunction  # which has no types
 
 
 class CachedCost(_CostFunction):
-    """A cost function; what it costs is `_evaluated`."""
+    """A cost function; what it costs is `_evaluated`: the answer in a place, whole and by blocks; None where an
+    observation cannot be projected from there. pyceres' metaclass lets no class with abstract methods join.
+    """
+
+    _evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
 
     def __init__(self, run: Run) -> None:
         super().__init__()
@@ -81,13 +85,6 @@ class CachedCost(_CostFunction):
         if jacobians is not None:
             self._accept()
         return True
-
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
-        """The answer in a place, whole and by blocks; None where an observation cannot be projected from there.
-
-        For every cost function to say: pyceres' own class has a metaclass that none with abstract methods can join.
-        """
-        raise NotImplementedError
 
     def _accept(self) -> None:
         """Jacobians are asked for where a step was accepted, and nowhere else."""

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32
+from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import search
 from ceres_cal.detect.photographs.matching import divergence
@@ -68,6 +68,22 @@ def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     return tuple(name for name in curves if name not in lacking)
 
 
+def _covered(grey: Array32, target: Target, camera: Camera, curves: Collection[str], seen: Mask) -> Array:
+    """(C,) of each of the target's curves the places beside which lies no floor that those have which are seen (C,)."""
+    beside_widths = 4.0  # from a line's middle, of its width: past its edges' blur, before its neighbour
+    if not np.any(seen):
+        return np.zeros(len(seen))
+    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
+    paint = search(grey, course, 0.5 * _NEAR * float(np.hypot(*camera.image_size)))[1] * seen[course.curve]
+    if not np.any(paint > 0.0):
+        return np.zeros(len(seen))
+    x, y = np.round(course.pixels + beside_widths * course.width_px[:, None] * course.normals).astype(int).T
+    beside = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)]
+    low, high = np.quantile(beside[paint >= np.median(paint[paint > 0.0])], (_DARKEST, 1.0 - _DARKEST))
+    other = (beside < low / _ANOTHER) | (beside > high * _ANOTHER)
+    return np.asarray(np.bincount(course.curve, other, len(seen)), dtype=float)
+
+
 def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
     """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
     other paint, to be measured; and those that something covers, by what is beside them: no floor that the others have.
@@ -75,16 +91,7 @@ def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     places, bright = _seen(grey, target, camera, curves, _NEAR)
     share = np.maximum(bright / np.maximum(places, 1.0), BY_CHANCE)
     sure = places * divergence(share, BY_CHANCE) > _SURELY
-    if not np.any(sure):
-        return ()
-    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
-    x, y = np.round(course.pixels + 4.0 * course.width_px[:, None] * course.normals).astype(int).T
-    beside = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)]
-    paint = search(grey, course, 0.5 * _NEAR * float(np.hypot(*camera.image_size)))[1] * sure[course.curve]
-    if np.any(paint > 0.0):
-        low, high = np.quantile(beside[paint >= np.median(paint[paint > 0.0])], (_DARKEST, 1.0 - _DARKEST))
-        other = (beside < low / _ANOTHER) | (beside > high * _ANOTHER)
-        sure |= np.bincount(course.curve, other, len(places)) > 0.5 * np.maximum(places, 1.0)
+    sure |= _covered(grey, target, camera, curves, sure) > 0.5 * np.maximum(places, 1.0)
     return tuple(name for name in curves if sure[target.curve_index[name]])
 
 
