@@ -10,7 +10,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import replace
-from ceres_cal.base.spread import known_inverses
+from ceres_cal.base.spread import NOTHING
+from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -38,19 +39,20 @@ def likeliest_sizes(
     """
     one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
     steps = 200  # of the search for sizes
-    ranks, unlimited = np.array([_rank(form) for form in forms]), np.full(len(slope), np.inf)
+    ranks, every = np.array([_rank(form) for form in forms]), np.array(forms)
+    first = normal + np.tensordot(sigmas**-2, every, 1)
+    # Along these directions the first precision is one, and further ones have plain inverses.
+    root = inverse_root(first, np.diagonal(first), NOTHING * len(slope))
+    data, along, flat = root.T @ normal @ root, root.T @ slope, (root.T @ every @ root).reshape(len(forms), -1)
     for _ in range(steps):
-        precision = normal + sum(form / sigma**2 for form, sigma in zip(forms, sigmas, strict=True))
-        covariance = known_inverses(precision, unlimited)
-        amount = covariance @ slope
-        known = ranks - np.array([np.sum(covariance * form) for form in forms]) / sigmas**2
-        squares = np.array([amount @ form @ amount for form in forms])
-        moved = np.sqrt((np.maximum(squares, 0.0) + one * least**2) / (np.maximum(known, 0.0) + one))
-        done = np.max(np.abs(np.log(moved / sigmas))) < at_rest
-        sigmas = moved
-        if done:
+        covariance = np.linalg.inv(data + (sigmas**-2 @ flat).reshape(data.shape))
+        amount = covariance @ along
+        known = ranks - flat @ covariance.reshape(-1) / sigmas**2
+        squares = flat @ np.outer(amount, amount).reshape(-1)
+        last, sigmas = sigmas, np.sqrt((np.maximum(squares, 0.0) + one * least**2) / (np.maximum(known, 0.0) + one))
+        if np.max(np.abs(np.log(sigmas / last))) < at_rest:
             break
-    return sigmas, amount, np.asarray(precision)
+    return sigmas, root @ amount, np.asarray(normal + np.tensordot(last**-2, every, 1))
 
 
 def _rank(form: Array) -> int:
