@@ -12,7 +12,7 @@ from pathlib import Path
 
 from scenes import RADIAL, corners
 
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.simulate import simulate
 
@@ -117,7 +117,7 @@ def test_a_child_calibrates_that_is_forked_while_a_thread_does() -> None:
 
 def test_nobody_takes_the_one_that_locks() -> None:
     taken = [path for path in SOURCES if "cached_property" in path.read_text() and _is_functools(path)]
-    assert taken == [PACKAGE / "base" / "lazy.py"], "take base.lazy's, which holds no lock"
+    assert taken == [PACKAGE / "base" / "frozen.py"], "take base.frozen's, which holds no lock"
 
 
 def _is_functools(path: Path) -> bool:

@@ -20,7 +20,7 @@ from ceres_cal.diagnostics import diagnose
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import NO_CURVES, Observations, Points, View, combine, taken
-from ceres_cal.observations.oddities import find_copies
+from ceres_cal.observations.validation import find_copies
 from ceres_cal.simulate import Disturbance, simulate
 
 

@@ -145,7 +145,7 @@ def test_a_decentred_fisheye_is_what_comes_nearer() -> None:
     lens = make_lens("kannala-brandt", coefficients={"k1": 0.05, "k2": 0.01, "p1": 4e-3, "p2": -3e-3})
     camera = Camera((1280, 960), 800.0, (640.0, 480.0), lens)
     found = camera.to_opencv()
-    assert not found.fisheye and found.error_px[0] < camera.to_foreign("fisheye").error_px[0]
+    assert not found.fisheye and found.error_px[0] < ForeignCamera.of(camera, "fisheye").error_px[0]
 
 
 @pytest.mark.parametrize("count", [12, 14])
@@ -156,7 +156,7 @@ def test_thin_prisms_are_opencvs(count: int) -> None:
     ours = ForeignCamera.opencv((1280, 960), matrix, k).project_rays(rays)
     theirs = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
     assert np.abs(ours - theirs).max() < 1e-9
-    camera, error_px = Camera.from_foreign(ForeignCamera.opencv((1280, 960), matrix, k))
+    camera, error_px = ForeignCamera.opencv((1280, 960), matrix, k).camera()
     assert np.abs(camera.project(rays) - theirs).max() < 1e-9 and error_px == (0.0, 0.0)
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 
 
 class Ring(Frozen):

@@ -24,7 +24,7 @@ from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.score_tests import ScoreTest
-from ceres_cal.effects.table.motion import motion_columns
+from ceres_cal.effects.table.camera import motion_columns
 from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, reaches, worst

@@ -42,6 +42,7 @@ from ceres_cal.problem.quantities import intrinsic_keys, moved, natural_sizes
 from ceres_cal.problem.ranges import PHI_RANGE
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.foreign import nearest
 from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import Segment
 from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
@@ -175,7 +176,7 @@ def test_another_lens_is_followed_over_the_floor() -> None:
     near, keys = calibration.estimate, calibration.uncertainty.posterior.keys
     camera = near.camera_at("overhead")
     step = 1e-3 * natural_sizes(near, keys) * np.random.default_rng(2).standard_normal(len(keys))
-    fisheye = camera.nearest(KannalaBrandt((0.0, 0.0, 0.0, 0.0)))
+    fisheye = nearest(camera, KannalaBrandt((0.0, 0.0, 0.0, 0.0)))
     lenses = others_of(near, moved(near, keys, step), replace(near, cameras={"overhead": fisheye.at(Pose.identity())}))
     shifts = shifts_to_lenses(lenses, keys, near)
     pixels = camera.principal_point + 200.0 * np.random.default_rng(3).uniform(-1.0, 1.0, (50, 2))

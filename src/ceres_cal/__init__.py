@@ -6,7 +6,7 @@ The names are loaded when they are first used, so that `import ceres_cal` costs 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.lazy import names_of
+from ceres_cal.base.frozen import names_of
 
 if TYPE_CHECKING:
     from ceres_cal.base.errors import CalibrationError as CalibrationError

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.typed import numbers_in
 
 _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding

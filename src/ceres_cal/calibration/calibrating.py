@@ -20,8 +20,8 @@ from ceres_cal.calibration.outcome import (
 )
 from ceres_cal.calibration.solving import Watched, solved_from
 from ceres_cal.observations import Observations
-from ceres_cal.observations.oddities import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights, is_bulk
+from ceres_cal.observations.validation import unfilled
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station

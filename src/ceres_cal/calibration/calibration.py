@@ -12,8 +12,7 @@ import numpy as np
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (

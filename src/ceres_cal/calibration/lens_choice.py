@@ -17,7 +17,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort

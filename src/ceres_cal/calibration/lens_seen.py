@@ -12,7 +12,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals

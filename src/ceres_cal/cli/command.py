@@ -17,8 +17,7 @@ from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field
-from ceres_cal.base.lazy import LazyTable
+from ceres_cal.base.frozen import Frozen, LazyTable, field
 from ceres_cal.base.words import did_you_mean, sentence
 from ceres_cal.report.document import Document
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
-from ceres_cal.base.native import interruptibly
+from ceres_cal.base.threads import interruptibly
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import Arguments, QuietArguments, argument

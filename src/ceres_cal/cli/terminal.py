@@ -201,7 +201,7 @@ def ended(exit_code: int) -> int:
     """
     if os.environ.get("CERES_CAL_DEBUG"):  # a profiler wants its say
         return exit_code
-    native = sys.modules.get("ceres_cal.base.native")
+    native = sys.modules.get("ceres_cal.base.threads")
     if native is None or not native.is_busy():
         atexit._run_exitfuncs()
     sys.stdout.flush()

@@ -20,7 +20,7 @@ from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.score_tests import Selection
-from ceres_cal.effects.table.target import feature_of
+from ceres_cal.effects.table.targets import feature_of
 from ceres_cal.observations import Observations
 from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.structure import numbers_by_kind

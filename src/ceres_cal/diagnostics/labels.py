@@ -16,8 +16,7 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Curves, Observations

@@ -13,8 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.effects.linearised import Linearised
 
 

@@ -12,8 +12,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import EffectColumns
 from ceres_cal.effects.evidence import SizePrior

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import ranges
 from ceres_cal.problem.costs import robust_weights

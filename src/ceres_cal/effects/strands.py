@@ -12,8 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, median
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, bounds_of

@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes
-from ceres_cal.base.native import kept_signals
+from ceres_cal.base.threads import kept_signals
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box

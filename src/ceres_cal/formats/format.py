@@ -206,7 +206,7 @@ class ImportedCameras(Frozen):
             if isinstance(given, Camera):
                 cameras[name] = given
                 continue
-            cameras[name], (rms, worst) = Camera.from_foreign(given)
+            cameras[name], (rms, worst) = given.camera()
             if worst > 0.0:
                 what = f"its {given.model} model is held as the nearest {cameras[name].lens.kind} lens"
                 warnings.append(f"camera {name!r}: {what}, off by {rms:.2g} px rms and {worst:.2g} px at most")

@@ -95,7 +95,7 @@ def as_foreign(
     camera: Camera, station: str, models: Sequence[str], box_m: Box | None
 ) -> tuple[ForeignCamera, ExportLoss]:
     """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""
-    foreign = camera.to_foreign(*models)
+    foreign = ForeignCamera.of(camera, *models)
     if foreign.error_px == (0.0, 0.0):
         return foreign, ExportLoss(station, {} if box_m is None else dict.fromkeys(HEIGHTS_M, (0.0, 0.0)), (0.0, 0.0))
     pose = camera.cam_from_world

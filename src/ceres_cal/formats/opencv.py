@@ -25,7 +25,8 @@ from ceres_cal.formats.format import (
     ImportRequest,
 )
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
-from ceres_cal.scene.foreign import FISHEYE, LARGEST, ForeignCamera, image_grid
+from ceres_cal.scene.camera import LARGEST
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid, opencv_models
 
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
@@ -45,7 +46,7 @@ def _export(request: ExportRequest) -> Exported:
     cameras, losses = [], []
     for name in request.stations:
         camera = request.calibration.station(name)
-        foreign, loss = as_foreign(camera, name, camera.opencv_models, box)
+        foreign, loss = as_foreign(camera, name, opencv_models(camera), box)
         cameras.append(foreign)
         losses.append(loss)
     entries = _mono(cameras[0], losses[0]) if len(cameras) == 1 else _stereo(cameras)

@@ -14,13 +14,14 @@ from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, Impo
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.foreign import nearest
 from ceres_cal.scene.lens import Radial
 
 
 def _export(request: ExportRequest) -> Exported:
     (name,) = request.stations
     camera = request.calibration.station(name)
-    ours = camera.nearest(Radial.blank((2, 3)))
+    ours = nearest(camera, Radial.blank((2, 3)))
     loss = camera_loss(name, camera, ours.project, field_box(request.calibration.targets))
     a2, a3 = ours.lens.values
     alpha, beta, gamma = euler_from_rotation(ours.cam_from_world.rotation)

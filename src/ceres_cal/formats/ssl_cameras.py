@@ -21,8 +21,8 @@ from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, as_foreign, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.foreign import LARGEST
+from ceres_cal.scene.camera import LARGEST, Camera
+from ceres_cal.scene.foreign import opencv_models
 from ceres_cal.scene.lens import Radial
 
 _QUATERNION, _SHIFT = ("q0", "q1", "q2", "q3"), ("tx", "ty", "tz")
@@ -82,7 +82,7 @@ def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]
     worst = max((worst for _, worst in loss.field_mm.values()), default=0.0)
     if not worst > much_mm:
         return []
-    other = as_foreign(camera, loss.station, camera.opencv_models, box_m)[1]
+    other = as_foreign(camera, loss.station, opencv_models(camera), box_m)[1]
     left = max(worst for _, worst in other.field_mm.values())
     return [
         f"one coefficient does not hold this lens, {worst:.3g} mm are lost at most: to lose less, read --to opencv "

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any
 from msgspec import Struct
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import read_bytes
+from ceres_cal.base.files import note, read_bytes
 from ceres_cal.base.words import first_of, plural
-from ceres_cal.base.written import note
 from ceres_cal.formats.format import Exported, ExportRequest
 from ceres_cal.formats.ssl_cameras import SslOptions
 from ceres_cal.formats.ssl_fields import target_of
@@ -62,7 +61,7 @@ def wrapped(geometry: Mapping[str, Any]) -> bytes:
 
 def publish(packet: bytes, group: Group, times: int | None = None, period_s: float = 3.0) -> int:
     """Send a packet so many times, without end where None; how often it was sent. What ends it early learns of it by
-    `base.written`.
+    `base.files`.
 
     Raises:
         InputError: the network does not take it.

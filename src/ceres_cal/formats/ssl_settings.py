@@ -19,7 +19,7 @@ from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, reader_traps, to_camera, to_entries
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import SslReadOptions
-from ceres_cal.scene.foreign import LARGEST
+from ceres_cal.scene.camera import LARGEST
 from ceres_cal.scene.targets import Target
 
 _CAMERA, _PARAMETERS, _FIELD = "Camera Calibrator", "Camera Parameters", "Field Configuration"

@@ -13,7 +13,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
-from ceres_cal.scene.foreign import LARGEST
+from ceres_cal.scene.camera import LARGEST
 
 
 def read_yaml(text: str) -> dict[str, Any]:

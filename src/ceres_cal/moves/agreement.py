@@ -13,8 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, rms
 from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
 from ceres_cal.base.words import HEIGHTS_M

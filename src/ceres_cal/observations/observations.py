@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property, replace
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.columns import (
@@ -35,7 +34,7 @@ from ceres_cal.observations.columns import (
 )
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered_curves, gathered_points
-from ceres_cal.observations.oddities import Copies, find_copies, odd_sizes, require_alike, stray_pixels
+from ceres_cal.observations.validation import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.scene.targets import Target
 
 _NAMES = attrgetter("camera", "station", "target", "placement")

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.scene.camera import Camera

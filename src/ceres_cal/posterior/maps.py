@@ -19,8 +19,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.shown import brief, drawn
 from ceres_cal.base.transforms import Pose
 from ceres_cal.posterior.posterior import Posterior

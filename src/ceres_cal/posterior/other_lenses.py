@@ -24,8 +24,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.effects.evidence import agreement as agreement_of

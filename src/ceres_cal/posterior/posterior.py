@@ -8,8 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.shown import brief
 from ceres_cal.base.spread import Spread, without
 from ceres_cal.base.tails import NORMAL_95, student_95

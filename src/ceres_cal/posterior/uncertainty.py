@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.shown import Shown, html_of, text_of
 from ceres_cal.base.spread import are_known
 from ceres_cal.base.typed import rows

@@ -5,7 +5,7 @@ over its free intrinsics alone; every other sight is one compressed block over i
 and its placement; each prior is one small block. What Ceres minimises is the same function either way.
 """
 
-from ceres_cal.base.native import kept_signals
+from ceres_cal.base.threads import kept_signals
 
 with kept_signals():
     from pyceres import __version__ as solver_version

@@ -18,8 +18,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.native import keep_freed_memory
-from ceres_cal.base.threads import at_most, available, single_threaded_blas
+from ceres_cal.base.threads import at_most, available, keep_freed_memory, single_threaded_blas
 from ceres_cal.base.transforms import Poses
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.costs import CachedCost, CostValue, Run

@@ -13,8 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.base.typed import checked_fields, take_types

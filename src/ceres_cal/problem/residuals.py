@@ -16,8 +16,7 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations import Observations
 from ceres_cal.observations.files import Content

@@ -17,8 +17,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.typed import take_types
 from ceres_cal.base.words import no_such
 from ceres_cal.observations.sights import Sights

@@ -7,7 +7,7 @@ quality of a calibration, few for the page.
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.lazy import names_of
+from ceres_cal.base.frozen import names_of
 
 if TYPE_CHECKING:
     from ceres_cal.report.material import FramePhotographs as FramePhotographs

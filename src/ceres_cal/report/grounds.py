@@ -15,7 +15,7 @@ from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, sho
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.effects.evidence import FLOOR_OFF_WORDS
-from ceres_cal.observations.oddities import COUNTED_ONCE
+from ceres_cal.observations.validation import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.quality import FaultyMap, Quality

@@ -11,8 +11,7 @@ from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, attempt
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis

@@ -13,8 +13,7 @@ from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, attempt
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose

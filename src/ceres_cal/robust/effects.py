@@ -14,8 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by

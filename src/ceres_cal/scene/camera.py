@@ -6,31 +6,47 @@ x_cam = R (x_world - t) with t the camera's position (paper, section 3).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
+from importlib import import_module
 from numbers import Real
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.shown import drawn, html_of
-from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import numbers_in, rows, size_in
-from ceres_cal.scene.foreign import (
-    FISHEYE,
-    LARGEST,
-    LARGEST_PX,
-    OPENCV_MODELS,
-    TO_HOLD,
-    ForeignCamera,
-    OpenCvCamera,
-    image_grid,
-    lens_fitted,
-)
 from ceres_cal.scene.lens import Lens
+
+LARGEST_PX = 10**9  # what is larger is no number of pixels
+LARGEST = 1e100  # of any number of a camera: squares and cubes of what is larger overflow
+_FOREIGN = "ceres_cal.scene.foreign"  # above: it is loaded when somebody asks for a camera in the words of others
+
+
+class OpenCvCamera(Struct, frozen=True, eq=False):
+    """A camera as OpenCV's functions take it: `K, dist, rvec, tvec = camera.to_opencv()`.
+
+    Attributes:
+        matrix: K (3, 3). distortion: its coefficients. rvec, tvec: (3,) from the world, metres.
+        fisheye: whether they are those of `cv2.fisheye`.
+        error_px: root mean square and largest distance over the image from the camera that it was made of.
+    """
+
+    matrix: Array
+    distortion: Array
+    rvec: Array
+    tvec: Array
+    fisheye: bool
+    error_px: tuple[float, float]
+
+    def __iter__(self) -> Iterator[Array]:
+        return iter((self.matrix, self.distortion, self.rvec, self.tvec))
 
 
 class Camera(Frozen, eq=True):
@@ -225,73 +241,12 @@ class Camera(Frozen, eq=True):
 
     # ---- in the words of others --------------------------------------------------------------------------------------
 
-    def to_foreign(self, *models: str) -> ForeignCamera:
-        """The camera in one of these models (see `ForeignCamera`): exactly where one holds its lens, else as the best
-        fit over the image.
-        """
-        blanks = []
-        for model in models:
-            focal, exact = (self.phi, self.phi * self.aspect), ForeignCamera.coefficients_of(self.lens, model)
-            numbers = exact or (0.0,) * (4 if model == FISHEYE else OPENCV_MODELS.get(model, 0))
-            one = ForeignCamera(self.image_size, focal, self.principal_point, model, numbers, self.cam_from_world)
-            if exact is not None and self.skew == 0.0:
-                return one
-            blanks += [] if model in TO_HOLD else [replace(one, coefficients=(0.0,) * len(numbers))]
-        pixels = image_grid(self.image_size)
-        rays = self.rays(pixels)
-        known = np.isfinite(rays[:, 0])
-        fits = [ForeignCamera.fitted(blank, rays[known], pixels[known]) for blank in blanks]
-        return min(fits, key=lambda fit: fit.error_px[0])
-
-    def nearest(self, lens: Lens) -> Camera:
-        """The camera with another lens, its coefficients and the other intrinsics fitted over the image.
-
-        Raises:
-            InputError: that lens would fold inside the image.
-        """
-        if (lens.kind, lens.names, self.skew) == (self.lens.kind, self.lens.names, 0.0):
-            return self
-        focal = (self.phi, self.phi * self.aspect)
-        start = ForeignCamera(self.image_size, focal, self.principal_point, FISHEYE, (0.0,) * 4)
-        pixels = image_grid(self.image_size)
-        rays = self.rays(pixels)
-        known = rays[:, 2] > 0.0
-        fit = lens_fitted(start, lens, rays[known], pixels[known])
-        if fit is None:
-            raise InputError(f"no {lens.kind} lens is near: it would fold over inside the image")
-        return Camera(**fit[0], cam_from_world=self.cam_from_world)
-
-    @classmethod
-    def from_foreign(cls, foreign: ForeignCamera) -> tuple[Camera, tuple[float, float]]:
-        """A camera of others as ours, and by how much that misses it over the image: root mean square and largest
-        distance, px, 0 where the lens is one of ours.
-
-        Raises:
-            InputError: it shows nothing of its image.
-        """
-        pose = foreign.cam_from_world or Pose.identity()
-        lens, (fx, fy) = foreign.lens, foreign.focal
-        if lens is not None:
-            return cls(foreign.image_size, fx, foreign.centre, lens, fy / fx, pose), (0.0, 0.0)
-        intrinsics, error_px = foreign.approximated()
-        return cls(**intrinsics, cam_from_world=pose), error_px
-
     def to_opencv(self) -> OpenCvCamera:
         """K, coefficients, rvec and tvec as OpenCV takes them; where it does not have the lens, or for a skew, the best
         fit, with its error.
         """
-        foreign, pose = self.to_foreign(*self.opencv_models), self.cam_from_world
-        vector, distortion = rotation_log(pose.rotation), np.array(foreign.coefficients)
-        fisheye = foreign.model == FISHEYE
-        return OpenCvCamera(foreign.matrix, distortion, vector, pose.translation.copy(), fisheye, foreign.error_px)
-
-    @property
-    def opencv_models(self) -> tuple[str, ...]:
-        """Those of OpenCV's models that may come near it: its fisheye where that is our lens, or sees across."""
-        across = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
-        is_one = ForeignCamera.coefficients_of(self.lens, FISHEYE) is not None
-        fisheye = is_one or bool(np.any(self.rays(image_grid(self.image_size))[:, 2] < across))
-        return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
+        camera: OpenCvCamera = import_module(_FOREIGN).to_opencv(self)
+        return camera
 
     @classmethod
     def from_opencv(
@@ -309,13 +264,15 @@ class Camera(Frozen, eq=True):
         Raises:
             InputError: numbers that make no camera.
         """
+        others = import_module(_FOREIGN)
         vectors = (numbers_in(one, name).ravel() for one, name in ((rvec, "rvec"), (tvec, "tvec")))
         given = numbers_in(distortion, "distortion").ravel()
         pose = Pose.exp(np.concatenate([*vectors]))
-        foreign = ForeignCamera.opencv(size_in(image_size), numbers_in(matrix, "matrix"), given, pose)
+        foreign = others.ForeignCamera.opencv(size_in(image_size), numbers_in(matrix, "matrix"), given, pose)
         if fisheye:
-            foreign = replace(foreign, model=FISHEYE, coefficients=tuple(given.tolist()))
-        return cls.from_foreign(foreign)[0]
+            foreign = replace(foreign, model=others.FISHEYE, coefficients=tuple(given.tolist()))
+        camera: Camera = foreign.camera()[0]
+        return camera
 
 
 def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:

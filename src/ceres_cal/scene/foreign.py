@@ -6,24 +6,21 @@ how much it misses: `error_px`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.least_squares import least_squares
-from ceres_cal.base.transforms import Pose, require_rotation
+from ceres_cal.base.transforms import Pose, require_rotation, rotation_log
+from ceres_cal.scene.camera import LARGEST, LARGEST_PX, Camera, OpenCvCamera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, make_lens
 
 OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
 """How many coefficients there are of OpenCV's, in its order: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]."""
-LARGEST_PX = 10**9  # what is larger is no number of pixels
-LARGEST = 1e100  # of any number of a camera: squares and cubes of what is larger overflow
 FISHEYE = "fisheye"
 """OpenCV's fisheye model: k1 to k4."""
 THIN_PRISM_FISHEYE = "THIN_PRISM_FISHEYE"
@@ -106,6 +103,25 @@ class ForeignCamera(Frozen):
             pose,
         )
 
+    @classmethod
+    def of(cls, camera: Camera, *models: str) -> ForeignCamera:
+        """A camera of ours in one of these models: exactly where one holds its lens, else as the best fit over the
+        image.
+        """
+        blanks = []
+        for model in models:
+            exact = cls.coefficients_of(camera.lens, model)
+            numbers = exact or (0.0,) * (4 if model == FISHEYE else OPENCV_MODELS.get(model, 0))
+            one = cls(camera.image_size, _focal(camera), camera.principal_point, model, numbers, camera.cam_from_world)
+            if exact is not None and camera.skew == 0.0:
+                return one
+            blanks += [] if model in TO_HOLD else [replace(one, coefficients=(0.0,) * len(numbers))]
+        pixels = image_grid(camera.image_size)
+        rays = camera.rays(pixels)
+        known = np.isfinite(rays[:, 0])
+        fits = [cls.fitted(blank, rays[known], pixels[known]) for blank in blanks]
+        return min(fits, key=lambda fit: fit.error_px[0])
+
     @property
     def matrix(self) -> Array:
         """K, (3, 3)."""
@@ -163,13 +179,16 @@ class ForeignCamera(Frozen):
         return replace(end, error_px=_error(end.project_rays(rays), pixels))
 
     @np.errstate(over="ignore", invalid="ignore")  # where it shows nothing
-    def approximated(self) -> tuple[dict[str, Any], tuple[float, float]]:
-        """The intrinsics of the camera of ours that is nearest over the image, by the names of `Camera`, and its root
-        mean square and largest distance, px.
+    def camera(self) -> tuple[Camera, tuple[float, float]]:
+        """The camera as ours, and by how much that misses it over the image: root mean square and largest distance,
+        px, 0 where the lens is one of ours.
 
         Raises:
             InputError: it shows nothing of its image.
         """
+        pose, lens, (fx, fy) = self.cam_from_world or Pose.identity(), self.lens, self.focal
+        if lens is not None:
+            return Camera(self.image_size, fx, self.centre, lens, fy / fx, pose), (0.0, 0.0)
         width, height = self.image_size
         rays = _all_directions()
         seen = self.project_rays(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
@@ -183,7 +202,12 @@ class ForeignCamera(Frozen):
         fits = [fit for lens in _LENSES if (fit := lens_fitted(self, lens, shown, pixels)) is not None]
         if not fits:
             raise InputError(f"no lens of ours is near its {self.model} model: correct its numbers")
-        return min(fits, key=lambda fit: fit[1][0])
+        camera, error_px = min(fits, key=lambda fit: fit[1][0])
+        return camera.at(pose), error_px
+
+
+def _focal(camera: Camera) -> tuple[float, float]:
+    return camera.phi, camera.phi * camera.aspect
 
 
 def _two(values: Array) -> tuple[float, float]:
@@ -209,8 +233,10 @@ def _all_directions() -> Array:
 
 def lens_fitted(
     foreign: ForeignCamera, lens: Lens, rays: Array, pixels: Array
-) -> tuple[dict[str, Any], tuple[float, float]] | None:
-    """Our lens nearest to what a foreign camera shows; None where it has no answer for some of it."""
+) -> tuple[Camera, tuple[float, float]] | None:
+    """The camera with a lens of ours that is nearest to a foreign one, and by how much it misses that; None where it
+    has no answer for some of what that shows.
+    """
     unit = 0.5 * float(np.hypot(*foreign.image_size))
     scales = lens.scales(unit)
     (fx, fy), centre = foreign.focal, foreign.centre
@@ -232,8 +258,34 @@ def lens_fitted(
     reach = float(np.max(np.hypot(pixels[:, 0] - end[2], (pixels[:, 1] - end[3]) / end[1])))
     if model.monotone_radius(end[0]) < reach:
         return None
-    intrinsics = {"phi": float(end[0]), "aspect": float(end[1]), "principal_point": _two(end[2:4]), "lens": model}
-    return {"image_size": foreign.image_size, **intrinsics}, _error(project(end), pixels)
+    camera = Camera(foreign.image_size, float(end[0]), _two(end[2:4]), model, float(end[1]))
+    return camera, _error(project(end), pixels)
+
+
+def nearest(camera: Camera, lens: Lens) -> Camera:
+    """A camera with another lens, its coefficients and the other intrinsics fitted over the image.
+
+    Raises:
+        InputError: that lens would fold inside the image.
+    """
+    if (lens.kind, lens.names, camera.skew) == (camera.lens.kind, camera.lens.names, 0.0):
+        return camera
+    start = ForeignCamera(camera.image_size, _focal(camera), camera.principal_point, FISHEYE, (0.0,) * 4)
+    pixels = image_grid(camera.image_size)
+    rays = camera.rays(pixels)
+    known = rays[:, 2] > 0.0
+    fit = lens_fitted(start, lens, rays[known], pixels[known])
+    if fit is None:
+        raise InputError(f"no {lens.kind} lens is near: it would fold over inside the image")
+    return fit[0].at(camera.cam_from_world)
+
+
+def opencv_models(camera: Camera) -> tuple[str, ...]:
+    """Those of OpenCV's models that may come near a camera: its fisheye where that is our lens, or sees across."""
+    across = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
+    is_one = ForeignCamera.coefficients_of(camera.lens, FISHEYE) is not None
+    fisheye = is_one or bool(np.any(camera.rays(image_grid(camera.image_size))[:, 2] < across))
+    return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
 
 
 def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> Array:
@@ -242,21 +294,9 @@ def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> A
     return np.column_stack([part.ravel() for part in np.meshgrid(*axes)])
 
 
-class OpenCvCamera(Struct, frozen=True, eq=False):
-    """A camera as OpenCV's functions take it: `K, dist, rvec, tvec = camera.to_opencv()`.
-
-    Attributes:
-        matrix: K (3, 3). distortion: its coefficients. rvec, tvec: (3,) from the world, metres.
-        fisheye: whether they are those of `cv2.fisheye`.
-        error_px: root mean square and largest distance over the image from the camera that it was made of.
-    """
-
-    matrix: Array
-    distortion: Array
-    rvec: Array
-    tvec: Array
-    fisheye: bool
-    error_px: tuple[float, float]
-
-    def __iter__(self) -> Iterator[Array]:
-        return iter((self.matrix, self.distortion, self.rvec, self.tvec))
+def to_opencv(camera: Camera) -> OpenCvCamera:
+    """See `Camera.to_opencv`."""
+    foreign, pose = ForeignCamera.of(camera, *opencv_models(camera)), camera.cam_from_world
+    vector, distortion = rotation_log(pose.rotation), np.array(foreign.coefficients)
+    fisheye = foreign.model == FISHEYE
+    return OpenCvCamera(foreign.matrix, distortion, vector, pose.translation.copy(), fisheye, foreign.error_px)

@@ -13,7 +13,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.base.errors import or_none
 from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.native import kept_signals
+from ceres_cal.base.threads import kept_signals
 from ceres_cal.observations import joined
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.start.closed_forms import (

@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.transforms import skews
 
 _LEAST = 1e-12  # of a length, which is divided by

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt

@@ -13,8 +13,7 @@ from math import gcd
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.detect.photographs.grid import LineGrid, Places, places_along
 from ceres_cal.detect.photographs.upright import Upright
 from ceres_cal.detect.registration import Nearness

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.spread import Spread
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
 from ceres_cal.posterior.mixture import Mixture

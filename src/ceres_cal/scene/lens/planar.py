@@ -14,8 +14,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.scene.lens.base import Lens
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53

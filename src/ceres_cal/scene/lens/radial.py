@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, horner, invert_increasing
 

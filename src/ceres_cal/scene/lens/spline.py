@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from ceres_cal.base.arrays import AnyArray, Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import cached_property
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 from ceres_cal.scene.lens.surface import (

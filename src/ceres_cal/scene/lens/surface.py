@@ -17,8 +17,7 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import Array, median
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 
 INTERVALS, DEGREE = 8, 5
 COUNT = INTERVALS + DEGREE - 2  # of the B-splines: value and slope at the axis are 0

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.lazy import LazyTable, names_of
+from ceres_cal.base.frozen import LazyTable, names_of
 from ceres_cal.scene.curves import SIDES as SIDES
 from ceres_cal.scene.curves import Arc as Arc
 from ceres_cal.scene.curves import Curve as Curve

@@ -17,8 +17,7 @@ from msgspec import Struct
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.base.frozen import Frozen, field
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, field
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import Array, Indices, Mask, median
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.observations.columns import Alone, Columns, Curves, Points, View, each_block, view_label
 from ceres_cal.observations.files import Content
 
