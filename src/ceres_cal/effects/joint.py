@@ -10,8 +10,7 @@ from collections.abc import Collection
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.lazy import cached_property
+from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.effects.effect import CameraEffect, Case
 from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.effects.table import EFFECTS

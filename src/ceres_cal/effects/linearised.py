@@ -394,8 +394,9 @@ def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -
     place = {key: column for column, key in enumerate(keys)}
     rows, values = [np.zeros((0, len(keys)))], [np.zeros(0)]
     for prior in problem.priors_at(estimate):
-        row = np.zeros((len(prior.information.root), len(keys)))
-        row[:, [place[key] for key in prior.keys]] = prior.information.root
+        root = prior.information.root
+        row = np.zeros((len(root), len(keys)))
+        row[:, [place[key] for key in prior.keys]] = root
         rows.append(row)
-        values.append(prior.residuals(estimate))
+        values.append(root @ prior.offsets(estimate))
     return np.vstack(rows), np.concatenate(values)

@@ -5,11 +5,11 @@ some frame on: knocked or zoomed, or the pictures of another camera.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, numbers_of
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped
 from ceres_cal.effects.effect import SMALL, CameraEffect, Case, Effect, Evidence, Words, amounts, half_diagonals
