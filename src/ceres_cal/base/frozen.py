@@ -8,7 +8,6 @@ from collections import UserDict
 from collections.abc import Callable, Mapping
 from dataclasses import Field, FrozenInstanceError, dataclass
 from dataclasses import field as field
-from dataclasses import replace as replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast, dataclass_transform
 
@@ -42,6 +41,21 @@ class Frozen:
     def __repr__(self) -> str:
         held = ", ".join(f"{name}={self.__dict__[name]!r}" for name in self.__dataclass_fields__)
         return f"{type(self).__qualname__}({held})"
+
+
+_T = TypeVar("_T")
+
+
+def replace(of: _T, /, **changes: Any) -> _T:
+    """`dataclasses.replace`, which does not go through `__init__`: what is the same was given once already."""
+    fields: Any = of.__dataclass_fields__  # type: ignore[attr-defined] # every dataclass has them
+    if unknown := changes.keys() - fields.keys():
+        raise TypeError(f"{type(of).__name__} has no field {', '.join(unknown)}")
+    made, held = object.__new__(type(of)), vars(of)
+    vars(made).update({name: held[name] for name in fields if name in held}, **changes)
+    if hasattr(made, "__post_init__"):
+        made.__post_init__()
+    return made
 
 
 _Row = TypeVar("_Row")

@@ -270,6 +270,9 @@ class Poses(Frozen, Mapping[str, Pose]):
         matrix = self.stack[self.numbers[name]]
         return Pose(matrix[:, :3], matrix[:, 3])
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.numbers
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.numbers)
 

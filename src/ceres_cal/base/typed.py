@@ -39,9 +39,11 @@ def take_types(instance: Any) -> None:
     Raises:
         InputError: a value has another type; the message names the field.
     """
-    for name, kind in _fields(type(instance)).items():  # type: ignore[arg-type] # a class has a hash
-        where = f"{type(instance).__name__}({name}=...)"
-        object.__setattr__(instance, name, convert(_plain(getattr(instance, name)), kind, where))
+    of, held = type(instance), vars(instance)
+    for name, kind in _fields(of).items():  # type: ignore[arg-type] # a class has a hash
+        value = held[name]
+        if type(value) is not kind and value is not getattr(of, name, held):  # nor its default
+            held[name] = convert(_plain(value), kind, f"{of.__name__}({name}=...)")
 
 
 @cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration

@@ -15,13 +15,13 @@ cells of the image and within them (analysis of variance).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
 from ceres_cal.calibration.lens_seen import (

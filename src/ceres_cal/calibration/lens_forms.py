@@ -6,7 +6,7 @@ Which of several lenses is the simplest that is as good as the best.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import replace
 from ceres_cal.problem.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
 from ceres_cal.scene.lens import LENSES, Lens, make_lens
 

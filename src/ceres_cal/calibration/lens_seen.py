@@ -6,13 +6,13 @@ Each kind of lens near its best, and what follows for each of its lenses.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.frozen import cached_property
+from ceres_cal.base.frozen import cached_property, replace
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals

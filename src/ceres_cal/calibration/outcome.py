@@ -6,13 +6,13 @@ Warnings of what the observations leave open: phi that they do not tell, or that
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import bounds_text, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejected

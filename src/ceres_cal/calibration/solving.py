@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import attempt
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import meanwhile
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (

@@ -5,11 +5,12 @@ from __future__ import annotations
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import replace
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.terminal import ProgressBar, progress_bar

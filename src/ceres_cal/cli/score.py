@@ -39,8 +39,7 @@ class ScoreArguments(Arguments):
 )
 def _run(args: ScoreArguments) -> Document:
     require_different(args.observations)
-    from dataclasses import replace
-
+    from ceres_cal.base.frozen import replace
     from ceres_cal.moves.scores import score
 
     calibration = read_calibration(args.calibration)

@@ -72,6 +72,11 @@ class AddedNumbers(Frozen):
         """(Q,) its standard deviations, infinite for what cannot be determined."""
         return np.where(np.any(self.root != 0.0, axis=1), np.sqrt(np.sum(self.root**2, axis=1)), np.inf)
 
+    def under(self, variances: Array) -> Array:
+        """(Q,) what brings them to their likeliest values under variances (Q,) that are expected of these."""
+        within = np.eye(len(self.step)) + (self.root.T / variances) @ self.root
+        return np.asarray(-self.root @ np.linalg.solve(within, self.step))
+
     @property
     def decrease(self) -> float:
         """By how much the squared residuals fall."""
@@ -389,8 +394,9 @@ def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -
     place = {key: column for column, key in enumerate(keys)}
     rows, values = [np.zeros((0, len(keys)))], [np.zeros(0)]
     for prior in problem.priors_at(estimate):
-        row = np.zeros((len(prior.information.root), len(keys)))
-        row[:, [place[key] for key in prior.keys]] = prior.information.root
+        root = prior.information.root
+        row = np.zeros((len(root), len(keys)))
+        row[:, [place[key] for key in prior.keys]] = root
         rows.append(row)
-        values.append(prior.residuals(estimate))
+        values.append(root @ prior.offsets(estimate))
     return np.vstack(rows), np.concatenate(values)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import reduce
 from operator import add
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate

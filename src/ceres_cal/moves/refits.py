@@ -7,12 +7,12 @@ the old posterior is one more prior, as a full matrix.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import DegenerateError, SolutionError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted

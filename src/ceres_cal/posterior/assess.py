@@ -7,12 +7,12 @@ lenses rougher than their model, and other lenses.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ceres_cal.base.arrays import numerical
+from ceres_cal.base.frozen import replace
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.observations import Observations

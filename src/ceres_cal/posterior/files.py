@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
+from ceres_cal.base.frozen import replace
 from ceres_cal.effects.dependence import Dependence
 from ceres_cal.posterior.bent import Ends
 from ceres_cal.posterior.mixture import Chain, Mixture

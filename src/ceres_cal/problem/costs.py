@@ -74,7 +74,7 @@ class CachedCost(_CostFunction):
         with self._run:
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
-            if self._known is None or not np.array_equal(self._known.at, at):
+            if self._known is None or self._known.at.tobytes() != at.tobytes():
                 self._known = self._evaluated(at, parameters)
             known = self._known
         if known is None:
@@ -315,9 +315,9 @@ class Chart:
         chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
         return np.asarray(chained)
 
-    @np.errstate(all="ignore")  # phi may be 0 on the way: no camera, which shows nothing
     def _scales(self, numbers: Array) -> Array:
-        return np.asarray((numbers[self._phi] / self._unit) ** self._powers)
+        nothing = 1e-30  # phi may be 0 on the way: no camera, which shows nothing
+        return np.asarray((numbers[self._phi] / self._unit or nothing) ** self._powers)
 
 
 def chart_of(camera: Camera, free: Indices) -> Chart | None:

@@ -6,7 +6,7 @@ How what a camera shows moves with its numbers: exactly, by the loops of the sol
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
-from dataclasses import replace
+from functools import lru_cache
 from itertools import chain
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log, skew
 from ceres_cal.problem.information import POSE_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
 from ceres_cal.problem.parameters import (
@@ -105,9 +106,9 @@ def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
         names = [keys[column].quantity for column in columns]
         if kind == "camera":
             camera = estimate.cameras[owner]
-            known = intrinsic_names(camera.lens)
-            every = intrinsics_vector(camera) / intrinsics_scales(camera)
-            values[columns] = every[[known.index(name) for name in names]]
+            numbers = camera.phi, camera.aspect, *camera.principal_point, *camera.lens.values, camera.skew
+            known = dict(zip(intrinsic_names(camera.lens), numbers, strict=True))
+            values[columns] = [known[name] for name in names]
         elif keys[columns[0]].is_structure:
             at = [estimate.structure.names.index(keys[column].structure_name) for column in columns]
             values[columns] = estimate.structure.values[at]
@@ -119,10 +120,15 @@ def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
     return values
 
 
-def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
+def intrinsic_keys(name: str, lens: Lens) -> tuple[Key, ...]:
     """Keys of all intrinsics of a camera, in the order of the solver's vector."""
-    units = ("px", "1", "px", "px", *lens.units, "1")
-    return [Key("camera", name, quantity, unit) for quantity, unit in zip(intrinsic_names(lens), units, strict=True)]
+    return _intrinsic_keys(name, intrinsic_names(lens), lens.units)
+
+
+@lru_cache(maxsize=64)
+def _intrinsic_keys(name: str, quantities: tuple[str, ...], units: tuple[str, ...]) -> tuple[Key, ...]:
+    every = zip(quantities, ("px", "1", "px", "px", *units, "1"), strict=True)
+    return tuple(Key("camera", name, quantity, unit) for quantity, unit in every)
 
 
 def every_key(estimate: Estimate) -> frozenset[Key]:

@@ -11,6 +11,7 @@ The lengths that targets are drawn by, and how another value of one moves points
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import repeat
 from typing import Literal
 
 import numpy as np
@@ -143,7 +144,7 @@ class Structure(Frozen):
         known = dict(zip(self.names[self.own :], self.drawn_m.tolist(), strict=True))
         for other in others:
             known |= zip(other.names, other.values.tolist(), strict=True)
-        return self.with_values(np.array([known.get(name, 0.0) for name in self.names]))
+        return self.with_values(np.array(list(map(known.get, self.names, repeat(0.0)))))
 
     def redrawn(self) -> Structure:
         """The same of targets that are drawn with the dimensions as they are here."""
@@ -223,66 +224,69 @@ def make_structure(
             raise InputError(f"a tolerance: {no_such('target', name, targets)}")
     if all(tolerance == Tolerance() for tolerance in tolerances.values()) and not dimensions:
         return EXACT
-    every = [of for name, target in targets.items() for of in _tolerated(name, target, tolerances)]
-    names = [name for name, sigma_m in every if sigma_m > 0.0]
-    sigmas = [sigma_m for _, sigma_m in every if sigma_m > 0.0]
-    others = [name for name, sigma_m in every if not sigma_m > 0.0] if dimensions else []
-    drawn_m, slopes = dimension_slopes((*names, *others), targets, dimensions)
+    parts = [_tolerated(name, target, tolerances.get(name, Tolerance())) for name, target in targets.items()]
+    every, sigmas = [name for names, _ in parts for name in names], np.concatenate([sigma_m for _, sigma_m in parts])
+    free = np.flatnonzero(sigmas > 0.0)
+    order = np.concatenate([free, np.flatnonzero(sigmas == 0.0)]) if dimensions else free
+    names = [every[number] for number in order]
+    drawn_m, slopes = dimension_slopes(names, targets, dimensions)
     for name, column in zip(dimensions, slopes.T, strict=True):
         if not np.any(column):
             raise InputError(f"no line or point lies elsewhere with another {name}: it cannot be solved for")
-    moved = np.any(slopes != 0.0, axis=1) | (np.arange(len(slopes)) < len(names))
-    place = {name: row for row, name in enumerate(np.array([*names, *others])[moved].tolist())}
+    moved = np.any(slopes != 0.0, axis=1) | (np.arange(len(slopes)) < len(free))
+    place = np.full(len(every), -1, dtype=np.int32)
+    place[order[moved]] = np.arange(np.count_nonzero(moved))
     return Structure(
-        (*names, *dimensions),
-        np.array([*np.zeros(len(names)), *drawn_m]),
-        np.array([*sigmas, *np.full(len(drawn_m), np.inf)]),
+        (*names[: len(free)], *dimensions),
+        np.concatenate([np.zeros(len(free)), drawn_m]),
+        np.concatenate([sigmas[free], np.full(len(drawn_m), np.inf)]),
         *_slots(targets, place),
         slopes[moved],
         drawn_m,
     )
 
 
-def _tolerated(name: str, target: Target, tolerances: Mapping[str, Tolerance]) -> Iterator[tuple[str, float]]:
+def _tolerated(name: str, target: Target, tolerance: Tolerance) -> tuple[list[str], Array]:
     """Everything of a target that may be offset, and its tolerance, in the order of the solver's numbers."""
-    tolerance = tolerances.get(name, Tolerance())
-    for curve_name, curve in target.curves.items():
-        sigma_m = tolerance.curve_m.get(curve_name, tolerance.lines_m)
-        yield from ((f"{name}/{curve_name}{part}", sigma_m) for part in _parts_of(curve))
     if max(tolerance.warp_m, tolerance.heights_m) > 0.0 and not target.bows:
         raise InputError(
             "a warp or heights are for checkerboards and boards like them: "
             f"target {name!r}, of kind {target.kind!r}, does not bow"
         )
-    yield from ((f"{name}/{part}", tolerance.warp_m) for part in WARP)
-    for point_name in target.points:
-        yield from ((f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy")
-    if tolerance.heights_m > 0.0:
-        yield from ((f"{name}/{point_name}.z", tolerance.heights_m) for point_name in target.points)
+    curves = [(one, part) for one, curve in target.curves.items() for part in _parts_of(curve)]
+    names = [
+        *[f"{name}/{one}{part}" for one, part in curves],
+        *[f"{name}/{part}" for part in WARP],
+        *[f"{name}/{one}.{axis}" for one in target.points for axis in "xy"],
+        *[f"{name}/{one}.z" for one in target.points],
+    ]
+    sigmas = [tolerance.curve_m.get(one, tolerance.lines_m) for one, _ in curves]
+    others, count = (tolerance.warp_m, tolerance.points_m, tolerance.heights_m), len(target.points)
+    return names, np.concatenate([sigmas, np.repeat(others, (len(WARP), 2 * count, count))])
 
 
 def _parts_of(curve: Curve) -> tuple[str, ...]:
     return (".x", ".y", ".radius") if isinstance(curve, Arc) else ("",)
 
 
-def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Indices32, Array, Indices32]:
-    """Point slots, bends and track slots, by the place of each offset."""
+def _slots(targets: Mapping[str, Target], place: Indices32) -> tuple[Indices32, Array, Indices32]:
+    """Point slots, bends and track slots, by the place of each offset in the order of `_tolerated`."""
     none = -1
-    point_slots, bends, track_slots = [], [], []
-    for name, target in targets.items():
+    point_slots, track_slots, start = [], [], 0
+    for target in targets.values():
         curves = []
-        for curve_name, curve in target.curves.items():
-            slots = [place.get(f"{name}/{curve_name}{part}", none) for part in _parts_of(curve)]
-            curves.append(slots + [none] * (3 - len(slots)))
+        for curve in target.curves.values():
+            parts = len(_parts_of(curve))
+            curves.append([*place[start : start + parts], *[none] * (3 - parts)])
+            start += parts
         track_slots += curves * 3  # the paint's centre and both edges move together
-        warp = [place.get(f"{name}/{part}", none) for part in WARP]
-        for point_name in target.points:
-            x, y, z = (place.get(f"{name}/{point_name}.{axis}", none) for axis in "xyz")
-            point_slots.append([x, y, *warp, z])
-        bends.append(bends_of(target))
+        count, ends = len(target.points), start + len(WARP)
+        warp, flat, heights = np.split(place[start : ends + 3 * count], [len(WARP), len(WARP) + 2 * count])
+        point_slots.append(np.column_stack([flat.reshape(-1, 2), np.tile(warp, (count, 1)), heights]))
+        start = ends + 3 * count
     return (
-        np.array(point_slots, dtype=np.int32).reshape(-1, 3 + len(WARP)),
-        np.concatenate(bends),
+        np.concatenate(point_slots),
+        np.concatenate([bends_of(target) for target in targets.values()]),
         np.array(track_slots, dtype=np.int32).reshape(-1, 3),
     )
 

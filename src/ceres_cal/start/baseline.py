@@ -7,13 +7,13 @@ its first two columns (section 3.5). phi is taken as measured beforehand, as the
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Estimate, Station

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice, product
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import attempt
+from ceres_cal.base.frozen import replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate_near
 from ceres_cal.detect.courses import Course, clear_px, predict

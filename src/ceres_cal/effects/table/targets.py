@@ -5,12 +5,12 @@ at one place than around it, or with a field that is painted out of square.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import first_of
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts

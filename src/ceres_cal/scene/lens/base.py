@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import no_such
 
 LinearEquations = tuple[dict[str, Array], Array]
@@ -101,7 +102,7 @@ class Lens(ABC):
     set_at_start: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", tuple(float(v) for v in self.values))
+        object.__setattr__(self, "values", tuple(map(float, self.values)))
         if len(self.values) != len(self.names):
             raise InputError(
                 f"lens {self.kind!r} has coefficients {', '.join(self.names)}: give {len(self.names)} numbers, "
@@ -178,7 +179,7 @@ class Lens(ABC):
 
     def with_values(self, values: ArrayLike) -> Lens:
         """The same model with other coefficients."""
-        return replace(self, values=tuple(float(v) for v in np.asarray(values, dtype=float)))
+        return replace(self, values=np.asarray(values, dtype=float).tolist())
 
     def distort(self, rays: ArrayLike, phi: float) -> Array:
         """Rays (N, 3) -> measured offsets (N, 2) px; NaN where the model has no answer."""
@@ -208,12 +209,12 @@ class Lens(ABC):
     @property
     def lengths(self) -> tuple[int, ...]:
         """The power of px that each coefficient's unit is; 0 of what acts on directions."""
-        return tuple(1 - order if self.acts_on_pixels else 0 for order in self.orders)
+        return tuple([1 - order for order in self.orders]) if self.acts_on_pixels else (0,) * len(self.names)
 
     @property
     def units(self) -> tuple[str, ...]:
         """The unit of each coefficient."""
-        return tuple({0: "1", 1: "px"}.get(power, f"px^{power}") for power in self.lengths)
+        return tuple(["1" if power == 0 else "px" if power == 1 else f"px^{power}" for power in self.lengths])
 
     @property
     def formula(self) -> str:

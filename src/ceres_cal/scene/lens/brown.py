@@ -13,6 +13,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.scene.lens.base import LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Decentred
 
+_ORDERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 7, "s1": 2, "s2": 4, "s3": 2, "s4": 4}
+
 
 @dataclass(frozen=True)
 class Brown(Decentred):
@@ -37,8 +39,7 @@ class Brown(Decentred):
 
     @property
     def orders(self) -> tuple[int, ...]:
-        order = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 7}
-        return tuple(order.get(name, 2 if name in ("s1", "s3") else 4) for name in self.names)
+        return tuple(map(_ORDERS.__getitem__, self.names))
 
     @staticmethod
     def _flat(rays: Array) -> Array:
