@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.columns import EffectColumns, EffectSums, SparseColumns, grouped
-from ceres_cal.effects.effect import Case
+from ceres_cal.effects.effect import Case, half_diagonals
 from ceres_cal.effects.evidence import (
     FEATURE_ASIDE,
     OFFSETS_SCATTER,
@@ -215,7 +215,7 @@ def test_a_bent_board(seen: Seen) -> None:
 
 def test_a_rough_lens(seen: Seen) -> None:
     """The likeliest size of waves along the radius is where the same likelihood, of known noise, is largest."""
-    offsets = seen.case.offsets("overhead")
+    offsets = half_diagonals(seen.case.estimate.cameras["overhead"], seen.model.equations.pixel)
     radius = np.linalg.norm(offsets, axis=1)
     outward = np.sum(seen.model.equations.direction * offsets, axis=1) / radius
     waves = outward[:, None] * np.cos(np.pi * np.arange(4, 64) * radius[:, None]) * seen.model.weight[:, None]

@@ -19,9 +19,12 @@ from scenes import RADIAL, SCENES, camera
 from ceres_cal import Calibration, Observations, Options, Pose, Prior, calibrate, write_report
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
-from ceres_cal.base.words import at_precision, short
+from ceres_cal.base.words import HEIGHTS_M, at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
+from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.score_tests import ScoreTest
+from ceres_cal.effects.table.camera import motion_columns
 from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, reaches, worst
@@ -208,8 +211,19 @@ def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
 @pytest.mark.usefixtures("words_alone")
 def test_a_wrong_model_is_never_simply_trusted() -> None:
     observations = sample()[1]
-    page = make_report(calibrate(observations, Options(powers=(3,))), observations)
-    assert headline(page).startswith("no: Do not trust this calibration: the faults below move it by ")  # 69 sd
+    calibration = calibrate(observations, Options(powers=(3,)))
+    page = make_report(calibration, observations)
+    promised = re.fullmatch(
+        r"care: Usable with limits: to ([\d.]+)\smm on the floor and to ([\d.]+)\smm at robot height .*", headline(page)
+    )
+    assert promised is not None
+    camera = built_in_scene("ssl-field")[0].camera_at("overhead")
+    for height_m, stated_mm in zip(HEIGHTS_M, map(float, promised.groups()), strict=True):  # 7.7 and 8.7
+        known = calibration.uncertainty.map_sd_mm(height_m=height_m)
+        places = known.places[np.isfinite(known.sd_mm.ravel())]
+        pixels = camera.project(np.column_stack([places, np.full(len(places), height_m)]))
+        off_mm = 1e3 * np.linalg.norm(calibration.station().locate(pixels, height_m) - places, axis=1)
+        assert 0.5 * stated_mm < np.quantile(off_mm, 0.95) < stated_mm  # 5.9 and 6.0
     assert "The accuracy in the first line includes this" in page
     cards = re.findall(r'<article class="card (\w+)"><h3>(.*?)</h3>', page)
     assert cards[0][0] == "no" and "residuals follow the radius" in cards[0][1]
@@ -253,10 +267,15 @@ def test_a_fault_that_moves_places_by_little_is_counted() -> None:
     assert sound.diagnosis is not None and sound.uncertainty is not None
     key = next(key for key in sound.uncertainty.posterior.keys if key.quantity == "x")
     sd = sound.uncertainty.posterior.sd_of(*key[:3])
-    (finding, *_) = sound.diagnosis.findings
+    fault = replace(sound.diagnosis.findings[0], wrong="model", effect_mm=1.0)
+    step = sound.diagnosis.step
+    along_x = motion_columns(step.case)[:, 3:4]
+    shifted = EffectColumns("moved in", along_x, np.zeros(len(along_x), dtype=np.int64), ("overhead",))
+    cause = ScoreTest(shifted, 0, 0.0, 1, 0.0, np.ones(1), np.ones(1))
     for sigmas, level in ((0.05, "good"), (30.0, "no")):
-        fault = replace(finding, wrong="model", effect_mm=1.0, moves=((key, sigmas * sd),))
-        judged = replace(sound, diagnosis=replace(sound.diagnosis, findings=(fault,)))
+        moved = replace(step, causes=((cause, np.array([sigmas * sd])),))
+        assert abs(moved.moves[key]) == pytest.approx(sigmas * sd, rel=1e-6)
+        judged = replace(sound, diagnosis=replace(sound.diagnosis, findings=(fault,), step=moved))
         assert judge_quality(judged).level == level
         before, after = reaches(sound)[0].radius_mm, reaches(judged)[0].radius_mm
         assert after >= np.hypot(before, 2.0) and (after > before + 1.0 if sigmas > 1.0 else after < before + 2.0)

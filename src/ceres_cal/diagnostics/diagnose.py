@@ -21,6 +21,7 @@ from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.effects.columns import EffectSums, least_absolute
 from ceres_cal.effects.effect import Finding
+from ceres_cal.effects.joint import JointStep, joint_step
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import select
 from ceres_cal.effects.table import EFFECTS, columns_of_all
@@ -46,6 +47,7 @@ class Diagnosis(Frozen):
         noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
         degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
         conflicts: what was known beforehand and everything else contradicts, the calibration's own.
+        step: what the calibration would be with all causes taken into account at once that are wrong with the model.
         new_data: whether the observations are others than those the calibration was made from. tests: how many
             alternatives were tested, and false_alarm_rate: the probability that sound data get any finding at all,
             Bonferroni over all of them. It holds for normal noise; what it does not hold for is said by "correlated".
@@ -60,6 +62,7 @@ class Diagnosis(Frozen):
     new_data: bool
     tests: int
     false_alarm_rate: float
+    step: JointStep
     conflicts: tuple[Conflict, ...] = ()
 
     @property
@@ -128,13 +131,14 @@ def diagnose(
         observations.digest != calibration.digest,
         tested.selection.tests,
         false_alarm_rate,
+        joint_step(case, tested.selection, _solved(case)),
         calibration.conflicts,
     )
 
 
 def _findings(tested: TestResults) -> Iterator[Finding]:
     """Of effects, also of those that the calibration solved for by itself, and of checks."""
-    solved = {(one.kind, one.subject, one.frame) for one in tested.case.effects}
+    solved = _solved(tested.case)
     for effect in EFFECTS.values():
         for finding in effect.findings(tested.case, tested.selection):
             if (finding.kind, finding.subject, finding.frame) in solved:
@@ -145,6 +149,11 @@ def _findings(tested: TestResults) -> Iterator[Finding]:
                 yield solved_for(effect.kind, one, tested)
     for check in CHECKS.values():
         yield from check.findings(tested)
+
+
+def _solved(case: DiagnosisCase) -> set[tuple[str, str, str | None]]:
+    """Effects by kind, subject and frame that the calibration solved for by itself."""
+    return {(one.kind, one.subject, one.frame) for one in case.effects}
 
 
 def _require_known(calibration: Calibration, observations: Observations, new_data: bool) -> None:

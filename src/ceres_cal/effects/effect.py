@@ -23,9 +23,9 @@ from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.residuals import Equations, plane_shift, whole_structure
 from ceres_cal.problem.structure import Kind, Structure
+from ceres_cal.scene.camera import Camera
 
 SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
@@ -113,7 +113,6 @@ class Finding(Frozen, eq=True):
         amounts: what would mend it.
         log10_p: decimal logarithm of the probability of a false alarm anywhere in the calibration, after Bonferroni.
         observations: how many it moves; rows: (kind, row) of the observations of a wrong label.
-        moves: by how much numbers of cameras and stations would move, were it taken into account.
     """
 
     kind: str
@@ -129,7 +128,6 @@ class Finding(Frozen, eq=True):
     log10_p: float
     observations: int
     rows: tuple[tuple[str, int], ...] = ()
-    moves: tuple[tuple[Key, float], ...] = ()
 
     @property
     def is_model_error(self) -> bool:
@@ -190,27 +188,21 @@ class Case(Frozen):
         squared = np.nansum(((x**2 + y**2) / twice)[rows])
         return Displacement(float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count)
 
-    def moves(self, score: ScoreTest, amount: Array) -> tuple[tuple[Key, float], ...]:
-        """By how much numbers of cameras and stations move where a group of an effect is at some amounts."""
-        keys = free_keys(self.estimate, self.problem.layout, self.problem.private)
-        moved = zip(keys, (self.model.taken_by(score.columns) @ amount).tolist(), strict=True)
-        return tuple((key, by) for key, by in moved if key.kind in ("camera", "station"))
-
     def noise_px(self, left_over: Array, rows: Mask) -> float:
         """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
         count = len(distinct(self.equations.observation[rows]))
         return float(np.sqrt(np.sum((left_over / self.model.weight)[rows] ** 2) / count))
-
-    def offsets(self, camera: str) -> Array:
-        """(E, 2) of every predicted pixel from the principal point, in half image diagonals."""
-        one = self.estimate.cameras[camera]
-        return one.offsets(self.equations.pixel) / unit_px(one)
 
     def free_coefficients(self, camera: str) -> set[str]:
         """Names of those that the lens solves for."""
         lens = self.estimate.cameras[camera].lens
         names = intrinsic_names(lens)
         return {names[number] for number in self.problem.layout.free[camera]} & set(lens.names)
+
+
+def half_diagonals(camera: Camera, pixels: Array) -> Array:
+    """(N, 2) of pixels (N, 2) from the principal point, in half image diagonals."""
+    return np.asarray(camera.offsets(pixels) / unit_px(camera))
 
 
 class Evidence(Frozen):
@@ -299,18 +291,20 @@ class Effect(ABC):
         own = [number for number, score in enumerate(selection.chosen) if score.effect.kind == self.kind]
         yield from self.together([self._finding(case, selection, number) for number in own])
 
-    def _likeliest(self, case: Case, score: ScoreTest) -> Array:
-        """(Q,) amounts of a group under what is expected of their size, where anything is, or under a larger one that
-        they show. A bow of 24 ± 26 mm moves a camera by what floors have, not by 24 mm; nor does one of 150 ± 30 mm,
-        which is something else that looks like it.
+    def variances(self, case: Case, score: ScoreTest) -> Array:
+        """(Q,) expected of the amounts of a group, where anything is, or larger ones that they show: a bow of 24 ± 26
+        mm moves a camera by what floors have, not by 24 mm; nor does one of 150 ± 30 mm, which is something else that
+        looks like it. Infinite where nothing is expected.
         """
         most = 4.0  # times the usual size: 9 mm of a field of 9 m
         prior = self.prior_of(score.effect, score.number, case)
-        if prior is None:
-            return score.amount
-        usual = float(np.mean(np.square(prior.sizes)))
-        size = np.clip(score.amount**2 - score.sd**2, usual, most**2 * usual)
-        return np.asarray(score.amount * size / (size + score.sd**2))
+        usual = np.inf if prior is None else float(np.mean(np.square(prior.sizes)))
+        return np.clip(score.amount**2 - score.sd**2, usual, most**2 * usual)
+
+    def is_implausible(self, case: Case, score: ScoreTest) -> bool:
+        """Whether amounts that are clear would be less than half as large under what is expected of their size."""
+        clear = 2.0  # standard deviations
+        return bool(np.any((np.abs(score.amount) > clear * score.sd) & (self.variances(case, score) < score.sd**2)))
 
     def _finding(self, case: Case, selection: Selection, number: int) -> Finding:
         chosen = selection.chosen
@@ -323,10 +317,33 @@ class Effect(ABC):
         if score.rivals:
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
             sentence += f"; these data do not distinguish it from {names}"
-        likeliest, clear = self._likeliest(case, score), 2.0  # standard deviations
-        if np.any((np.abs(score.amount) > clear * score.sd) & (np.abs(likeliest) < 0.5 * np.abs(score.amount))):
+        if self.is_implausible(case, score):
             sentence += ". That is more than usual, so it is probably something else that looks like it"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
-            selection.log10_p(score.log_p), effect.observations, moves=case.moves(score, likeliest),
+            selection.log10_p(score.log_p), effect.observations,
         )  # fmt: skip
+
+
+class CameraEffect(Effect):
+    """What a camera does to its picture besides."""
+
+    absorbed = True
+
+    @abstractmethod
+    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
+        """(N, 2, Q) px at pixels (N, 2) per unit of its amounts; None where the camera solves for them."""
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        equations, group, parts = case.equations, case.camera.copy(), []
+        for number, name in enumerate(case.cameras):
+            own = np.flatnonzero(case.camera == number)
+            displaced = self.displacement(case, name, equations.pixel[own])
+            if displaced is None:
+                group[own] = -1
+            else:
+                parts.append((own, np.sum(equations.direction[own, :, None] * displaced, axis=1)))
+        columns = np.zeros((len(equations), max((part.shape[1] for _, part in parts), default=1)))
+        for own, part in parts:
+            columns[own, : part.shape[1]] = part
+        yield EffectColumns(self.kind, columns, group, case.cameras)

@@ -72,6 +72,11 @@ class AddedNumbers(Frozen):
         """(Q,) its standard deviations, infinite for what cannot be determined."""
         return np.where(np.any(self.root != 0.0, axis=1), np.sqrt(np.sum(self.root**2, axis=1)), np.inf)
 
+    def under(self, variances: Array) -> Array:
+        """(Q,) what brings them to their likeliest values under variances (Q,) that are expected of these."""
+        within = np.eye(len(self.step)) + (self.root.T / variances) @ self.root
+        return np.asarray(-self.root @ np.linalg.solve(within, self.step))
+
     @property
     def decrease(self) -> float:
         """By how much the squared residuals fall."""

@@ -17,13 +17,15 @@ from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.effects.effect import Finding
+from ceres_cal.effects.effect import SMALL, CameraEffect, Finding
+from ceres_cal.effects.joint import JointStep
+from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import thinned
 from ceres_cal.posterior.maps import FieldMap, ImageMap, locate_slopes, visible_pixels
 from ceres_cal.posterior.seam import Disagreement
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
-from ceres_cal.problem.information import Key, over
+from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import OF_PIXELS
 from ceres_cal.scene.targets import Target
 
@@ -58,34 +60,41 @@ class FaultyMap(Struct, frozen=True, eq=False):
         return float(np.sqrt(np.sum(self.moved_mm[known] ** 2))) / sd if sd > 0.0 else 0.0
 
 
-def faulty_map(known: Uncertainty, of: FieldMap, faults: Sequence[Finding]) -> FaultyMap:
-    """A map with faults counted, which are taken for independent of one another."""
-    moved_mm, keys = np.zeros(of.shape), known.posterior.keys
-    if faults:
+def faulty_map(
+    known: Uncertainty, of: FieldMap, step: JointStep | None, faults: Sequence[Finding], doubtful_mm: float
+) -> FaultyMap:
+    """A map with faults counted: what a camera has besides displaces the image, and moves its numbers."""
+    moved_mm = np.zeros(of.shape)
+    if step is not None and step.causes:
         pixels = visible_pixels(known.estimate, of.station, of.places, of.height_m)
         own = known.posterior.keys_of(known.estimate, of.station)
         slopes = locate_slopes(known.estimate, own, of.station, pixels, of.height_m)
-        steps = over(np.array([_step(fault, keys) for fault in faults]), keys, own)
-        moved_mm = 1e3 * np.sqrt(np.sum((slopes @ steps.T) ** 2, axis=(1, 2))).reshape(of.shape)
-    return FaultyMap(of, moved_mm, float(np.sqrt(np.nansum([fault.effect_mm**2 for fault in faults]))))
+        displaced = step.displaced(known.estimate.stations[of.station].camera, pixels)
+        back = known.estimate.camera_at(of.station).locate(pixels - displaced, of.height_m)
+        moved = back - of.places + slopes @ _steps(step, own)
+        moved_mm = 1e3 * np.linalg.norm(moved, axis=1).reshape(of.shape)
+    others = [fault.effect_mm for fault in faults if not _is_of_camera(fault)]
+    return FaultyMap(of, np.hypot(moved_mm, doubtful_mm), float(np.sqrt(np.nansum(np.square(others)))))
 
 
-def sigmas_of_cameras(known: Uncertainty, faults: Sequence[Finding]) -> float:
+def _is_of_camera(fault: Finding) -> bool:
+    return isinstance(EFFECTS.get(fault.kind), CameraEffect)
+
+
+def sigmas_of_cameras(known: Uncertainty, step: JointStep | None) -> float:
     """By how many of its standard deviations the number of a camera that faults move farthest is moved; coefficients
     are not looked at, which trade off against one another.
     """
     keys, sd = known.posterior.keys, known.posterior.sd
     own = np.array([key.kind == "camera" and key.quantity in OF_PIXELS for key in keys], dtype=bool)
-    if not (faults and own.any()):
-        return 0.0
-    squares = np.sum([_step(fault, keys) ** 2 for fault in faults], axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.nanmax(np.sqrt(squares[own]) / sd[own]))
+        sigmas = np.abs(_steps(step, keys)[own]) / sd[own]
+    return float(np.nanmax(sigmas, initial=0.0))
 
 
-def _step(fault: Finding, keys: Sequence[Key]) -> Array:
-    """(K,) by how much it moves some numbers."""
-    moves = dict(fault.moves)
+def _steps(step: JointStep | None, keys: Sequence[Key]) -> Array:
+    """(K,) by how much some numbers move."""
+    moves = {} if step is None else step.moves
     return np.array([moves.get(key, 0.0) for key in keys])
 
 
@@ -164,14 +173,30 @@ class Quality(Frozen):
         every = () if self.diagnosis is None else self.diagnosis.findings
         return tuple(finding for finding in every if finding.is_model_error)
 
+    @property
+    def _step(self) -> JointStep | None:
+        return None if self.diagnosis is None else self.diagnosis.step
+
     @cached_property
     def faulty_maps(self) -> tuple[tuple[FaultyMap, ...], ...]:
         """The maps with faults counted, of each placed station, at HEIGHTS_M."""
         if self.uncertainty is None:
             return ()
         return tuple(
-            tuple(faulty_map(self.uncertainty, one, self.faults) for one in maps) for maps in self.maps.values()
+            tuple(faulty_map(self.uncertainty, one, self._step, self.faults, self.doubtful_mm) for one in maps)
+            for maps in self.maps.values()
         )
+
+    @property
+    def doubtful_mm(self) -> float:
+        """By how much the feature of a field lies aside that was solved for farthest, where what is wrong with a camera
+        shows in single observations: then it may lie as drawn, and the camera be wrong there by as much.
+        """
+        if not any(_is_of_camera(fault) and fault.noise_ratio >= SMALL for fault in self.faults):
+            return 0.0
+        structure, targets = self.calibration.estimate.structure, self.observations.targets
+        aside = zip(structure.names[: structure.own], structure.values.tolist(), strict=False)
+        return 1e3 * max((abs(by) for name, by in aside if not targets[name.partition("/")[0]].movable), default=0.0)
 
     @cached_property
     def fault_sigmas(self) -> float:
@@ -179,7 +204,7 @@ class Quality(Frozen):
         if self.uncertainty is None:
             return 0.0
         if not self.faulty_maps:
-            return sigmas_of_cameras(self.uncertainty, self.faults)
+            return sigmas_of_cameras(self.uncertainty, self._step)
         return max(one.sigmas for maps in self.faulty_maps for one in maps)
 
     @cached_property

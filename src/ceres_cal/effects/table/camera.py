@@ -11,10 +11,11 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, numbers_of
-from ceres_cal.base.transforms import skew
+from ceres_cal.base.transforms import Pose, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.effect import CameraEffect, Case, Effect, Evidence, Words, amounts
 from ceres_cal.problem.parameters import intrinsic_names
+from ceres_cal.problem.quantities import pixel_slopes
 
 
 class _PoseTest(Effect):
@@ -108,21 +109,16 @@ def _length(vector: Array, sd: Array) -> tuple[float, float]:
     return length, float(np.linalg.norm(vector[known] * sd[known])) / max(length, 1e-300)
 
 
-class Skew(Effect):
+class Skew(CameraEffect):
     """The axes of the pixels are not perpendicular: x grows with y."""
 
     kind = "skew"
-    absorbed = True
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        down, group = np.zeros(len(case.equations)), case.camera.copy()
-        for number, name in enumerate(case.cameras):
-            own, camera = case.camera == number, case.estimate.cameras[name]
-            if intrinsic_names(camera.lens).index("skew") in case.problem.layout.free[name]:
-                group[own] = -1
-            else:
-                down[own] = camera.offsets(case.equations.pixel[own])[:, 1]
-        yield EffectColumns(self.kind, (case.equations.direction[:, 0] * down)[:, None], group, case.cameras)
+    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
+        one = case.estimate.cameras[camera]
+        if intrinsic_names(one.lens).index("skew") in case.problem.layout.free[camera]:
+            return None
+        return np.asarray(one.offsets(pixels)[:, 1:, None] * [[1.0], [0.0]])
 
     def words(self, evidence: Evidence) -> Words:
         skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
@@ -135,17 +131,16 @@ class Skew(Effect):
         )
 
 
-class HeldNumbers(Effect):
+class HeldNumbers(CameraEffect):
     """Numbers of the pixels that are held; places: theirs in the intrinsics vector."""
 
-    absorbed = True
     places: ClassVar[list[int]]
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        free = case.problem.layout.free
-        held = np.array([not set(self.places) & set(free[name].tolist()) for name in case.cameras])
-        group = np.where(held[case.camera], case.camera, -1)
-        yield EffectColumns(self.kind, case.equations.intrinsics[:, self.places], group, case.cameras)
+    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
+        if set(self.places) & set(case.problem.layout.free[camera].tolist()):
+            return None
+        one = case.estimate.cameras[camera].at(Pose.identity())
+        return pixel_slopes(one, one.rays(pixels)).intrinsics[:, :, self.places]
 
 
 class Aspect(HeldNumbers):

@@ -4,17 +4,18 @@ some frame on: knocked or zoomed, or the pictures of another camera.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, numbers_of
+from ceres_cal.base.arrays import Array, numbers_of
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped
-from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.effect import SMALL, CameraEffect, Case, Effect, Evidence, Words, amounts, half_diagonals
 from ceres_cal.effects.score_tests import score_all
 from ceres_cal.problem.parameters import OF_PIXELS, unit_px
+from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens
 
 # Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few
@@ -22,23 +23,16 @@ from ceres_cal.scene.lens import LENSES, Lens
 _WAVES = range(5, 25)
 
 
-class Radius(Effect):
+class Radius(CameraEffect):
     """Residuals follow the radius: the polynomial is too short."""
 
     kind = "radius"
-    absorbed = True
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
+    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
         radial_basis = 3  # powers of the radius past the lens's: enough for any trend that one more power mends
-        columns = np.zeros((len(case.equations), max(radial_basis, len(_WAVES))))
-        for number, name in enumerate(case.cameras):
-            own = case.camera == number
-            if case.estimate.cameras[name].lens.roughness:
-                columns[own, : len(_WAVES)] = _waves(case, name, own)
-                continue
-            for k, power in enumerate(_missing_powers(case, name)[:radial_basis]):
-                columns[own, k] = _radial_column(case, name, power)[own]
-        yield EffectColumns(self.kind, columns, case.camera, case.cameras)
+        if case.estimate.cameras[camera].lens.roughness:
+            return _waves(case, camera, pixels)
+        return _growing(case.estimate.cameras[camera], pixels, _missing_powers(case, camera)[:radial_basis])
 
     def words(self, evidence: Evidence) -> Words:
         case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
@@ -50,7 +44,8 @@ class Radius(Effect):
                 "rays are about as wrong as those pixels; for phi by itself look at a lens that has a formula, too",
             )
         powers = _missing_powers(case, name)
-        columns = np.column_stack([_radial_column(case, name, power) * own for power in powers])
+        displaced = _growing(case.estimate.cameras[name], case.equations.pixel, powers)
+        columns = np.sum(case.equations.direction[:, :, None] * displaced, axis=1) * own[:, None]
         decreases = evidence.others.decreases(columns)
         power, decrease = powers[int(np.argmax(decreases))], float(np.max(decreases))
         share = 100.0 * min(1.0, decrease / evidence.others.freed(evidence.score.columns).decrease)
@@ -90,43 +85,43 @@ def _across(lens: Lens) -> set[str]:
     return {*lens.decentring, *(name for term in ("tangential", "prism") for name in lens.more_terms.get(term, ()))}
 
 
-def _outward(case: Case, camera: str) -> tuple[Array, Array]:
-    """(E,) radius of every predicted pixel, in half image diagonals, and what a px away from the centre does to it."""
-    offsets = case.offsets(camera)
+def _outward(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """(N,) radius of pixels (N, 2), in half image diagonals, and (N, 2) px of a displacement of one away from the
+    centre.
+    """
+    offsets = half_diagonals(camera, pixels)
     radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    along = np.sum(case.equations.direction * offsets * (1.0, case.estimate.cameras[camera].aspect), axis=1)
-    return radius, np.asarray(along / radius)
+    return radius, np.asarray(offsets * (1.0, camera.aspect) / radius[:, None])
 
 
-def _radial_column(case: Case, camera: str, power: int) -> Array:
-    """(E,) px per unit of a coefficient more in the lens's polynomial, scaled to be of order one."""
-    one = case.estimate.cameras[camera]
-    growth = one.lens.radial_change(one.offsets(case.equations.pixel), one.phi, unit_px(one), power)
-    return np.asarray(_outward(case, camera)[1] * growth)
+def _growing(camera: Camera, pixels: Array, powers: Sequence[int]) -> Array:
+    """(N, 2, powers) px per unit of coefficients more in the lens's polynomial, scaled to be of order one."""
+    offsets, outward = camera.offsets(pixels), _outward(camera, pixels)[1]
+    growth = [camera.lens.radial_change(offsets, camera.phi, unit_px(camera), power) for power in powers]
+    return np.stack([outward * one[:, None] for one in growth], axis=2)
 
 
-def _waves(case: Case, camera: str, own: Mask) -> Array:
-    """(E of its own, waves) px per px of displacements along the radius that go up and down."""
-    radius, outward = (column[own, None] for column in _outward(case, camera))
-    return np.asarray(outward * np.cos(np.pi * np.array(_WAVES) * radius / np.max(radius, initial=1e-12)))
+def _waves(case: Case, camera: str, pixels: Array) -> Array:
+    """(N, 2, waves) px per px of displacements along the radius that go up and down as far as was observed."""
+    one, own = case.estimate.cameras[camera], case.camera == case.cameras.index(camera)
+    radius, outward = _outward(one, pixels)
+    share = radius / np.max(_outward(one, case.equations.pixel[own])[0], initial=1e-12)
+    return np.asarray(outward[:, :, None] * np.cos(np.pi * np.array(_WAVES) * share[:, None, None]))
 
 
-class Decentring(Effect):
+class Decentring(CameraEffect):
     """Brown's tangential displacement, where the lens does not solve for it."""
 
     kind = "decentring"
-    absorbed = True
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        columns, group = np.zeros((len(case.equations), 2)), case.camera.copy()
-        for number, name in enumerate(case.cameras):
-            own = case.camera == number
-            parts = _tangential(case.estimate.cameras[name].lens)
-            if parts and set(parts) <= case.free_coefficients(name):
-                group[own] = -1
-            else:
-                columns[own] = _decentring_columns(case, name)[own]
-        yield EffectColumns(self.kind, columns, group, case.cameras)
+    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
+        one = case.estimate.cameras[camera]
+        parts = _tangential(one.lens)
+        if parts and set(parts) <= case.free_coefficients(camera):
+            return None
+        x, y = half_diagonals(one, pixels).T
+        r2 = x * x + y * y
+        return np.stack([[2.0 * x * y, r2 + 2.0 * x * x], [r2 + 2.0 * y * y, 2.0 * x * y]]).transpose(2, 0, 1)
 
     def words(self, evidence: Evidence) -> Words:
         name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
@@ -152,31 +147,18 @@ def _tangential(lens: Lens) -> tuple[str, ...]:
     return own or lens.more_terms.get("tangential", ())
 
 
-def _decentring_columns(case: Case, camera: str) -> Array:
-    """(E, 2) px of Brown's tangential displacements, 1 px at half the image diagonal."""
-    x, y = case.offsets(camera).T
-    r2 = x * x + y * y
-    first = np.column_stack([2.0 * x * y, r2 + 2.0 * y * y])
-    second = np.column_stack([r2 + 2.0 * x * x, 2.0 * x * y])
-    return np.column_stack([np.sum(case.equations.direction * field, axis=1) for field in (first, second)])
-
-
-class Prism(Effect):
+class Prism(CameraEffect):
     """OpenCV's thin prism, where the lens does not solve for it: all is displaced one way, by r^2 and r^4."""
 
     kind = "prism"
-    absorbed = True
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        columns, group = np.zeros((len(case.equations), 4)), case.camera.copy()
-        for number, name in enumerate(case.cameras):
-            own, parts = case.camera == number, case.estimate.cameras[name].lens.more_terms.get("prism", ())
-            if parts and set(parts) <= case.free_coefficients(name):
-                group[own] = -1
-                continue
-            r2 = np.sum(case.offsets(name)[own] ** 2, axis=1)[:, None]
-            columns[own] = np.hstack([case.equations.direction[own] * r2, case.equations.direction[own] * r2**2])
-        yield EffectColumns(self.kind, columns, group, case.cameras)
+    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
+        one = case.estimate.cameras[camera]
+        parts = one.lens.more_terms.get("prism", ())
+        if parts and set(parts) <= case.free_coefficients(camera):
+            return None
+        r2 = np.sum(half_diagonals(one, pixels) ** 2, axis=1)[:, None, None]
+        return np.concatenate([r2 * np.eye(2), r2**2 * np.eye(2)], axis=2)
 
     def words(self, evidence: Evidence) -> Words:
         name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
