@@ -181,7 +181,7 @@ def decode_json(
     try:
         data: Any = msgspec.json.decode(content, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        # reads: what plain data say of the place that does not fit
+        # quiet: plain data are read instead, and say where they do not fit
         plain = check_header(parse_json(content, where), where, format_name, version)
         if finite:
             _require_finite(plain, "$", where)
