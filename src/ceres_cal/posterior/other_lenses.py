@@ -268,12 +268,8 @@ _ALONG, _OVER = 36, (7, 21)
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
-    lenses do to them; none where views do not agree on anything that is left.
+    lenses do to them.
     """
-    every = end.problem.sights
-    asked = every if end.problem.options.blank_lens.roughness else of_placements(every)
-    if not len(asked) or not LeftOver.of_end(end, asked).asks_for_more:
-        return (), ()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     model = _linearised(end, observations, reduced)
     shifts = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]

@@ -96,7 +96,6 @@ NORMAL_NS = 60.0
 # Of a sight's cost, by the step its pose would take: the complement takes that along exactly, to second order. From
 # half to double the answer moves by under 1 % of its error.
 _LEFT_TO_THE_COMPLEMENT = 1e-2
-_AT_FIRST = 1e-4  # the same where a solve starts: steps from a cost that was taken for less are rejected
 
 
 class SightCost(CachedCost):
@@ -213,8 +212,7 @@ class EliminatedCost(CachedCost):
         self.set_parameter_block_sizes([size for size in sizes if size])
 
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
-        known = len(self._accepted.residuals)
-        last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT if known else _AT_FIRST)
+        last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
         if last is None:
             return None
         self._last = last
