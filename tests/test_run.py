@@ -63,7 +63,7 @@ def test_what_cannot_be_trusted_is_not_exported_and_advice_may_fail(
         raise SolutionError("no advice can be given")
 
     monkeypatch.setattr("ceres_cal.diagnostics.advice.advise", fails)
-    wrong = ("--lens", "radial", "--prior", "height_m=3:5mm", "--to", "paper", "-o", str(tmp_path))
+    wrong = ("--lens", "radial", "--prior", "phi=700:1", "--to", "paper", "-o", str(tmp_path))
     assert main(["run", str(photographs / "0001.jpg"), *FIELD, *wrong]) == 1
     said = capsys.readouterr()
     assert "error     no advice: no advice can be given\n" in said.out
