@@ -1,8 +1,6 @@
 """Simulation: every row is where the camera model puts it, and the truth beside it is true."""
 
 import math
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +11,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from data import make_data
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import SCENES
@@ -48,6 +45,7 @@ from ceres_cal.simulate import (
     truth_to_json,
     write_simulation,
 )
+from data import make_data
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
