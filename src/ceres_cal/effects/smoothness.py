@@ -10,7 +10,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import replace
-from ceres_cal.base.spread import known_inverses
+from ceres_cal.base.spread import NOTHING
+from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -39,7 +40,7 @@ def likeliest_sizes(
     one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
     steps = 200  # of the search for sizes
     ranks = np.array([_rank(form) for form in forms])
-    told = _by_sizes(normal, slope, forms)
+    told = _by_sizes(normal, slope, forms, sigmas)
     for _ in range(steps):
         amount, traces, squares = told(sigmas)
         known = ranks - traces / sigmas**2
@@ -52,11 +53,14 @@ def likeliest_sizes(
     return sigmas, amount, np.asarray(precision)
 
 
-def _by_sizes(normal: Array, slope: Array, forms: Sequence[Array]) -> Callable[[Array], tuple[Array, Array, Array]]:
+def _by_sizes(
+    normal: Array, slope: Array, forms: Sequence[Array], first: Array
+) -> Callable[[Array], tuple[Array, Array, Array]]:
     """Of sizes sigma (K,): the likeliest numbers c (Q,), and tr(C F) and c^T F c (K,) of each form.
 
     The numbers of the largest form that is diagonal are turned to where what data say of them is diagonal, too. Then
-    another size takes the inverse of what is left alone, a Schur complement, not of everything.
+    another size takes the inverse of what is left alone, a Schur complement, not of everything; along directions in
+    which it is one at the `first` sizes, so that inverses are plain.
     """
     sizes = [int(np.count_nonzero(form)) if _is_diagonal(form) else 0 for form in forms]
     largest = int(np.argmax(sizes))
@@ -64,20 +68,31 @@ def _by_sizes(normal: Array, slope: Array, forms: Sequence[Array]) -> Callable[[
     rest = np.setdiff1d(np.arange(len(slope)), turned)
     unit = 1.0 / np.sqrt(np.diagonal(forms[largest])[turned])
     values, vectors = np.linalg.eigh(normal[np.ix_(turned, turned)] * unit[:, None] * unit)
-    turn, unlimited = vectors * unit[:, None], np.full(len(rest), np.inf)
+    turn = vectors * unit[:, None]
     own, coupling, here = turn.T @ slope[turned], normal[np.ix_(rest, turned)] @ turn, normal[np.ix_(rest, rest)]
-    others = [form[np.ix_(rest, rest)] for form in forms]
+    others = np.array([form[np.ix_(rest, rest)] for form in forms])
+
+    def along_turned(sigmas: Array) -> Array:
+        return 1.0 / (values + sigmas[largest] ** -2) if len(turned) else values
+
+    left = here + np.tensordot(first**-2, others, 1) - coupling * along_turned(first) @ coupling.T
+    root = inverse_root(left, np.diagonal(left), NOTHING * len(slope))
+    coupling, here, others, beside = (
+        root.T @ coupling,
+        root.T @ here @ root,
+        root.T @ others @ root,
+        root.T @ slope[rest],
+    )
 
     def told(sigmas: Array) -> tuple[Array, Array, Array]:
-        along = 1.0 / (values + sigmas[largest] ** -2) if len(turned) else values
+        along = along_turned(sigmas)
         weighed = coupling * along
-        stated = sum(form / sigma**2 for form, sigma in zip(others, sigmas, strict=True))
-        covariance = known_inverses(here + stated - weighed @ coupling.T, unlimited)
-        amount, numbers = covariance @ (slope[rest] - weighed @ own), np.empty(len(slope))
+        covariance = np.linalg.inv(here + np.tensordot(sigmas**-2, others, 1) - weighed @ coupling.T)
+        amount, numbers = covariance @ (beside - weighed @ own), np.empty(len(slope))
         of_turned = along * (own - coupling.T @ amount)
-        numbers[rest], numbers[turned] = amount, turn @ of_turned
-        traces = np.array([np.sum(covariance * form) for form in others])
-        squares = np.array([amount @ form @ amount for form in others])
+        numbers[rest], numbers[turned] = root @ amount, turn @ of_turned
+        traces = np.tensordot(others, covariance)
+        squares = others @ amount @ amount
         traces[largest] += np.sum(along) + np.sum(covariance * (weighed @ weighed.T))
         squares[largest] += of_turned @ of_turned
         return numbers, traces, squares
