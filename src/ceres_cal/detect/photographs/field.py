@@ -364,8 +364,9 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
         curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
     priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
     for name, length_m in built.dimensions.items():  # which may be others, or look so by a lens that is none of ours
-        drawn_m = built.drawn[name]
-        priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (abs(length_m - drawn_m),)))
+        drawn_m = built.drawn[name]  # stated to half of what is usual: beyond, a calibration says that it is contradicted
+        sigma_m = min(abs(length_m - drawn_m), 0.5 * built.usual_m)
+        priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (sigma_m,)))
     if camera.aspect != 1.0:  # else it is solved for as one with square pixels
         priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(
