@@ -348,7 +348,7 @@ def test_places_far_apart_have_no_correlation_at_all() -> None:
     more = "3.60109 3.77682 3.79786 3.99964 4.19946 4.20242 4.79925"
     places = np.zeros((36, 3))
     places[:, 0] = np.sort(np.array(" ".join((first, last, more)).split(), dtype=float))
-    kernel = decay(distances_of(places), 0.0135, smooth=False)
+    kernel = decay(distances_of(places, places), 0.0135, smooth=False)
     assert np.min(kernel[kernel > 0.0]) > 1e-31
     values, vectors = np.linalg.eigh(kernel)
     assert values[0] > 0.01 and np.max(np.abs((vectors * values) @ vectors.T - kernel)) < 1e-14  # 1.3e-15 measured

@@ -241,7 +241,7 @@ def test_correlated_errors() -> None:
     for place in np.flatnonzero(np.isfinite(at.log))[1::5]:
         together = 0.0 * every
         for strand in family.strands:
-            correlation = decay(distances_of(strand.places), at.length_m[place], False)
+            correlation = decay(distances_of(strand.places, strand.places), at.length_m[place], False)
             together[np.ix_(strand.rows, strand.rows)] = at.share[place] * (correlation - np.eye(len(strand.rows)))
         assert at.log[place] - at.log[0] == pytest.approx(seen.log(every, together) - none, abs=1e-6)
 

@@ -149,6 +149,18 @@ def test_numbers_that_are_not_finite_reach_the_checks() -> None:
     assert [str(v) for v in parse_json(b"[NaN, Infinity, -Infinity]", "here")] == ["nan", "inf", "-inf"]
 
 
+@pytest.mark.parametrize("letter", ["a", "é", "\\u4e2d"])
+def test_plain_letters_take_a_byte_of_memory_each(letter: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The posterior of a board of 484 corners as built is 70 MB of digits, which 512 MB hold.
+    monkeypatch.setenv("CERES_CAL_MOST_MB", "1")
+    content = f'["{letter}{"a" * 300_000}"]'.encode()
+    if letter == "a":
+        assert len(parse_json(content, "here")[0]) == 300_001
+    else:
+        with pytest.raises(InputError, match="here: would take 1 MB"):
+            parse_json(content, "here")
+
+
 @quick
 @given(st.dictionaries(st.text(), st.floats(allow_nan=False, allow_infinity=False) | st.text() | st.integers(0, 2**53)))
 def test_json_comes_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, content: dict[str, Any]) -> None:

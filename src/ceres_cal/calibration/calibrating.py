@@ -28,7 +28,6 @@ from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import problem_of
 from ceres_cal.problem.ranges import require_possible_numbers
-from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT, make_structure
 from ceres_cal.robust.as_built import AS_DRAWN, Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
@@ -163,7 +162,8 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)
-    too_few = chosen.choice.share < 1.0 and _asks_for_more(calibration, observations, sights)
+    known = calibration.posterior
+    too_few = chosen.choice.share < 1.0 and known is not None and known.left_alike
     if too_few or (calibration.as_built and not chosen.built.every):
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
         # all views leave in the same places need not show in the few of them that lenses were compared by.
@@ -189,18 +189,6 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
             said.append(f"other lenses could not be compared, so {without}: {others.failed}")
     warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]), *said)
     return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
-
-
-def _asks_for_more(calibration: Calibration, observations: Observations, sights: Sights) -> bool:
-    """Whether the lens leaves the same in views of different placements."""
-    from ceres_cal.posterior.other_lenses import LeftOver, of_placements
-
-    seen = of_placements(sights)
-    if not len(seen):
-        return False
-    there = residuals(observations, seen, calibration.estimate)
-    taking_part = seen.used(*calibration.inlier_masks(observations))
-    return LeftOver.of(taking_part, there, calibration.fit.scales, calibration.estimate).asks_for_more
 
 
 def _part(bulk: Bulk, options: Options) -> Subset:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
+from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, decode_json, read_bytes, write_json
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.shown import html_of
 from ceres_cal.base.transforms import Pose
@@ -231,7 +231,7 @@ class Calibration(Frozen):
         Raises:
             InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
         """
-        data = convert(read_json(path, FORMAT, VERSION), CalibrationFile, str(path))
+        data = decode_json(read_bytes(path), CalibrationFile, str(path), FORMAT, VERSION, finite=True)
         with naming(path):
             return cls.from_file(data)
 

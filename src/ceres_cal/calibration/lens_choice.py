@@ -207,7 +207,8 @@ def choose_lens(
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
-    observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
+    if observations.priors:
+        observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
     by_themselves = replace(
         by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start))
     )

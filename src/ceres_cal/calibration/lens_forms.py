@@ -191,7 +191,7 @@ def pseudo_bma(squares: Sequence[Array]) -> Array:
     each = np.array(squares)
     signs = np.ones((1, 1))
     while len(signs) <= each.shape[1]:
-        signs = np.block([[signs, signs], [signs, -signs]])  # Sylvester's Hadamard matrix
+        signs = np.vstack([np.hstack([signs, signs]), np.hstack([signs, -signs])])  # Sylvester's Hadamard matrix
     more = 0.5 * (1.0 + signs[:, 1 : each.shape[1] + 1]) @ each.T
     likelihoods = np.exp(more.min(axis=1, keepdims=True) - more)
     return np.asarray(np.mean(likelihoods / likelihoods.sum(axis=1, keepdims=True), axis=0))

@@ -18,7 +18,7 @@ from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_erro
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.bundle import solve, with_placements_at_best
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, problem_of
@@ -288,8 +288,11 @@ class InlierRows:
         Raises:
             CalibrationError: it cannot be solved for.
         """
-        options = candidate.form.of(self.options)
-        solution = solve(self._problem(options, candidate.estimate), candidate.estimate)
+        posed = (
+            1e-6  # share of a placement's cost: from one that is taken for less, whatever the solve does is rejected
+        )
+        problem = self._problem(candidate.form.of(self.options), candidate.estimate)
+        solution = solve(problem, with_placements_at_best(problem, candidate.estimate, posed))
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
         return solution.estimate

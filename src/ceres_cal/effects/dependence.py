@@ -152,12 +152,15 @@ class _Average(Frozen):
 
     def _kernel(self, strand: Strand, here: Mask, weights: Array) -> Array:
         """(N, N) sum of weights times the correlation at some places."""
-        distance = distances_of(strand.places)
-        kernel, used = np.zeros_like(distance), weights > 0.0
-        lengths, smooth, weights = self.at.length_m[here][used], self.at.smooth[here][used], weights[used]
-        for length, one in sorted(set(zip(lengths.tolist(), smooth.tolist(), strict=True))):
-            same = (lengths == length) & (smooth == one)
-            kernel += float(np.sum(weights[same])) * decay(distance, length, one)
+        rows = 64  # at a time, so that distances stay in the cache
+        places, used, together = strand.places, weights > 0.0, dict[tuple[float, bool], float]()
+        for *place, weight in zip(self.at.length_m[here][used], self.at.smooth[here][used], weights[used], strict=True):
+            together[*place] = together.get((*place,), 0.0) + weight
+        kernel = np.zeros((len(places), len(places)))
+        for first in range(0, len(places) if together else 0, rows):
+            distance = distances_of(places[first : first + rows], places)
+            for (length, smooth), weight in sorted(together.items()):
+                kernel[first : first + rows] += weight * decay(distance, length, smooth)
         return kernel
 
 

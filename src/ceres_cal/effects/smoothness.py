@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from operator import add
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import replace
-from ceres_cal.base.spread import known_inverses
+from ceres_cal.base.spread import NOTHING
+from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -38,26 +39,75 @@ def likeliest_sizes(
     """
     one = 1.0  # directions of the least size that count along, so that few data do not make a size zero
     steps = 200  # of the search for sizes
-    ranks, unlimited = np.array([_rank(form) for form in forms]), np.full(len(slope), np.inf)
+    ranks = np.array([_rank(form) for form in forms])
+    told = _by_sizes(normal, slope, forms, sigmas)
     for _ in range(steps):
-        precision = normal + sum(form / sigma**2 for form, sigma in zip(forms, sigmas, strict=True))
-        covariance = known_inverses(precision, unlimited)
-        amount = covariance @ slope
-        known = ranks - np.array([np.sum(covariance * form) for form in forms]) / sigmas**2
-        squares = np.array([amount @ form @ amount for form in forms])
+        amount, traces, squares = told(sigmas)
+        known = ranks - traces / sigmas**2
         moved = np.sqrt((np.maximum(squares, 0.0) + one * least**2) / (np.maximum(known, 0.0) + one))
         done = np.max(np.abs(np.log(moved / sigmas))) < at_rest
-        sigmas = moved
+        before, sigmas = sigmas, moved
         if done:
             break
+    precision = normal + sum(form / sigma**2 for form, sigma in zip(forms, before, strict=True))
     return sigmas, amount, np.asarray(precision)
+
+
+def _by_sizes(
+    normal: Array, slope: Array, forms: Sequence[Array], first: Array
+) -> Callable[[Array], tuple[Array, Array, Array]]:
+    """Of sizes sigma (K,): the likeliest numbers c (Q,), and tr(C F) and c^T F c (K,) of each form.
+
+    The numbers of the largest form that is diagonal are turned to where what data say of them is diagonal, too. Then
+    another size takes the inverse of what is left alone, a Schur complement, not of everything; along directions in
+    which it is one at the `first` sizes, so that inverses are plain.
+    """
+    sizes = [int(np.count_nonzero(form)) if _is_diagonal(form) else 0 for form in forms]
+    largest = int(np.argmax(sizes))
+    turned = np.flatnonzero(np.diagonal(forms[largest]) if sizes[largest] else np.zeros(len(slope)))
+    rest = np.setdiff1d(np.arange(len(slope)), turned)
+    unit = 1.0 / np.sqrt(np.diagonal(forms[largest])[turned])
+    values, vectors = np.linalg.eigh(normal[np.ix_(turned, turned)] * unit[:, None] * unit)
+    turn = vectors * unit[:, None]
+    own, coupling, here = turn.T @ slope[turned], normal[np.ix_(rest, turned)] @ turn, normal[np.ix_(rest, rest)]
+    others = np.array([form[np.ix_(rest, rest)] for form in forms])
+
+    def along_turned(sigmas: Array) -> Array:
+        return 1.0 / (values + sigmas[largest] ** -2) if len(turned) else values
+
+    left = here + np.tensordot(first**-2, others, 1) - coupling * along_turned(first) @ coupling.T
+    root = inverse_root(left, np.diagonal(left), NOTHING * len(slope))
+    coupling, here, others, beside = (
+        root.T @ coupling,
+        root.T @ here @ root,
+        root.T @ others @ root,
+        root.T @ slope[rest],
+    )
+
+    def told(sigmas: Array) -> tuple[Array, Array, Array]:
+        along = along_turned(sigmas)
+        weighed = coupling * along
+        covariance = np.linalg.inv(here + np.tensordot(sigmas**-2, others, 1) - weighed @ coupling.T)
+        amount, numbers = covariance @ (beside - weighed @ own), np.empty(len(slope))
+        of_turned = along * (own - coupling.T @ amount)
+        numbers[rest], numbers[turned] = root @ amount, turn @ of_turned
+        traces = np.tensordot(others, covariance)
+        squares = others @ amount @ amount
+        traces[largest] += np.sum(along) + np.sum(covariance * (weighed @ weighed.T))
+        squares[largest] += of_turned @ of_turned
+        return numbers, traces, squares
+
+    return told
 
 
 def _rank(form: Array) -> int:
     rows = np.any(form != 0.0, axis=1)
     own = form[np.ix_(rows, rows)]
-    diagonal = np.count_nonzero(own) == len(own)
-    return len(own) if diagonal else int(np.linalg.matrix_rank(own, hermitian=True))
+    return len(own) if _is_diagonal(own) else int(np.linalg.matrix_rank(own, hermitian=True))
+
+
+def _is_diagonal(form: Array) -> bool:
+    return bool(np.count_nonzero(form) == np.count_nonzero(np.diagonal(form)))
 
 
 def with_smoothness(

@@ -103,9 +103,11 @@ def evenly(count: int, most: int) -> Indices:
     return np.asarray((np.arange(taken) * (count - 1)) // max(taken - 1, 1))
 
 
-def distances_of(places: Array) -> Array:
-    """(N, N) m between places (N, 3)."""
-    squared = np.sum((places[:, None] - places[None]) ** 2, axis=2)
+def distances_of(places: Array, others: Array) -> Array:
+    """(N, M) m between places (N, 3) and others (M, 3)."""
+    squared = np.zeros((len(places), len(others)))
+    for here, there in zip(places.T, others.T, strict=True):
+        squared += (here[:, None] - there) ** 2
     return np.asarray(np.sqrt(squared))
 
 
@@ -115,7 +117,8 @@ def decay(distance: Array, length: float, smooth: bool) -> Array:
     no_correlation = 1e-30
     relative = distance / length
     correlation = np.exp(-0.5 * relative**2 if smooth else -relative)
-    return np.where(correlation < no_correlation, 0.0, correlation)
+    correlation *= correlation >= no_correlation
+    return np.asarray(correlation)
 
 
 class StrandFamily(Frozen):
@@ -152,8 +155,8 @@ class StrandFamily(Frozen):
             rows[number, : len(at)], filled[number, : len(at)] = strand.rows[at], True
         distance = np.full((len(shapes), shape[1], shape[1]), np.inf)
         for whole, first in zip(distance, starts[:-1].tolist(), strict=True):
-            at = picked[first]
-            whole[: len(at), : len(at)] = distances_of(strands[first].places[at])
+            places = strands[first].places[picked[first]]
+            whole[: len(places), : len(places)] = distances_of(places, places)
             np.fill_diagonal(whole, 0.0)
         # Rows first in memory: those of all strands of one shape are then multiplied as one matrix.
         side_by_side = columns[rows.T]

@@ -20,11 +20,8 @@ from ceres_cal.base.files import (
     UNITS,
     PixelOrigin,
     Units,
-    check_header,
-    convert,
     decode_json,
     opened,
-    parse_json,
     read_bytes,
     write_bytes,
 )
@@ -145,7 +142,7 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
 def read_content(path: Path) -> Content:
     """See `Observations.load`."""
     if path.suffix == ENDING or path.is_dir():
-        header = _decoded(read_bytes(path / HEADER), str(path / HEADER))
+        header = decode_json(read_bytes(path / HEADER), ObservationsFile, str(path / HEADER), FORMAT, VERSION)
         return _of_columns(header, read_folder(path, _NUMBERS))
     content = read_bytes(path)
     return _from_npz(content, str(path)) if path.suffix == ".npz" else _from_json(content, str(path))
@@ -178,17 +175,8 @@ def header_of(content: Content) -> ObservationsFile:
     )
 
 
-def _decoded(content: bytes, where: str) -> ObservationsFile:
-    """The JSON of a file; InputError naming the place."""
-    data = decode_json(content, ObservationsFile, where)
-    if data is None:
-        return convert(check_header(parse_json(content, where), where, FORMAT, VERSION), ObservationsFile, where)
-    check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
-    return data
-
-
 def _from_json(content: bytes, where: str) -> Content:
-    data = _decoded(content, where)
+    data = decode_json(content, ObservationsFile, where, FORMAT, VERSION)
     header = data.content()
     targets, views = header.targets, header.views
     for number, view in enumerate(views):
@@ -306,7 +294,8 @@ def _to_npz(content: Content) -> bytes:
 
 def _from_npz(packed: bytes, where: str) -> Content:
     arrays = read_npz(packed, _COLUMNS, where)
-    return _of_columns(_decoded(arrays.pop("header").tobytes(), where), arrays)
+    header = decode_json(arrays.pop("header").tobytes(), ObservationsFile, where, FORMAT, VERSION)
+    return _of_columns(header, arrays)
 
 
 def _of_columns(header: ObservationsFile, arrays: Mapping[str, AnyArray]) -> Content:

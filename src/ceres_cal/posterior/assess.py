@@ -192,10 +192,15 @@ def with_doubts(
 
 
 def with_roughness(posterior: Posterior, end: RobustSolution, observations: Observations) -> Posterior:
-    """Wider by what a lens without a formula leaves in the same places of all views."""
-    from ceres_cal.posterior.other_lenses import shifts_by_roughness
+    """Wider by what the lens leaves in the same places of all views; one with a formula in views of placements."""
+    from ceres_cal.posterior.other_lenses import LeftOver, of_placements, shifts_by_roughness
 
-    return posterior.widened(*shifts_by_roughness(end, observations))
+    every, placed = end.problem.sights, of_placements(end.problem.sights)
+    asks = alike = bool(len(placed)) and LeftOver.of_end(end, placed).asks_for_more
+    if end.problem.options.blank_lens.roughness and len(placed) < len(every):
+        asks = LeftOver.of_end(end, every).asks_for_more
+    wider = posterior.widened(*shifts_by_roughness(end, observations)) if asks else posterior
+    return replace(wider, left_alike=alike)
 
 
 def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:

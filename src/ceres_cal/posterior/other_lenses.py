@@ -78,10 +78,15 @@ class OtherLenses(Frozen):
             pixels[name] = places[np.linalg.norm(places - camera.principal_point, axis=1) <= reach_px]
         return pixels
 
+    @cached_property
+    def pictures(self) -> dict[str, Picture]:
+        """Camera -> what the chosen lens shows there."""
+        every = self.pixels.items()
+        return {name: Picture(self.near.cameras[name].at(Pose.identity()), pixels) for name, pixels in every}
+
     def shifts(self, camera: str) -> Array:
         """(L, N, 2) px by how much the others show rays elsewhere, turned as well as can be."""
-        picture = Picture(self.near.cameras[camera].at(Pose.identity()), self.pixels[camera])
-        return np.array([picture.shift(one.cameras[camera].at(Pose.identity())) for one in self.others])
+        return np.array([self.pictures[camera].shift(one.cameras[camera].at(Pose.identity())) for one in self.others])
 
     def offsets(self, station: str, height_m: float) -> Array:
         """(L, N, 2) m by how much the others locate pixels elsewhere; every node of a valley asks for the same."""
@@ -143,7 +148,8 @@ def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iter
                 slopes = locate_slopes(there, keys, station, pixels, height_m)
                 yield part * px_per_m * slopes, part * px_per_m * lenses.offsets(station, height_m)
         if not stations:
-            picture = Picture(camera.at(Pose.identity()), pixels)
+            picture = lenses.pictures[name]
+            picture = picture if there is lenses.near else picture.of(camera)
             yield picture_slopes(picture, keys, name), lenses.shifts(name)
 
 
@@ -262,12 +268,8 @@ _ALONG, _OVER = 36, (7, 21)
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
-    lenses do to them; none where views do not agree on anything that is left.
+    lenses do to them.
     """
-    every = end.problem.sights
-    asked = every if end.problem.options.blank_lens.roughness else of_placements(every)
-    if not len(asked) or not LeftOver.of_end(end, asked).asks_for_more:
-        return (), ()
     reduced = end.reduced or information(end.problem, end.solution.estimate)
     model = _linearised(end, observations, reduced)
     shifts = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]

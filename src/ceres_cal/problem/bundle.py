@@ -273,13 +273,13 @@ def placement_costs(
     return EliminatedCost(Run(), sights, problem, estimate).from_poses(poses, tolerance)
 
 
-def with_placements_at_best(problem: Problem, estimate: Estimate) -> Estimate:
-    """The estimate with every private placement where it fits best, everything else held."""
+def with_placements_at_best(problem: Problem, estimate: Estimate, tolerance: float = _POSED) -> Estimate:
+    """The estimate with every private placement where it fits best, everything else held: to a share of its cost."""
     for camera in estimate.cameras:
         own = problem.sights.take(problem.sights.numbers(camera, placements=problem.private))
         if len(own):
             poses = estimate.pose_stack(own.keys)
-            _, best = placement_costs(own, estimate, problem.weighting, poses, _POSED)
+            _, best = placement_costs(own, estimate, problem.weighting, poses, tolerance)
             estimate = estimate.with_placements(own.keys, best)
     return estimate
 

@@ -128,7 +128,7 @@ class Information(Frozen):
     def among(self, keys: Collection[Key]) -> tuple[Key, ...]:
         """Those of its keys that are among others."""
         wanted = set(keys)
-        return tuple(key for key in self.keys if key in wanted)
+        return tuple([key for key in self.keys if key in wanted])
 
     def given(self, keys: Sequence[Key]) -> Information:
         """About some of the numbers, with all others held where they are."""

@@ -112,10 +112,9 @@ def is_plain(prior: GaussianPrior) -> bool:
 
 def statements(problem: Problem, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
     """Everything stated of a problem's numbers, and what is held by name; a tolerance that was estimated is none."""
-    tolerances = problem.options.tolerances
-    for one in grouped(problem.stated_at(estimate)):
-        if one.kind != "tolerance" or one.keys[0].owner in tolerances:
-            yield one
+    told, every = problem.options.tolerances, problem.stated_at(estimate)
+    plain = ([key for key in prior.keys if key.kind != "structure" or key.owner in told] for prior in every)
+    yield from grouped([one.given(own) if is_plain(one) else one for one, own in zip(every, plain, strict=True)])
     yield from _held(problem.options, observations, estimate)
 
 

@@ -123,7 +123,7 @@ class Spline(Planar):
 
     @property
     def orders(self) -> tuple[int, ...]:
-        return tuple(1 if name in EXTENTS else 0 for name in self.names)
+        return tuple([int(name in EXTENTS) for name in self.names])
 
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Spline:
