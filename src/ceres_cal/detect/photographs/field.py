@@ -313,7 +313,8 @@ def _looked_from(
     if followed.holds and not followed.is_decided and not options.keep_start:
         # It is near, or looks like it, and its lens led astray: the search has other lenses to start from.
         auto = Auto(before=followed.camera, lengths=lengths)
-        other = attempt(partial(search, grey, target, painted, auto), InputError)  # reads: as it was followed
+        # reads: "the field length is ... larger", as it was followed
+        other = attempt(partial(search, grey, target, painted, auto), InputError)
         if isinstance(other, SearchResult) and other.followed is not None:
             return SearchResult(other.followed)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
