@@ -354,7 +354,7 @@ def test_names_that_do_not_fit(calibration: Calibration, observations: Observati
     assert plan.loosened("zoom") == {("camera", "overhead", "phi", "px")}
 
 
-@pytest.mark.parametrize("points, rows, seed", [(5, 200, 0), (4, 24, 1), (4, 60, 2), (5, 100, 3)])
+@pytest.mark.parametrize("points, rows, seed", [(4, 24, 1), (5, 100, 3)])
 def test_strays_are_neither_another_zoom_nor_mirrored_labels(
     calibration: Calibration, points: int, rows: int, seed: int
 ) -> None:

@@ -109,7 +109,7 @@ def known_photographs(folder: Path) -> list[Known]:
 
 
 def shared_rows(folders: Iterable[Path]) -> Iterator[Row]:
-    """Every photograph without a start and from four rough clicks; other fields are refused, not trusted, or right."""
+    """Every photograph without a start and from four rough clicks; other fields are refused, or not trusted."""
     every = [shown for folder in folders for shown in known_photographs(folder)]
     asked = [(shown, how) for shown in every for how in shown.ways]
     found: dict[str, list[Outcome]] = {}
@@ -131,7 +131,7 @@ def _rows(shown: Known, how: str, came: Outcome) -> Iterator[Row]:
     note = f"{came.seconds:.1f} s, {came.lens}"
     print(f"{case}: {came.why or came.verdict}", file=sys.stderr)
     if shown.is_wrong:
-        yield Row(case, "refused, not trusted, or right", float(not came.certified), least=1.0, note=note)
+        yield Row(case, "refused, or not trusted", float(not came.trusted), least=1.0, note=note)
         return
     yield Row(case, "found", float(not came.why), least=1.0, note=note)
     if not came.why:

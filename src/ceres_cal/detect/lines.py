@@ -61,6 +61,7 @@ class Lines(Frozen):
         sigma_px: (N,) standard deviation of it. contrast: (N,) grey levels.
         blur_px: standard deviation of the picture's blur, lens, pixel and motion together.
         stretch: the paint's width over what the target says, as far as the blur lets it be seen.
+        is_even: whether no coma was seen.
     """
 
     course: Course
@@ -70,6 +71,7 @@ class Lines(Frozen):
     contrast: Array
     blur_px: float
     stretch: float
+    is_even: bool = True
 
     @property
     def pixels(self) -> Array:
@@ -169,12 +171,14 @@ def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float)
     return np.asarray(cv2.remap(grey, x.astype(np.float32), y.astype(np.float32), flags, borderMode=border), float)
 
 
-def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | float = np.inf) -> Lines:
+def measure(
+    grey: Array32, course: Course, reach_px: float, clear_px: Array | float = np.inf, *, is_even: bool = False
+) -> Lines:
     """Measure the paint at the places of a course whose windows hold no other paint.
 
     Args:
         reach_px: how far the course may be off. clear_px: (N,) or one, from each place to other paint (see
-            `courses.clear_px`).
+            `courses.clear_px`). is_even: that no coma is looked for.
     """
     clear, blur, beyond = np.broadcast_to(clear_px, len(course)), no_blur(len(course)), _BEYOND_PX
     for _ in range(2):
@@ -190,7 +194,7 @@ def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | fl
             break
         beyond = _AS_FAR * float(np.max(blur.blur_px))
     even = fits = blur.fitted(windows, course)
-    coma = with_coma(windows, course, blur, fits, (grey.shape[0], grey.shape[1]))
+    coma = None if is_even else with_coma(windows, course, blur, fits, (grey.shape[0], grey.shape[1]))
     if coma is not None:
         blur, fits = coma, coma.fitted(windows, course)
     drawn = _OF_COMA * np.nan_to_num(fits.offset_px - even.offset_px) * np.sqrt(np.bincount(course.curve)[course.curve])
@@ -202,7 +206,8 @@ def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | fl
     offset, sigma = offset - aside, np.hypot(np.hypot(fits.sigma_px, drawn), remains)
     sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
     found = _goes_on(course, found, offset, sigma)
-    return Lines(course, found, np.where(found, offset, np.nan), sigma, contrast, blur.usual_px, blur.stretch)
+    offset = np.where(found, offset, np.nan)
+    return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma is None)
 
 
 def _window_px(course: Course, beyond_px: float) -> Array:

@@ -30,7 +30,6 @@ from ceres_cal.scene.targets import Target
 # lie aside, root sum of squares: farther, they are others.
 _SCATTER, _FARTHEST = np.array([0.0125, 0.025, 0.05, 0.1, 0.2]), 3.0
 _ASIDE = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
-SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 _OTHER = 0.1  # of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 _BEAM, _MOST = 24, 9

@@ -310,6 +310,13 @@ def _looked_from(
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
     if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
         return SearchResult(followed)
+    if followed.holds and not followed.is_decided and not options.keep_start:
+        # It is near, or looks like it, and its lens led astray: the search has other lenses to start from.
+        auto = Auto(before=followed.camera, lengths=lengths)
+        # reads: "the field length is ... larger", as it was followed
+        other = attempt(partial(search, grey, target, painted, auto), InputError)
+        if isinstance(other, SearchResult) and other.followed is not None:
+            return SearchResult(other.followed)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 
 
@@ -364,8 +371,11 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
         curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
     priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
     for name, length_m in built.dimensions.items():  # which may be others, or look so by a lens that is none of ours
-        drawn_m = built.drawn[name]
-        priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (abs(length_m - drawn_m),)))
+        drawn_m = built.drawn[
+            name
+        ]  # stated to half of what is usual: beyond, a calibration says that it is contradicted
+        sigma_m = min(abs(length_m - drawn_m), 0.5 * built.usual_m)
+        priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (sigma_m,)))
     if camera.aspect != 1.0:  # else it is solved for as one with square pixels
         priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(

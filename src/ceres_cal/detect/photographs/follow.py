@@ -18,7 +18,7 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.beside import among_others
-from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.painted import painted_curves, visible_curves
 from ceres_cal.detect.photographs.refit import TARGET, FreeIntrinsics, misfit, moved_px, observations_of, refit_camera
 from ceres_cal.detect.registration import nearness, shifted
@@ -29,8 +29,6 @@ from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target, target_from_spec
 
 FAR_PX = 130.0  # how far off the start may be
-# Share from which on no other start is tried. At half of its odds nothing changes.
-SURE_SHARE = 0.7
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # From points that were shown: what stands farther beside a line than they are off cannot draw it away.
@@ -69,10 +67,13 @@ def follow(
     if not tracker.free.names:
         return best
     if best.may_be_worn:
-        best = tracker.told(best)
+        told, best = [best], tracker.told(best)
         for one in islice(tried, _MOST_OTHERS):
-            if best.is_field:
+            if best.is_field or best.is_decided:
                 break
+            if any(one is before for before in told):
+                continue
+            told.append(one)
             again = tracker.told(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
@@ -217,7 +218,7 @@ class _Tracker:
                 break
             before, (tracker, there) = camera, refitted
             moved = moved_px(before, there, lines.course.pixels)
-            camera, lines = there, tracker.measured(there)
+            camera, lines = there, tracker.measured(there, is_even=lines.is_even)
             if moved < self.rest_px:
                 break
         return tracker.followed(camera, lines, moved)
@@ -374,10 +375,10 @@ class _Tracker:
     def _predicted(self, camera: Camera, margin_px: float = 0.0) -> Course:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
-    def measured(self, camera: Camera) -> Lines:
+    def measured(self, camera: Camera, *, is_even: bool = False) -> Lines:
         course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
         clear = clear_px(self.target, camera, course, self.curves)
-        return measure(self.grey, course, _LAST_REACH_PX, clear)
+        return measure(self.grey, course, _LAST_REACH_PX, clear, is_even=is_even)
 
     def _observed(self, lines: Lines, camera: Camera) -> Observations:
         rows = lines.found

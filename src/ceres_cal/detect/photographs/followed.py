@@ -13,6 +13,8 @@ from ceres_cal.scene.targets import Target
 
 # Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
 LEAST_SHARE = 0.5
+# The same from which on no other start is tried. At half of its odds nothing changes.
+SURE_SHARE = 0.7
 # The same of lines that may be worn to dashes: other fields and wrong places have as much, and strokes must decide.
 _LEAST_IF_WORN = 0.3
 # Found of a curve, at least; places on curves without that, at most.
@@ -90,6 +92,12 @@ class Followed(Frozen):
     def is_field(self) -> bool:
         """Whether it holds, and its curves lie as those of the target do."""
         return self.holds and not self.built.is_other
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether its lines are there, and other dimensions alone explain them: no other start would tell more."""
+        is_another = self.built.is_other and bool(self.built.dimensions) and not self.built.aside_m
+        return is_another and self.holds and self.share >= SURE_SHARE
 
     @property
     def may_be_worn(self) -> bool:

@@ -27,8 +27,8 @@ from ceres_cal.detect.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.detect.photographs.follow import SURE_SHARE, approach, refine
-from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.follow import approach, refine
+from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.grid import grid_of
 from ceres_cal.detect.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, PointHints
