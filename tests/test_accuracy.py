@@ -38,7 +38,8 @@ PROBLEMS = tuple(scenes.PROBLEMS)
 @cache
 def found(problem: str, outliers: float) -> limit.Efficiency:
     noise = replace(scenes.CLEAN_NOISE, outliers=outliers)
-    return limit.efficiency(scenes.PROBLEMS[problem](), noise, range(RUNS[problem]))
+    runs = min(RUNS[problem], 10) if outliers else RUNS[problem]  # twelve percent are told by fewer
+    return limit.efficiency(scenes.PROBLEMS[problem](), noise, range(runs))
 
 
 # ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------
@@ -136,12 +137,12 @@ def test_no_pose_of_a_small_board_is_mirrored() -> None:
 
 @pytest.mark.parametrize("name", scenes.SSL_PROBLEMS)
 def test_the_scenes_of_ssl_vision_are_solved_as_well_as_the_noise_allows(name: str) -> None:
-    rows = list(accuracy.ssl_vision_rows(name, scenes.SSL_PROBLEMS[name](), 10))
+    rows = list(accuracy.ssl_vision_rows(name, scenes.SSL_PROBLEMS[name](), 6))
     for row in rows:
         if row.what.startswith("its excess"):
             assert row.error < 0.03  # 0.003 measured, so that 10 percent are told
         assert row.verdict in ("yes", "open", ""), row
-    # Medians of 10 seeds vary by 11 percent or so; the paper's lens is ssl-vision's worst case.
+    # Medians of 6 seeds vary by 15 percent or so; the paper's lens is ssl-vision's worst case.
     means = {row.case: row.value for row in rows if row.what.startswith("mean")}
     if "paper" in name:
         for height, (theirs, _) in zip(("0", "150"), scenes.SSL_VISION_MM[name], strict=True):
@@ -171,7 +172,7 @@ def test_lines_painted_amiss_are_found_by_six_stations(seed: int) -> None:
 
 @pytest.mark.parametrize("heights_known", [False, True])
 def test_tolerances_do_no_harm_where_two_cameras_can_tell_little(heights_known: bool) -> None:
-    errors = np.array([accuracy.floor_errors_of_two_cameras(seed, heights_known) for seed in range(2)])
+    errors = np.array([accuracy.floor_errors_of_two_cameras(seed, heights_known) for seed in range(1)])
     assert np.all(errors[:, 1] <= errors[:, 0])  # 4 against 7 mm on average
 
 

@@ -54,11 +54,9 @@ def test_without_a_pose_the_best_one_is_taken() -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     seen(4).save(tmp_path / "obs.npz")
-    export(sound(), "opencv", tmp_path / "a.yml")
     sound().save(tmp_path / "ours.json")
-    for file in ("a.yml", "ours.json"):
-        assert main(["audit", str(tmp_path / file), "--observations", str(tmp_path / "obs.npz")]) == 0
-        assert capsys.readouterr().out.startswith("audit     yes\nstation   overhead explains the observations")
+    assert main(["audit", str(tmp_path / "ours.json"), "--observations", str(tmp_path / "obs.npz")]) == 0
+    assert capsys.readouterr().out.startswith("audit     yes\nstation   overhead explains the observations")
     half = planted.FAULTS["half a pixel"](sound().station())
     export(ImportedCameras({"overhead": half}, sound().targets).calibration("x"), "opencv", tmp_path / "b.yml")
     ask = ["audit", str(tmp_path / "b.yml"), "--observations", str(tmp_path / "obs.npz"), "--json"]

@@ -273,7 +273,6 @@ def test_from_photographs_alone_to_a_calibration(
 @pytest.mark.parametrize(
     "kind, seed",
     [
-        ("worn", 102),  # paint at 37 % of the places
         ("boundary", 100),  # twice as bright as the touch line, 7 px beside it
         ("another sport", 0),  # 46 % of the strokes are lines of the field
         ("an old field", 4),

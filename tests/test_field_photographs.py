@@ -178,16 +178,15 @@ def test_where_places_scatter_more_than_stated_so_do_crossings(shot: script.Shot
     assert np.std(np.concatenate(pulls)) < 2.0  # 1.24; by the stated sigmas alone 4.0
 
 
-@pytest.mark.parametrize("off, seed", [("100 px", 2), ("5 degrees", 9)])
-def test_far_starts_arrive(off: str, seed: int) -> None:
-    shot = script.take(seed)
-    angle = script.OFF_PX / shot.camera.phi if off == "100 px" else np.deg2rad(script.OFF_DEG)
-    found = follow(shot.grey, FIELD, [script.off_by(shot.camera, float(angle), seed)], FIELD.curve_names)
+def test_far_starts_arrive() -> None:
+    """Five degrees off."""
+    shot, angle = script.take(9), float(np.deg2rad(script.OFF_DEG))
+    found = follow(shot.grey, FIELD, [script.off_by(shot.camera, angle, 9)], FIELD.curve_names)
     assert found.holds and found.moved_px < 0.05
     assert np.max(script.floor_error_mm(shot, found.camera)) < 1.0  # 0.1 mm: the lens is known
 
 
-@pytest.mark.parametrize("seed", [0, 4, 8])
+@pytest.mark.parametrize("seed", [0, 8])
 def test_from_clicks_to_a_calibration(tmp_path: Path, seed: int) -> None:
     shot = script.take(seed)
     found = detect_field([saved(shot, tmp_path)], FIELD, script.clicks(shot, seed))
@@ -209,13 +208,12 @@ def test_edges_say_the_same_as_middles(tmp_path: Path, shot: script.Shot) -> Non
     assert np.mean(script.floor_error_mm(shot, by_edges)) < 0.2  # 0.05 mm
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_lines_darker_than_the_floor(tmp_path: Path, shot: script.Shot, known: bool) -> None:
+def test_lines_darker_than_the_floor(tmp_path: Path, shot: script.Shot) -> None:
     """A negative shows the same field, of which the second photograph is looked at as the first one was."""
     paths = [saved(shot, tmp_path), tmp_path / "dark.png", tmp_path / "again.png"]
     for path in paths[1:]:
         cv2.imwrite(str(path), 255 - shot.picture.image)
-    start = shot.camera if known else script.clicks(shot, 0)
+    start = script.clicks(shot, 0)
     light, dark = (detect_field(some, FIELD, start).observations.curves for some in (paths[:1], paths[1:]))
     assert len(dark) == 2 * len(light)
     for number in (0, 1):
@@ -258,11 +256,10 @@ def test_a_wrong_field_is_a_miss(tmp_path: Path, shot: script.Shot) -> None:
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("kind", ["flat", "noise", "board"])
+@pytest.mark.parametrize("kind", ["noise", "board"])
 def test_pictures_without_a_field_are_misses(tmp_path: Path, shot: script.Shot, kind: str) -> None:
     rng = np.random.default_rng(2)
     image = {
-        "flat": np.full((960, 1280), 90),
         "noise": rng.integers(0, 255, (960, 1280)),
         "board": np.kron(np.indices((24, 32)).sum(axis=0) % 2 * 200 + 20, np.ones((40, 40))),
     }[kind]

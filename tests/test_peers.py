@@ -262,10 +262,10 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_quick_form_side_by_side(tmp_path: Path) -> None:
-    """By OpenCV and pycolmap as they are here, on the set of data/opencv_left and on two inputs."""
+    """By OpenCV as it is here, on the set of data/opencv_left and on two inputs."""
     path = tmp_path / "peers.json"
     command = [sys.executable, str(ROOT / "scripts" / "peers.py"), "--quick", "--splits", "1", "--jobs", "1"]
-    asked = [*command, "--peers", "opencv", "pycolmap", "--json", str(path)]
+    asked = [*command, "--peers", "opencv", "--json", str(path)]
     printed = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
     found = json.loads(path.read_text(encoding="utf-8"))
     assert found["environment"]["missing"] == {} and "held-out rms, px" in printed
@@ -275,7 +275,7 @@ def test_quick_form_side_by_side(tmp_path: Path) -> None:
     (apart,) = (row["numbers"] for row in found["truth"] if row["peer"] == "opencv")
     assert apart > 1.3  # 2 measured: the board's errors are in no number of OpenCV's
     said = {(row["fault"], row["peer"]): row for row in found["lies"]}
-    assert not any(said["sound", peer]["wrong"] for peer in ("ours", "opencv", "pycolmap"))
+    assert not any(said["sound", peer]["wrong"] for peer in ("ours", "opencv"))
     assert said["repeated picture", "ours"]["notices"] == "named"
     assert said["repeated picture", "opencv"]["notices"] == "no"
 

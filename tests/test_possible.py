@@ -49,7 +49,7 @@ def refusal(observations: Observations, options: Options | None = None) -> str:
     return str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["corners", "lines", "lines-arcs", "field-boards", "rings-field", "two-cameras"])
+@pytest.mark.parametrize("name", ["corners", "lines-arcs", "field-boards", "rings-field", "two-cameras"])
 @pytest.mark.parametrize("how", MIRRORED)
 def test_a_mirrored_picture_is_refused(name: str, how: str) -> None:
     seen = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations

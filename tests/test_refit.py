@@ -42,7 +42,7 @@ from ceres_cal.problem.prior_cost import PriorCost
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.structure import Tolerance
-from ceres_cal.scene.files import CameraFile, PoseFile
+from ceres_cal.scene.camera import CameraFile, PoseFile
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
@@ -354,7 +354,7 @@ def test_names_that_do_not_fit(calibration: Calibration, observations: Observati
     assert plan.loosened("zoom") == {("camera", "overhead", "phi", "px")}
 
 
-@pytest.mark.parametrize("points, rows, seed", [(5, 200, 0), (4, 24, 1), (4, 60, 2), (5, 100, 3)])
+@pytest.mark.parametrize("points, rows, seed", [(4, 24, 1), (5, 100, 3)])
 def test_strays_are_neither_another_zoom_nor_mirrored_labels(
     calibration: Calibration, points: int, rows: int, seed: int
 ) -> None:

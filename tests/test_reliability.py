@@ -420,9 +420,9 @@ def _nearly_singular(observations: Observations) -> Iterator[Observations]:
     none = np.zeros(len(curves), bool)
     for count in range(1, 9):
         yield observations.part(np.arange(len(points)) < count, none)
-    yield replace(observations, points=replace(points, pixels=np.full_like(points.pixels, 100.0)))
     line = np.column_stack([np.linspace(0.0, 900.0, len(points)), np.linspace(0.0, 500.0, len(points))])
-    yield replace(observations, points=replace(points, pixels=line)).part(np.ones(len(points), bool), none)
+    for pixels in (np.full_like(points.pixels, 100.0), line):
+        yield replace(observations, points=replace(points, pixels=pixels)).part(np.ones(len(points), bool), none)
     for sigma_px in (1e-12, 1e12):
         yield replace(observations, points=replace(points, sigma_px=np.full(len(points), sigma_px)))
 

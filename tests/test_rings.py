@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from rendering.photograph import photograph
 from rendering.photography import Photography
 from scenes import RADIAL, camera, rings_and_field
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Image8
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
@@ -25,11 +26,16 @@ RADII = tuple(i / 100 for i in range(1, 37))
 HARSH = Photography(blur_px=1.1, vignetting=0.4, unevenness=0.4, read_noise=4.0, jpeg_quality=80)
 
 
-def taken(folder: Path, how: Photography, seed: int = 0) -> Path:
-    """A photograph of data/field_2004's rings."""
+@cache
+def image_of_rings(how: Photography) -> Image8:
     scene, _ = built_in_scene("rings-2004")
+    return photograph(scene, "overhead", "rings", how).image
+
+
+def taken(folder: Path, how: Photography) -> Path:
+    """A photograph of data/field_2004's rings."""
     path = folder / "rings.png"
-    cv2.imwrite(str(path), photograph(scene, "overhead", "rings", how, seed).image)
+    cv2.imwrite(str(path), image_of_rings(how))
     return path
 
 

@@ -1,8 +1,6 @@
 """Simulation: every row is where the camera model puts it, and the truth beside it is true."""
 
 import math
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -47,6 +45,7 @@ from ceres_cal.simulate import (
     truth_to_json,
     write_simulation,
 )
+from data import make_data
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
@@ -526,17 +525,25 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 # ---- the sample data ------------------------------------------------------------------------------------------------
 
 
-def test_sample_data_come_from_the_script(tmp_path: Path) -> None:
-    script = [sys.executable, str(ROOT / "scripts" / "run.py"), "make_data", str(tmp_path)]
-    printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout
-    shipped = {path.relative_to(ROOT / "data"): path.read_bytes() for path in (ROOT / "data").glob("*/*.json")}
-    made = {path.relative_to(tmp_path): path.read_bytes() for path in tmp_path.glob("*/*.json")}
-    assert made == shipped
-    assert sum(map(len, shipped.values())) < 400_000
-    images = [path.relative_to(ROOT / "data") for path in (ROOT / "data").rglob("*.jpg")]
-    images = [path for path in images if path.parts[0] != "opencv_left"]  # which were taken by a camera
-    assert len(shipped) == 7 and len(images) == 14 and len(printed.splitlines()) == 21
-    assert max((ROOT / "data" / path).stat().st_size for path in images) < 300_000
+def test_sample_data_come_from_the_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every observation and truth; seven of the fourteen photographs are taken anew."""
+    monkeypatch.setattr(make_data, "PHOTOGRAPHED", make_data.PHOTOGRAPHED[:4])
+    assert make_data.main([str(tmp_path)]) == 0
+    names = {path.relative_to(ROOT / "data") for path in (ROOT / "data").glob("*/*.json")}
+    assert names == {path.relative_to(tmp_path) for path in tmp_path.glob("*/*.json")} and len(names) == 7
+    for name in names:
+        shipped, made = (msgspec.json.decode((root / name).read_bytes()) for root in (ROOT / "data", tmp_path))
+        if name.name == "truth.json":
+            taken = made.pop("photographs")
+            assert taken == {one: shot for one, shot in shipped.pop("photographs").items() if one in taken}
+        assert made == shipped, name
+    assert sum((ROOT / "data" / name).stat().st_size for name in names) < 400_000
+    every = [path for path in (ROOT / "data").rglob("*.jpg") if path.parts[-2] != "opencv_left"]  # taken by a camera
+    images = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*.jpg"))
+    assert (len(every), len(images), len(capsys.readouterr().out.splitlines())) == (14, 7, 14)
+    assert max(path.stat().st_size for path in every) < 300_000
     for path in images:
         ours, theirs = (cv2.imread(str(root / path), cv2.IMREAD_GRAYSCALE) for root in (ROOT / "data", tmp_path))
         assert ours is not None and theirs is not None

@@ -271,7 +271,7 @@ def test_a_prior_on_phi_is_part_of_its_profile() -> None:
     assert (verdict.low, verdict.high) == pytest.approx((560.0 - 117.6, 560.0 + 117.6), abs=12.0)  # 447, 683 measured
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_camera_a_hands_breadth_over_the_floor(seed: int) -> None:
     """At 1 degree a quarter of all least costs lie at a phi of a few px, and so do two cameras over an askew field."""
     for calibration in (
@@ -315,14 +315,14 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 
 @pytest.mark.parametrize(
     "name, runs",
-    [("tilt 25 deg", 20), ("tilt 3 deg", 20), ("tilt 1 deg", 20), ("tilt 1 deg, height", 20), ("boards", 20)],
+    [("tilt 25 deg", 10), ("tilt 3 deg", 10), ("tilt 1 deg", 10), ("tilt 1 deg, height", 10), ("boards", 10)],
 )
 def test_intervals_hold_what_they_say(name: str, runs: int) -> None:
     """Four standard errors around 0.95, by few runs; accuracy/intervals.py has 500 of each, 0.943 to 0.964 measured."""
     found, wider = cover(CASES[name], range(runs)), np.sqrt(60.0 / runs)
     assert found.failed == 0
     mean, error = share(found.parameters)
-    assert mean == pytest.approx(0.95, abs=4.0 * max(error, 0.01)) and error < 0.02 * wider
+    assert mean == pytest.approx(0.95, abs=4.0 * max(error, 0.01 * wider)) and error < 0.02 * wider
     assert np.min(np.mean(found.parameters, axis=0)) > 0.95 - 0.12 * wider  # four standard errors
     if found.points:
         assert share(found.points[0.0])[0] == pytest.approx(0.95, abs=0.04 * wider)

@@ -180,12 +180,26 @@ class SparseColumns(Frozen):
         sums = np.bincount(key.ravel(), products.ravel(), minlength=owners * (self.size + 1))
         return np.asarray(sums.reshape(owners, -1)[:, :-1])
 
+    @cached_property
+    def _dense(self) -> Array | None:
+        """(E, Q) all of them, where these are hardly more numbers than move each equation."""
+        most = 2  # times as many
+        if self.size > most * self.slots.shape[1]:
+            return None
+        dense = np.zeros((len(self.slots), self.size + 1))
+        dense[np.arange(len(dense))[:, None], self.slots] = self.values
+        return dense[:, :-1]
+
     def summed(self, factors: Array) -> Array:
         """(Q,) the same over all equations."""
+        if self._dense is not None and factors.ndim == 1:
+            return np.asarray(factors @ self._dense)
         return np.asarray(self.gathered(factors, np.zeros(len(self.slots), dtype=np.int64), 1)[0])
 
     def products(self) -> Array:
         """(Q, Q) X^T X."""
+        if self._dense is not None:
+            return np.asarray(self._dense.T @ self._dense)
         every = [self.gathered(self.values[:, k], self.slots[:, k], self.size + 1) for k in range(self.slots.shape[1])]
         return np.asarray(np.sum(every, axis=0)[:-1])
 
@@ -196,10 +210,14 @@ class SparseColumns(Frozen):
     def in_private(self, model: Linearised) -> Array:
         """(6, S, Q) what the private placement of each sight takes of them."""
         bounds, sight = model.equations.bounds, model.equations.sight
+        if not model.of_private.any():
+            return np.zeros((6, len(bounds) - 1, self.size))
         return np.array([self.gathered(column, sight, len(bounds) - 1) for column in model.private.T])
 
     def in_shared(self, model: Linearised) -> Array:
         """(P, Q) what the shared numbers take of them."""
+        if self._dense is not None:
+            return np.asarray(model.shared.T @ self._dense)
         return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
 
     def left_of(self, model: Linearised) -> tuple[Array, Array]:

@@ -116,6 +116,8 @@ class Linearised(Frozen):
 
     def beyond_private(self, columns: Array) -> Array:
         """Columns (E, Q), in standard deviations, without what private placements take up."""
+        if not self._private_ranges:
+            return columns
         rest = columns.copy()
         inside = columns if self.used.all() else columns * self.used[:, None]
         for start, stop in self._private_ranges:
@@ -212,7 +214,7 @@ class Linearised(Frozen):
     def _projected(self, columns: Array) -> tuple[Array, Array]:
         """Columns (E, Q), in standard deviations, beyond private placements, and what `shared` takes of them (P, Q)."""
         rest = self.beyond_private(columns)
-        return rest, self.shared[self.used].T @ rest[self.used]
+        return rest, self.shared.T @ (rest * self.used[:, None])
 
     @cached_property
     def leverage(self) -> Array:
@@ -281,8 +283,9 @@ def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations
     rest = blank.beyond_private(columns)
     prior_rows, prior_values = prior_equations(problem, estimate, keys)
     inside = rest[weights.used]
+    before = inside if rest is columns else columns[weights.used]
     normal = inside.T @ inside + prior_rows.T @ prior_rows
-    sizes = np.sum(columns[weights.used] ** 2, axis=0) + np.sum(prior_rows**2, axis=0)
+    sizes = np.einsum("ep,ep->p", before, before) + np.sum(prior_rows**2, axis=0)
     root = inverse_root(normal, sizes, SINGULAR)
     gradient = inside.T @ blank.score[weights.used] + prior_rows.T @ prior_values
     return replace(

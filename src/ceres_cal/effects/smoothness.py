@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
-from operator import add
 
 import numpy as np
 
@@ -83,16 +81,16 @@ def _by_sizes(
         root.T @ others @ root,
         root.T @ slope[rest],
     )
+    flat = others.reshape(len(forms), -1)
 
     def told(sigmas: Array) -> tuple[Array, Array, Array]:
         along = along_turned(sigmas)
         weighed = coupling * along
-        covariance = np.linalg.inv(here + np.tensordot(sigmas**-2, others, 1) - weighed @ coupling.T)
+        covariance = np.linalg.inv(here + (sigmas**-2 @ flat).reshape(here.shape) - weighed @ coupling.T)
         amount, numbers = covariance @ (beside - weighed @ own), np.empty(len(slope))
         of_turned = along * (own - coupling.T @ amount)
         numbers[rest], numbers[turned] = root @ amount, turn @ of_turned
-        traces = np.tensordot(others, covariance)
-        squares = others @ amount @ amount
+        traces, squares = flat @ covariance.reshape(-1), others @ amount @ amount
         traces[largest] += np.sum(along) + np.sum(covariance * (weighed @ weighed.T))
         squares[largest] += of_turned @ of_turned
         return numbers, traces, squares
@@ -136,7 +134,7 @@ def with_smoothness(
         return problem, reduced, 0.0
     smooth = replace(problem, smoothness={**problem.smoothness, **found})
     priors = [prior.information for prior in smooth.priors_at(estimate)]
-    known = reduce(add, priors, Information.nothing(reduced.shared.keys))
+    known = Information.nothing(reduced.shared.keys).beside_all(priors)
     return smooth, replace(reduced, priors=known), moving
 
 

@@ -12,7 +12,8 @@ from where the pose is, so no pose is special, not even one turned by half a tur
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -133,7 +134,7 @@ class Information(Frozen):
     def given(self, keys: Sequence[Key]) -> Information:
         """About some of the numbers, with all others held where they are."""
         at = self.columns(keys)
-        return Information(tuple(keys), self.matrix[np.ix_(at, at)])
+        return Information(tuple(keys), self.matrix[at[:, None], at])
 
     def marginal(self, keys: Sequence[Key]) -> Information:
         """About some of the numbers, all others integrated out: the Schur complement."""
@@ -141,9 +142,9 @@ class Information(Frozen):
         if not rest:
             return self.given(keys)
         at, others = self.columns(keys), self.columns(rest)
-        here, coupling = self.matrix[np.ix_(at, at)], self.matrix[np.ix_(others, at)]
+        here, coupling = self.matrix[at[:, None], at], self.matrix[others[:, None], at]
         return Information(
-            tuple(keys), without(here, coupling, self.matrix[np.ix_(others, others)], sigma_limits(rest))
+            tuple(keys), without(here, coupling, self.matrix[others[:, None], others], sigma_limits(rest))
         )
 
     def without(self, keys: Collection[Key]) -> Information:
@@ -155,7 +156,7 @@ class Information(Frozen):
         """The same over other keys, which have all of its own among them."""
         whole = Information.nothing(keys)
         at = whole.columns(self.keys)
-        whole.matrix[np.ix_(at, at)] = self.matrix
+        whole.matrix[at[:, None], at] = self.matrix
         return whole
 
     def widened(self, shifts: Array) -> Information:
@@ -191,10 +192,17 @@ class Information(Frozen):
 
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""
-        if self.keys == other.keys:
-            return Information(self.keys, self.matrix + other.matrix)
-        keys = tuple(dict.fromkeys((*self.keys, *other.keys)))
-        return Information(keys, self.over(keys).matrix + other.over(keys).matrix)
+        return self.beside_all([other])
+
+    def beside_all(self, others: Iterable[Information]) -> Information:
+        """All of them together, over the keys of any."""
+        every = [other for other in others if other.keys]
+        keys = tuple(dict.fromkeys(chain(self.keys, *(other.keys for other in every if other.keys != self.keys))))
+        whole = self.over(keys) if len(keys) > len(self.keys) else Information(keys, self.matrix.copy())
+        for other in every:
+            at = whole.columns(other.keys)
+            whole.matrix[(at[:, None], at) if other.keys != keys else ...] += other.matrix
+        return whole
 
     @cached_property
     def spread(self) -> Spread:

@@ -119,8 +119,10 @@ class Problem(Frozen):
 
     def knows_lens(self, camera: str, lens: Lens) -> bool:
         """Whether a posterior states a camera's lens in every direction: how smooth it is, is in there."""
+        if camera not in self._stated_whole:
+            return False
         rough = {name for form in lens.roughness for name in form.names}
-        return bool(rough) and rough <= self._stated_whole.get(camera, frozenset())
+        return bool(rough) and rough <= self._stated_whole[camera]
 
     @cached_property
     def _stated_whole(self) -> dict[str, frozenset[str]]:

@@ -173,13 +173,12 @@ class _InformationSums:
                 self._add(key, self._estimate.pose_stack([key])[0], kinds)
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
-        known = reduce(add, priors, Information.nothing(self._keys))
+        known = Information.nothing(self._keys).beside_all(priors)
         every = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
         of_targets = [all(key.kind == "structure" for key in prior.keys) for prior in every]
         each = list(zip(every, of_targets, strict=True))
         stated, built = (
-            reduce(add, (one.information for one, own in each if own == of), Information.nothing())
-            for of in (False, True)
+            Information.nothing().beside_all(one.information for one, own in each if own == of) for of in (False, True)
         )
         return ReducedInformation(points, curves, known, stated, built, tuple(eliminated), *self._leverages.tolist())
 

@@ -15,8 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +68,7 @@ def linear_rest(statement: Statement, end: RobustSolution) -> Rest:
     estimate, freedom = end.solution.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
         reduced = end.reduced or information(end.problem, estimate)
-        stated = reduce(add, (prior.information for prior in statement.priors), Information.nothing(statement.keys))
+        stated = Information.nothing(statement.keys).beside_all(prior.information for prior in statement.priors)
         at = reduced.shared.columns(stated.keys)
         slope = np.zeros(len(stated.keys))
         for prior in statement.priors:

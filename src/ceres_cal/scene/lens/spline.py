@@ -169,7 +169,7 @@ class Spline(Planar):
         rows = np.vstack([profile_columns(np.nan_to_num(u)), rough.T])
         return {f"g{k + 1}": rows[:, k] for k in range(COUNT)}, np.append(measured - rim * u, np.zeros(COUNT))
 
-    @property
+    @cached_property
     def roughness(self) -> tuple[Roughness, ...]:
         loose_surface, least_surface = 1e-3, 1e-5
         rim, names = self._rim_px, self.names
