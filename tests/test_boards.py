@@ -291,7 +291,7 @@ def _moved_aside(x_px: float, y_px: float, turn: float = 0.0, board: Target = BO
     return photograph(ideal_picture(camera, 0.03, squares(columns, rows))), truth
 
 
-@pytest.mark.parametrize("x_px, y_px, turn", [(-220, 0, 0.0), (220, 0, np.pi), (0, -140, np.pi), (0, 140, 0.0)])
+@pytest.mark.parametrize("x_px, y_px, turn", [(-220, 0, 0.0), (0, -140, np.pi)])
 def test_a_board_partly_out_of_the_picture(x_px: float, y_px: float, turn: float, tmp_path: Path) -> None:
     image, truth = _moved_aside(x_px, y_px, turn)
     points = detect_boards([write(tmp_path / "a.png", image)], BOARD).observations.points

@@ -78,7 +78,7 @@ def error_sd(calibration: Calibration, scene: Scene) -> Array:
 
 
 @pytest.mark.parametrize("line", LINES)
-@pytest.mark.parametrize("aside_px", [3.0, -6.0, 15.0])
+@pytest.mark.parametrize("aside_px", [3.0, -15.0])
 def test_line_aside_in_the_only_frame_is_named_and_taken_out(line: str, aside_px: float) -> None:
     sound = simulate(half_field(), NOISE, 1).observations
     observations = moved_aside(sound, line, aside_px)
@@ -181,7 +181,7 @@ def test_board_that_is_not_its_drawing_is_taken_out() -> None:
 # ---- what belongs ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("make", [half_field, lambda: lines_and_arcs("radial-2-3"), lambda: boards("brown")])
 def test_sound_scenes_lose_nothing(make: object, seed: int) -> None:
     """0 of 200 in one frame of half a field, and none in doubt."""

@@ -42,7 +42,7 @@ from ceres_cal.problem.prior_cost import PriorCost
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.structure import Tolerance
-from ceres_cal.scene.files import CameraFile, PoseFile
+from ceres_cal.scene.camera import CameraFile, PoseFile
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate

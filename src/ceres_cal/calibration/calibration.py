@@ -44,8 +44,7 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import every_key
 from ceres_cal.problem.structure import redrawn
 from ceres_cal.robust.stated import Conflict, agreed
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.files import CameraFile, PoseFile
+from ceres_cal.scene.camera import Camera, CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
 
 _ALIKE = (

@@ -24,7 +24,7 @@ from ceres_cal.problem.parameters import Estimate, Options, Station
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.structure import EXACT, WARP, make_structure
 from ceres_cal.robust.stated import Conflict
-from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
+from ceres_cal.scene.camera import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
 
 COPY = "a copy"

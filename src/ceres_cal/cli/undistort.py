@@ -204,7 +204,7 @@ def _write(path: Path, picture: Image) -> None:
 
 def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.report.pictures.straight import straighten
-    from ceres_cal.scene.files import camera_to_json
+    from ceres_cal.scene.camera import camera_to_json
 
     name, station, camera = _camera(args, calibration)
     straight = straighten(camera, whole=args.whole, size=args.size, phi=args.phi, angle_deg=args.angle)

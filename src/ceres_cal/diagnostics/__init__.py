@@ -4,6 +4,5 @@ from ceres_cal.diagnostics.checks import Noise as Noise
 from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE as FALSE_ALARM_RATE
 from ceres_cal.diagnostics.diagnose import Diagnosis as Diagnosis
 from ceres_cal.diagnostics.diagnose import diagnose as diagnose
-from ceres_cal.diagnostics.summaries import Summary as Summary
 from ceres_cal.diagnostics.table import ResidualTable as ResidualTable
 from ceres_cal.effects.effect import Finding as Finding

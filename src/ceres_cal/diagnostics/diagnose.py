@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, numerical
 from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.shown import Shown, drawn, html_of, text_of
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
@@ -17,7 +17,6 @@ from ceres_cal.base.words import plural
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResults, measure_noise, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled
-from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.effects.columns import EffectSums, least_absolute
 from ceres_cal.effects.effect import Finding
@@ -34,6 +33,9 @@ from ceres_cal.problem.residuals import Residuals, residuals, write_equations
 from ceres_cal.robust.other_minima import with_lost_boards_posed
 from ceres_cal.robust.stated import Conflict
 
+if TYPE_CHECKING:
+    from ceres_cal.diagnostics.summaries import Summaries
+
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
 
@@ -43,7 +45,7 @@ class Diagnosis(Frozen):
 
     Attributes:
         findings: causes of what is left over, the largest first (by effect in px). None: what is left looks like noise.
-        table: every observation. summaries: the same by frame, feature, image region and radius.
+        table: every observation.
         noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
         degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
         conflicts: what was known beforehand and everything else contradicts, the calibration's own.
@@ -56,7 +58,6 @@ class Diagnosis(Frozen):
 
     findings: tuple[Finding, ...]
     table: ResidualTable
-    summaries: Summaries
     noise: tuple[Noise, ...]
     degrees_of_freedom: float
     new_data: bool
@@ -84,6 +85,13 @@ class Diagnosis(Frozen):
             camera: its name; may be left out where there is only one.
         """
         return drawn("plot_residuals", self, ax, camera=camera)
+
+    @cached_property
+    def summaries(self) -> Summaries:
+        """The table by frame, feature, image region and radius."""
+        from ceres_cal.diagnostics.summaries import summarise
+
+        return summarise(self.step.case, self.table)
 
     @property
     def model_error(self) -> bool:
@@ -125,7 +133,6 @@ def diagnose(
     return Diagnosis(
         tuple(sorted(findings, key=lambda finding: -finding.effect_px)),
         case.table,
-        summarise(case),
         tested.noise,
         case.inliers.degrees_of_freedom,
         observations.digest != calibration.digest,

@@ -8,8 +8,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, numbers_of
 from ceres_cal.base.frozen import Frozen
-from ceres_cal.diagnostics.checks import DiagnosisCase
 from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.effects.effect import Case
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.scene.camera import Camera
 
@@ -66,9 +66,9 @@ class Summaries(Frozen):
     trends: tuple[RadiusTrend, ...]
 
 
-def summarise(case: DiagnosisCase) -> Summaries:
+def summarise(case: Case, table: ResidualTable) -> Summaries:
     """All summaries of a table."""
-    observations, table, cameras = case.observations, case.table, case.estimate.cameras
+    observations, cameras = case.observations, case.estimate.cameras
     several = len(observations.stations) > 1
     labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
     frames = list(dict.fromkeys(labels))

@@ -24,7 +24,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information, Key, over, pose_keys
 from ceres_cal.problem.parameters import Estimate, Station
 from ceres_cal.problem.structure import EXACT
-from ceres_cal.scene.files import CameraFile, PoseFile
+from ceres_cal.scene.camera import CameraFile, PoseFile
 
 
 class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):

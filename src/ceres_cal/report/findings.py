@@ -8,8 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, plural, powered, sentence, short
-from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable, Summary
+from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable
 from ceres_cal.diagnostics.held_out import Choice
+from ceres_cal.diagnostics.summaries import Summary
 from ceres_cal.report.document import Card, Chapter, Piece, Section, Table, Text, wrapped
 from ceres_cal.report.grounds import is_against
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.words import fixed, grouped, short
-from ceres_cal.diagnostics import ResidualTable, Summary
-from ceres_cal.diagnostics.summaries import RadiusTrend
+from ceres_cal.diagnostics import ResidualTable
+from ceres_cal.diagnostics.summaries import RadiusTrend, Summary
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table

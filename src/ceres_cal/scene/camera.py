@@ -1,4 +1,4 @@
-"""A camera: image size, intrinsics, lens and pose, and the maps between world, rays and pixels.
+"""A camera: image size, intrinsics, lens and pose, the maps between world, rays and pixels, and how files have it.
 
 Pixel (0, 0) is the centre of the top-left pixel. The camera frame has x right, y down, z forward, and
 x_cam = R (x_world - t) with t the camera's position (paper, section 3).
@@ -12,6 +12,7 @@ from importlib import import_module
 from numbers import Real
 from typing import Any
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
@@ -20,9 +21,9 @@ from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.shown import drawn, html_of
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.base.typed import numbers_in, rows, size_in
-from ceres_cal.scene.lens import Lens
+from ceres_cal.scene.lens import Lens, make_lens
 
 LARGEST_PX = 10**9  # what is larger is no number of pixels
 LARGEST = 1e100  # of any number of a camera: squares and cubes of what is larger overflow
@@ -289,3 +290,76 @@ def _along_edge(image_size: tuple[int, int]) -> Array:
     sides = [np.column_stack(one) for end in ends for one in ((along, end), (end, along))]
     size = np.array(image_size)
     return np.asarray(np.vstack(sides) * size + 0.5 * (size - 1.0))
+
+
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+
+
+# ---- in our files ---------------------------------------------------------------------------------------------------
+
+
+class LensFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """A lens; only `radial` and `spline` have powers. Which terms it has, its coefficients' names say."""
+
+    kind: str
+    powers: tuple[int, ...] | None = None
+    coefficients: dict[str, float] = {}
+
+
+class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """A camera's intrinsics."""
+
+    image_size: tuple[int, int]
+    phi: float
+    principal_point: tuple[float, float]
+    aspect: float = 1.0
+    skew: float | msgspec.UnsetType = msgspec.UNSET
+    lens: LensFile
+    camera_matrix: Matrix | msgspec.UnsetType = msgspec.UNSET
+    """K, for other programs: phi, aspect, skew and principal point once more."""
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraFile:
+        """As a file has it."""
+        lens = LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients)
+        size, centre = camera.image_size, camera.principal_point
+        k = camera.matrix.tolist()
+        return cls(
+            image_size=size,
+            phi=camera.phi,
+            principal_point=centre,
+            aspect=camera.aspect,
+            skew=camera.skew or msgspec.UNSET,
+            lens=lens,
+            camera_matrix=k,
+        )
+
+    def camera(self) -> Camera:
+        """The camera, at no particular pose; InputError where it is none."""
+        lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
+        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect, skew=self.skew or 0.0)
+        if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
+            raise InputError("camera_matrix is another than that of phi, aspect, skew and principal_point: correct one")
+        return camera
+
+
+class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A rotation's rows and a translation."""
+
+    rotation: Matrix
+    translation_m: Vector
+
+    @classmethod
+    def of(cls, pose: Pose) -> PoseFile:
+        """As a file has it."""
+        return cls(pose.rotation.tolist(), pose.translation.tolist())
+
+    def pose(self) -> Pose:
+        """The pose; InputError where the rotation is none."""
+        return Pose(require_rotation(self.rotation, "rotation"), np.array(self.translation_m))
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """A camera's intrinsics as plain data."""
+    return dict(msgspec.to_builtins(CameraFile.of(camera)))

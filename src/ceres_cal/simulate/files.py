@@ -16,8 +16,7 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import check_header, convert, make_folder, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.problem.parameters import Station
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
+from ceres_cal.scene.camera import Camera, CameraFile, Vector, camera_to_json
 from ceres_cal.scene.targets import targets_from_specs
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth

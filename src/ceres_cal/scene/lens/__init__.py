@@ -1,8 +1,7 @@
-"""The lens models, each in a file of its own."""
+"""The lens models."""
 
 from ceres_cal.scene.lens.base import LENSES, Lens, lens_class, make_lens, register
-from ceres_cal.scene.lens.brown import Brown
-from ceres_cal.scene.lens.kannala_brandt import KannalaBrandt
+from ceres_cal.scene.lens.opencv import Brown, KannalaBrandt
 from ceres_cal.scene.lens.radial import Radial
 from ceres_cal.scene.lens.spline import Spline
 
