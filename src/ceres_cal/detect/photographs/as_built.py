@@ -216,15 +216,8 @@ class _CurveNumbers(Frozen):
             dimensions[name] = float(self.lengths[d] * (1.0 + _OTHER * values[0]))
             sds[name] = float(self.lengths[d] * _OTHER * own[0])
         drawn = {name.partition("/")[2]: float(length) for name, length in zip(self.names, self.lengths, strict=True)}
-        return FieldAsBuilt(
-            aside,
-            dimensions,
-            sds,
-            drawn,
-            tuple(curves),
-            self.usual_m,
-            scatter_m * (scatter_m > _SCATTER[0] * self.usual_m),
-        )
+        scatter_m *= scatter_m > _SCATTER[0] * self.usual_m
+        return FieldAsBuilt(aside, dimensions, sds, drawn, tuple(curves), self.usual_m, scatter_m)
 
     def _searched(self, roots: Sequence[Array]) -> tuple[list[int], float]:
         """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""

@@ -16,16 +16,8 @@ from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.symmetry import middle_of, size_of
 from ceres_cal.scene.targets import Target
 
-SIDES = {
-    "left": (-1.0, 0.0),
-    "right": (1.0, 0.0),
-    "top": (0.0, -1.0),
-    "bottom": (0.0, 1.0),
-    "top-left": (-1.0, -1.0),
-    "top-right": (1.0, -1.0),
-    "bottom-left": (-1.0, 1.0),
-    "bottom-right": (1.0, 1.0),
-}
+_FOUR = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "top": (0.0, -1.0), "bottom": (0.0, 1.0)}
+SIDES = _FOUR | {f"{y}-{x}": (_FOUR[x][0], _FOUR[y][1]) for y in ("top", "bottom") for x in ("left", "right")}
 # Cosine of the angle between a side of the picture and a feature that lies towards it, at least: within 73 degrees.
 _FACES = 0.3
 # A cosine less by no more than this is no worse.
@@ -95,8 +87,7 @@ def nearest_to_before(cameras: Sequence[Camera], before: Camera) -> list[int]:
 
 def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str]) -> str:
     """The side of the picture, left, right, top or bottom, that a feature lies towards."""
-    four = [side for side in SIDES if "-" not in side]
-    return max(four, key=lambda side: facing_cosine(Facing(feature, side), camera, target, curves))
+    return max(_FOUR, key=lambda side: facing_cosine(Facing(feature, side), camera, target, curves))
 
 
 def distinguishing_feature(target: Target, curves: Collection[str]) -> str:

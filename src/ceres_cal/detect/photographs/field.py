@@ -339,15 +339,11 @@ def _starts(
         return starts_from_clicks(start, target, size, lengths)
     camera = start.camera if isinstance(start, Followed) else start
     if camera.image_size != size:
-        raise InputError(
-            f"{path}: {size[0]} x {size[1]} px, "
-            + (
-                "unlike the images before: give it on its own"
-                if isinstance(start, Followed)
-                else f"but the camera has {camera.image_size[0]} x {camera.image_size[1]}: "
-                "start from a calibration of this camera"
-            )
-        )
+        width, height = camera.image_size
+        other = f"but the camera has {width} x {height}: start from a calibration of this camera"
+        if isinstance(start, Followed):
+            other = "unlike the images before: give it on its own"
+        raise InputError(f"{path}: {size[0]} x {size[1]} px, {other}")
     return [camera], FreeIntrinsics(priors=lengths)
 
 
@@ -371,9 +367,7 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
         curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
     priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
     for name, length_m in built.dimensions.items():  # which may be others, or look so by a lens that is none of ours
-        drawn_m = built.drawn[
-            name
-        ]  # stated to half of what is usual: beyond, a calibration says that it is contradicted
+        drawn_m = built.drawn[name]  # beyond what is usual a calibration says that this is contradicted
         sigma_m = min(abs(length_m - drawn_m), 0.5 * built.usual_m)
         priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (sigma_m,)))
     if camera.aspect != 1.0:  # else it is solved for as one with square pixels

@@ -67,13 +67,10 @@ def follow(
     if not tracker.free.names:
         return best
     if best.may_be_worn:
-        told, best = [best], tracker.told(best)
+        best = tracker.told(best)
         for one in islice(tried, _MOST_OTHERS):
             if best.is_field or best.is_decided:
                 break
-            if any(one is before for before in told):
-                continue
-            told.append(one)
             again = tracker.told(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
@@ -143,13 +140,14 @@ class _Tracker:
         return replace(self, curves=[one for one in self.curves if one not in names], missing=tuple(names))
 
     def tried(self, starts: Sequence[Camera]) -> Iterator[Followed]:
-        """What is reached from each start: what is surely the field at once, then the others, the best first."""
-        left: list[Followed] = []
+        """What is reached from the starts: what is surely the field at once, then the others, the best first."""
+        is_sure: dict[Followed, bool] = {}
         for one in self._reached(starts):
-            if one.holds and one.share >= SURE_SHARE:
-                yield one
-            else:
-                left.append(one)
+            if one not in is_sure:
+                is_sure[one] = one.holds and one.share >= SURE_SHARE
+                if is_sure[one]:
+                    yield one
+        left = [one for one in is_sure if not is_sure[one]]
         yield from sorted(left, key=lambda one: (one.holds, one.share), reverse=True)
 
     def _reached(self, starts: Sequence[Camera]) -> Iterator[Followed]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import partial
 from pathlib import Path
 
 from ceres_cal.base.errors import InputError, NothingShownError
@@ -98,7 +99,7 @@ def detect_known(
     shown: dict[str, int] = {}
     reasons: dict[str, list[str]] = {str(path): [] for path in paths}
     for turn, (what, target) in enumerate(wanted.items()):
-        report = _counting_on(progress, turn, len(wanted))
+        report = partial(_count_on, progress, turn, len(wanted))
         try:
             detected, missed = _searched(paths, target, posed, names, not_painted, report)
             parts.append(_renamed(detected, what))
@@ -164,14 +165,10 @@ def _counted(images: int) -> str:
     return "the photograph" if images == 1 else f"any of {images} photographs"
 
 
-def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> ImageProgress:
-    """The callback of one of several searches through the same images."""
-
-    def report(done: int, images: int, name: str) -> None:
-        if progress is not None:
-            progress(turn * images + done, turns * images, name)
-
-    return report
+def _count_on(progress: ImageProgress | None, turn: int, turns: int, done: int, images: int, name: str) -> None:
+    """What one of several searches through the same images tells."""
+    if progress is not None:
+        progress(turn * images + done, turns * images, name)
 
 
 def _renamed(detected: Observations, target: str) -> Observations:
