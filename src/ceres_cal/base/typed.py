@@ -41,7 +41,7 @@ def take_types(instance: Any) -> None:
     """
     of, held = type(instance), vars(instance)
     for name, kind in _fields(of).items():  # type: ignore[arg-type] # a class has a hash
-        value = held[name]
+        value = getattr(instance, name)  # of a default that a file has not, its class
         if type(value) is not kind and value is not getattr(of, name, held):  # nor its default
             held[name] = convert(_plain(value), kind, f"{of.__name__}({name}=...)")
 
