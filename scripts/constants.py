@@ -62,6 +62,9 @@ class Constant:
             if not inspect.isclass(getattr(owner, cls)):
                 object.__setattr__(getattr(owner, cls), field, value)
                 return
+            if "__init__" not in vars(getattr(owner, cls)):  # that of all frozen data, which reads the fields
+                getattr(owner, cls).__dataclass_fields__[field].default = value
+                return
             make = inspect.unwrap(getattr(owner, cls).__init__)
             names = [name for name, one in inspect.signature(make).parameters.items() if one.default is not one.empty]
             defaults = list(make.__defaults__)

@@ -6,6 +6,7 @@ import copy
 import pickle
 from dataclasses import FrozenInstanceError, fields
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -71,3 +72,9 @@ def test_it_is_a_dataclass_to_everybody() -> None:
         assert (again.name, again.colour, again.size) == ("red", 1, 2)
     with pytest.raises(TypeError, match="colour"):
         Coloured(np.zeros(2))  # type: ignore[call-arg]
+
+
+def test_what_a_file_leaves_out_is_the_default() -> None:
+    """msgspec writes no default into an instance: it is its class's."""
+    read = msgspec.convert({"width": 2}, Size)
+    assert read == Size(2) and repr(read) == repr(Size(2)) and replace(read, width=3) == Size(3)

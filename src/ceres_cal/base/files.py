@@ -1,8 +1,7 @@
 """Reading and writing files: one guarded door, one line of error that names the file, and never half a file.
 
 Files come from other people. Only regular ones are read, and what the content would take in memory is estimated from
-its size, headers and marks before any of it is made: more than `most_bytes` is refused. Which files were written is
-noted for those who must say so when they are interrupted.
+its size, headers and marks before any of it is made: more than `most_bytes` is refused.
 """
 
 from __future__ import annotations
@@ -15,13 +14,13 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, Any, Literal, TypeVar, cast
 
 import msgspec
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.progress import note
 from ceres_cal.base.words import printable
 
 T = TypeVar("T")
@@ -165,6 +164,9 @@ def _whole(text: str) -> int | float:
     return int(text) if len(text) < 19 else float(text)
 
 
+_LONG_WHOLE = re.compile(rb"[:\[,]\s*-?\d{19}")  # which msgspec takes at any length, and plain data as `_whole` does
+
+
 def decode_json(
     content: bytes, kind: type[T], where: str, format_name: str, version: int, *, finite: bool = False
 ) -> T:
@@ -179,6 +181,8 @@ def decode_json(
     """
     _require_few_marks(content, where)
     try:
+        if _LONG_WHOLE.search(content):
+            raise msgspec.DecodeError
         data: Any = msgspec.json.decode(content, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         # quiet: plain data are read instead, and say where they do not fit
@@ -416,24 +420,3 @@ def make_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
     return folder
-
-
-_noted: ContextVar[list[str] | None] = ContextVar("noted", default=None)
-
-
-@contextmanager
-def noting() -> Iterator[list[str]]:
-    """The files that are written while it lasts, as they come."""
-    files: list[str] = []
-    token = _noted.set(files)
-    try:
-        yield files
-    finally:
-        _noted.reset(token)
-
-
-def note(path: object) -> None:
-    """That a file is in its place."""
-    files = _noted.get()
-    if files is not None:
-        files.append(str(path))

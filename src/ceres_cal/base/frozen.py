@@ -6,12 +6,30 @@ from __future__ import annotations
 
 from collections import UserDict
 from collections.abc import Callable, Mapping
-from dataclasses import Field, FrozenInstanceError, dataclass
+from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, fields
 from dataclasses import field as field
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast, dataclass_transform
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import did_you_mean
+
+
+class _Signature:
+    """How a class is made, for people and for programs that ask: worked out when they do."""
+
+    def __get__(self, instance: Any, owner: Any) -> Any:
+        from inspect import Parameter, Signature
+
+        def told(name: str, one: Field[Any]) -> Parameter:
+            kind = Parameter.KEYWORD_ONLY if one.kw_only else Parameter.POSITIONAL_OR_KEYWORD
+            default = one.default if one.default_factory is MISSING else one.default_factory
+            default = Parameter.empty if default is MISSING else default
+            return Parameter(name, kind, default=default, annotation=one.type)
+
+        every = sorted(_fields_of(owner)[0], key=lambda one: bool(one[1].kw_only))
+        return Signature([told(*one) for one in every])
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
@@ -25,10 +43,36 @@ class Frozen:
 
     if TYPE_CHECKING:  # msgspec reads what is annotated
         __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+    else:
+        __signature__ = _Signature()
 
     def __init_subclass__(cls, *, eq: bool = False, kw_only: bool = False, **others: Any) -> None:
         super().__init_subclass__(**others)
-        dataclass(repr=False, eq=eq, unsafe_hash=eq, kw_only=kw_only)(cls)
+        dataclass(init=False, repr=False, eq=eq, unsafe_hash=eq, kw_only=kw_only)(cls)
+
+    if not TYPE_CHECKING:
+
+        def __init__(self, *args: Any, **given: Any) -> None:
+            of, held = type(self), self.__dict__
+            every, by_place = _fields_of(of)
+            values = dict(zip(by_place, args, strict=False), **given)
+            if len(values) < len(args) + len(given):
+                raise TypeError(f"{of.__name__}() is given too many values, or one of them twice")
+            for name, one in every:
+                if name in values:
+                    held[name] = values.pop(name)
+                elif one.default is not MISSING:
+                    held[name] = one.default
+                elif one.default_factory is not MISSING:
+                    held[name] = one.default_factory()
+                else:
+                    raise TypeError(f"{of.__name__}() needs {name!r}")
+            for name in values:
+                known = [name for name, _ in every]
+                meant = did_you_mean(name, known) or f": there are {', '.join(known)}"
+                raise InputError(f"{of.__name__} has no field {name!r}{meant}")
+            if hasattr(self, "__post_init__"):
+                self.__post_init__()
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.__dict__ or name not in self.__dataclass_fields__:
@@ -39,8 +83,14 @@ class Frozen:
         raise FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __repr__(self) -> str:
-        held = ", ".join(f"{name}={self.__dict__[name]!r}" for name in self.__dataclass_fields__)
+        held = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.__dataclass_fields__)
         return f"{type(self).__qualname__}({held})"
+
+
+@cache
+def _fields_of(of: Any) -> tuple[list[tuple[str, Field[Any]]], list[str]]:
+    """The fields of a class by name, and the names of those that may be given without."""
+    return [(one.name, one) for one in fields(of)], [one.name for one in fields(of) if not one.kw_only]
 
 
 _T = TypeVar("_T")

@@ -41,7 +41,7 @@ def take_types(instance: Any) -> None:
     """
     of, held = type(instance), vars(instance)
     for name, kind in _fields(of).items():  # type: ignore[arg-type] # a class has a hash
-        value = held[name]
+        value = getattr(instance, name)  # of a default that a file has not, its class
         if type(value) is not kind and value is not getattr(of, name, held):  # nor its default
             held[name] = convert(_plain(value), kind, f"{of.__name__}({name}=...)")
 
@@ -86,22 +86,6 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return call
-
-
-def checked_fields(of: _Class) -> _Class:
-    """A dataclass whose construction names a misspelled field, and the one that was meant."""
-    signature, make = inspect.signature(of), of.__init__  # type: ignore[misc]
-
-    @wraps(make)
-    def init(self: Any, *args: Any, **kwargs: Any) -> None:
-        if unknown := [name for name in kwargs if name not in signature.parameters]:
-            meant = did_you_mean(unknown[0], signature.parameters)
-            known = meant or f": there are {', '.join(signature.parameters)}"
-            raise InputError(f"{of.__name__} has no field {unknown[0]!r}{known}")
-        make(self, *args, **kwargs)
-
-    of.__init__ = init  # type: ignore[misc]
-    return of
 
 
 def _meant(given: Mapping[str, Any], known: Mapping[str, Any]) -> str:

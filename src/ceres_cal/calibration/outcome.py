@@ -91,9 +91,8 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
     usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
     if reduced is None or not usual:
         return
-    without = reduced.shared
-    for prior in usual:
-        without = without + replace(prior.information, matrix=-prior.information.matrix)
+    every = [prior.information for prior in usual]
+    without = reduced.shared.beside_all(replace(one, matrix=-one.matrix) for one in every)
     for name in estimate.cameras:
         key = Key("camera", name, "phi", "px")
         if key in reduced.shared.keys:

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
-from ceres_cal.base.files import noting
+from ceres_cal.base.progress import noting
 from ceres_cal.base.words import did_you_mean, first_of
 from ceres_cal.cli.command import COMMANDS, Command
 from ceres_cal.cli.terminal import TERMINATED, Terminated, as_a_program, ended, error, in_colour, print_answer

@@ -69,17 +69,13 @@ def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
-class _Fields(Frozen):
-    """Makes each class below it a frozen dataclass, whose fields are given by name."""
+class Arguments(Frozen, eq=True, kw_only=True):
+    """What every command takes; in each class below it, too, fields are given by name."""
+
+    json: bool = switch("print one JSON object")
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__(eq=True, kw_only=True)
-
-
-class Arguments(_Fields):
-    """What every command takes."""
-
-    json: bool = switch("print one JSON object")
 
 
 class QuietArguments(Arguments):

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
-from ceres_cal.base.threads import interruptibly
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import Arguments, QuietArguments, argument
@@ -87,6 +86,8 @@ def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
     """What `detect` returns; InputError where it takes longer than --timeout."""
     if timeout is not None and not timeout > 0.0:
         raise InputError(f"--timeout must be above 0 seconds, not {timeout:g}")
+    from ceres_cal.base.threads import interruptibly
+
     try:
         return interruptibly(detect, timeout)
     except TimeoutError:

@@ -192,14 +192,10 @@ class SparseColumns(Frozen):
 
     def summed(self, factors: Array) -> Array:
         """(Q,) the same over all equations."""
-        if self._dense is not None and factors.ndim == 1:
-            return np.asarray(factors @ self._dense)
         return np.asarray(self.gathered(factors, np.zeros(len(self.slots), dtype=np.int64), 1)[0])
 
     def products(self) -> Array:
         """(Q, Q) X^T X."""
-        if self._dense is not None:
-            return np.asarray(self._dense.T @ self._dense)
         every = [self.gathered(self.values[:, k], self.slots[:, k], self.size + 1) for k in range(self.slots.shape[1])]
         return np.asarray(np.sum(every, axis=0)[:-1])
 

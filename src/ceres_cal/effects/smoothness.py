@@ -70,21 +70,13 @@ def _by_sizes(
     own, coupling, here = turn.T @ slope[turned], normal[np.ix_(rest, turned)] @ turn, normal[np.ix_(rest, rest)]
     others = np.array([form[np.ix_(rest, rest)] for form in forms])
 
-    def along_turned(sigmas: Array) -> Array:
-        return 1.0 / (values + sigmas[largest] ** -2) if len(turned) else values
-
-    left = here + np.tensordot(first**-2, others, 1) - coupling * along_turned(first) @ coupling.T
+    left = here + np.tensordot(first**-2, others, 1) - coupling / (values + first[largest] ** -2) @ coupling.T
     root = inverse_root(left, np.diagonal(left), NOTHING * len(slope))
-    coupling, here, others, beside = (
-        root.T @ coupling,
-        root.T @ here @ root,
-        root.T @ others @ root,
-        root.T @ slope[rest],
-    )
-    flat = others.reshape(len(forms), -1)
+    coupling, here, others = root.T @ coupling, root.T @ here @ root, root.T @ others @ root
+    beside, flat = root.T @ slope[rest], others.reshape(len(forms), -1)
 
     def told(sigmas: Array) -> tuple[Array, Array, Array]:
-        along = along_turned(sigmas)
+        along = 1.0 / (values + sigmas[largest] ** -2)
         weighed = coupling * along
         covariance = np.linalg.inv(here + (sigmas**-2 @ flat).reshape(here.shape) - weighed @ coupling.T)
         amount, numbers = covariance @ (beside - weighed @ own), np.empty(len(slope))

@@ -13,7 +13,6 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
-from ceres_cal.base.typed import checked_fields
 from ceres_cal.base.words import no_such
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import matched, require_posterior
@@ -68,7 +67,6 @@ WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
 LABELS = ("check", "as-given", "turned")
 
 
-@checked_fields
 class RefitOptions(Frozen, eq=True):
     """What a refit takes for granted.
 

@@ -16,7 +16,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.typed import checked_fields, take_types
+from ceres_cal.base.typed import take_types
 
 
 class View(Frozen, eq=True):
@@ -33,7 +33,6 @@ _OFFSET = ".offset_m"
 PRIOR_OWNERS = ("camera", "station", "target")
 
 
-@checked_fields
 class Prior(Frozen, eq=True):
     """What is known beforehand: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
 

@@ -16,7 +16,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.shown import brief
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.base.typed import checked_fields, take_types
+from ceres_cal.base.typed import take_types
 from ceres_cal.base.words import no_such
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
@@ -34,7 +34,6 @@ OF_PIXELS = ("phi", "aspect", "cx", "cy")
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
-@checked_fields
 class Options(Frozen, eq=True):
     """What to solve for and how.
 
