@@ -164,6 +164,9 @@ def _whole(text: str) -> int | float:
     return int(text) if len(text) < 19 else float(text)
 
 
+_LONG_WHOLE = re.compile(rb"[:\[,]\s*-?\d{19}")  # which msgspec takes at any length, and plain data as `_whole` does
+
+
 def decode_json(
     content: bytes, kind: type[T], where: str, format_name: str, version: int, *, finite: bool = False
 ) -> T:
@@ -178,6 +181,8 @@ def decode_json(
     """
     _require_few_marks(content, where)
     try:
+        if _LONG_WHOLE.search(content):
+            raise msgspec.DecodeError
         data: Any = msgspec.json.decode(content, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         # quiet: plain data are read instead, and say where they do not fit

@@ -180,16 +180,6 @@ class SparseColumns(Frozen):
         sums = np.bincount(key.ravel(), products.ravel(), minlength=owners * (self.size + 1))
         return np.asarray(sums.reshape(owners, -1)[:, :-1])
 
-    @cached_property
-    def _dense(self) -> Array | None:
-        """(E, Q) all of them, where these are hardly more numbers than move each equation."""
-        most = 2  # times as many
-        if self.size > most * self.slots.shape[1]:
-            return None
-        dense = np.zeros((len(self.slots), self.size + 1))
-        dense[np.arange(len(dense))[:, None], self.slots] = self.values
-        return dense[:, :-1]
-
     def summed(self, factors: Array) -> Array:
         """(Q,) the same over all equations."""
         return np.asarray(self.gathered(factors, np.zeros(len(self.slots), dtype=np.int64), 1)[0])
@@ -212,8 +202,10 @@ class SparseColumns(Frozen):
 
     def in_shared(self, model: Linearised) -> Array:
         """(P, Q) what the shared numbers take of them."""
-        if self._dense is not None:
-            return np.asarray(model.shared.T @ self._dense)
+        if self.size <= 2 * self.slots.shape[1]:  # hardly more numbers than move each equation: as one matrix
+            dense = np.zeros((len(self.slots), self.size + 1))
+            dense[np.arange(len(dense))[:, None], self.slots] = self.values
+            return np.asarray(model.shared.T @ dense[:, :-1])
         return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
 
     def left_of(self, model: Linearised) -> tuple[Array, Array]:

@@ -196,12 +196,11 @@ class Information(Frozen):
 
     def beside_all(self, others: Iterable[Information]) -> Information:
         """All of them together, over the keys of any."""
-        every = [other for other in others if other.keys]
-        keys = tuple(dict.fromkeys(chain(self.keys, *(other.keys for other in every if other.keys != self.keys))))
-        whole = self.over(keys) if len(keys) > len(self.keys) else Information(keys, self.matrix.copy())
+        every = [self, *others]
+        whole = Information.nothing(tuple(dict.fromkeys(chain(*(other.keys for other in every)))))
         for other in every:
             at = whole.columns(other.keys)
-            whole.matrix[(at[:, None], at) if other.keys != keys else ...] += other.matrix
+            whole.matrix[(at[:, None], at) if other.keys != whole.keys else ...] += other.matrix
         return whole
 
     @cached_property

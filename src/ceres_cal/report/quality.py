@@ -17,7 +17,7 @@ from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.effects.effect import SMALL, CameraEffect, Finding
+from ceres_cal.effects.effect import CameraEffect, Finding
 from ceres_cal.effects.joint import JointStep
 from ceres_cal.effects.table import EFFECTS
 from ceres_cal.observations import Observations
@@ -190,9 +190,9 @@ class Quality(Frozen):
     @property
     def doubtful_mm(self) -> float:
         """By how much the feature of a field lies aside that was solved for farthest, where what is wrong with a camera
-        shows in single observations: then it may lie as drawn, and the camera be wrong there by as much.
+        is as large as the noise: then it may lie as drawn, and the camera be wrong there by as much.
         """
-        if not any(_is_of_camera(fault) and fault.noise_ratio >= SMALL for fault in self.faults):
+        if sum(fault.noise_ratio**2 for fault in self.faults if _is_of_camera(fault)) < 1.0:
             return 0.0
         structure, targets = self.calibration.estimate.structure, self.observations.targets
         aside = zip(structure.names[: structure.own], structure.values.tolist(), strict=False)

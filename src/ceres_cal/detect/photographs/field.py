@@ -366,10 +366,14 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
         aside = _curves(beside, beside.found, options.edges)
         curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
     priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
-    for name, length_m in built.dimensions.items():  # which may be others, or look so by a lens that is none of ours
-        drawn_m = built.drawn[name]  # beyond what is usual a calibration says that this is contradicted
-        sigma_m = min(abs(length_m - drawn_m), 0.5 * built.usual_m)
-        priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (sigma_m,)))
+    # Dimensions may be others, or look so by a lens that is none of ours; and where lines lie aside, so may the whole.
+    # Beyond what is usual a calibration says that this is contradicted.
+    extent_m = float(np.max(np.ptp(target.box, axis=0)))
+    for name, drawn_m in built.drawn.items():
+        off_m = abs(built.dimensions.get(name, drawn_m) - drawn_m)
+        is_long = drawn_m > 0.5 * extent_m and bool(features_of(target, name) & set(built.names))
+        if off_m := off_m or (np.inf if built.scatter_m and is_long else 0.0):
+            priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (min(off_m, 0.5 * built.usual_m),)))
     if camera.aspect != 1.0:  # else it is solved for as one with square pixels
         priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(
