@@ -158,7 +158,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     def solved(one: Chosen) -> Calibration:
         named = replace(one.options, priors=options.priors)  # which lenses were compared without
-        return _of_lens(one.start, observations, sights, named, watched, one.built)
+        return _of_lens(one.start, observations, sights, named, replace(watched, chosen=True), one.built)
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)

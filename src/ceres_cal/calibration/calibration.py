@@ -44,6 +44,7 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import every_key
 from ceres_cal.problem.structure import redrawn
 from ceres_cal.robust.stated import Conflict, agreed
+from ceres_cal.robust.unsteady import without_unsteadiness
 from ceres_cal.scene.camera import Camera, CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
 
@@ -208,7 +209,11 @@ class Calibration(Frozen):
         else:
             priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
             layout = self.posterior.layout(self.estimate)
-        return Problem(sights, layout, agreed(priors, self.conflicts), weighting, options)
+        problem = Problem(sights, layout, agreed(priors, self.conflicts), weighting, options)
+        points, curves = len(observations.points), len(observations.curves)
+        every = np.ones(points, dtype=bool), np.ones(curves, dtype=bool)
+        taking_part = every if new_data else self.inlier_masks(observations)
+        return without_unsteadiness(problem, observations, self.estimate, taking_part, self.effects)
 
     def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
         """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import attempt
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import meanwhile
@@ -27,7 +28,9 @@ from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
 from ceres_cal.posterior.other_lenses import AGREES, LeftOver
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress, Solution
+from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, Layout, Options
+from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
@@ -38,6 +41,7 @@ from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.unsteady import Unsteady, solve_unsteady
 from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
@@ -68,12 +72,14 @@ class Watched:
 
     Attributes:
         progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
-        knows: whether it is asked what is then known of the numbers.
+        knows: whether it is asked what is then known of the numbers. chosen: whether the data chose the lens: what one
+            that is too simple leaves looks like a principal point that moves.
     """
 
     progress: Callable[[Progress], None] | None = None
     settle: Callable[..., Settled] | None = None
     knows: bool = True
+    chosen: bool = False
 
 
 def solved_from(
@@ -96,6 +102,8 @@ def solved_from(
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
     seen = _explained(start, observations, problem, again, watched, built)
+    if watched.chosen and watched.settle is None:
+        seen = _made_steady(seen, observations, problem, watched)
     conflicts, assessed = Conflicts(), again is None or again.assessed
     if assessed:
         part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
@@ -107,7 +115,8 @@ def solved_from(
         settled = watched.settle(seen.problem, seen.end, seen.explanations, watched.progress)
         seen = replace(seen, end=settled.end)
     explanations = settled.explanations if settled else seen.explanations
-    warnings = (*(one.warning for one in explanations), *(one.warning for one in seen.effects))
+    effects = seen.effects(observations)
+    warnings = (*(one.warning for one in explanations), *(one.warning for one in effects))
     posterior = None
     if assessed and watched.knows:
         seen, posterior = _known(seen, observations, conflicts, again)
@@ -128,7 +137,7 @@ def solved_from(
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**seen.problem.options.tolerances, **tolerances_of(seen.as_built)}
     options = replace(seen.problem.options, tolerances=tolerances)
-    return replace(calibration, options=options, as_built=seen.as_built, effects=seen.effects)
+    return replace(calibration, options=options, as_built=seen.as_built, effects=effects)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +147,7 @@ class _Explained:
     Attributes:
         explanations: what else groups of observations may be. as_built: how targets were built.
         beside: effects of the table that were solved for. others: further minima.
+        unsteady: what moves single views.
     """
 
     problem: Problem
@@ -147,16 +157,25 @@ class _Explained:
     as_built: tuple[AsBuilt, ...] = ()
     beside: EffectsEnd | None = None
     others: tuple[Solution, ...] = ()
+    unsteady: Unsteady | None = None
 
-    @property
-    def effects(self) -> tuple[EffectEstimate, ...]:
+    def effects(self, observations: Observations) -> tuple[EffectEstimate, ...]:
         """What was solved for beside the problem."""
-        return self.beside.estimates if self.beside else ()
+        moving = self.unsteady.estimates(observations) if self.unsteady else ()
+        return (*moving, *(self.beside.estimates if self.beside else ()))
 
     @property
     def shifts_at(self) -> ShiftsAt | None:
         """By which numbers scatter besides."""
-        return self.beside.shifts_at if self.beside else None
+        if self.unsteady is None:
+            return self.beside.shifts_at if self.beside else None
+        unsteady, beside = self.unsteady, self.beside
+
+        def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
+            keys, shifts = beside.shifts_at(there, priors) if beside else (unsteady.keys, ())
+            return keys, [*shifts, *over(unsteady.shifts, unsteady.keys, keys)]
+
+        return shifts_at
 
     def without(self, conflicts: Conflicts, observations: Observations) -> _Explained:
         """The answer without what was stated and everything else contradicts."""
@@ -165,6 +184,25 @@ class _Explained:
         problem = replace(self.problem, priors=conflicts.answer.problem.priors)
         shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
         return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
+
+
+def _made_steady(seen: _Explained, observations: Observations, problem: Problem, watched: Watched) -> _Explained:
+    """With what moves the principal points of single views taken off, where any do."""
+    most_rounds = 2
+    unsteady, as_found = None, seen
+    for _ in range(most_rounds):
+        part = taking_part(seen.problem, observations, seen.explanations)
+        found = solve_unsteady(seen.problem, part, observations, seen.end, unsteady)
+        if found is None:  # what seemed to move was what the lens or the target left
+            return as_found
+        if found.stays(unsteady):
+            break
+        unsteady = found
+        stated = replace(seen.end.solution.estimate, structure=seen.start.estimate.structure)
+        start = replace(seen.start, estimate=stated, is_near=True)
+        steady = unsteady.taken_off(problem, len(observations.points))
+        seen = _explained(start, observations, steady, None, watched, AS_DRAWN)
+    return replace(seen, unsteady=unsteady)
 
 
 def _explained(

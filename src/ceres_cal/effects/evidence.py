@@ -91,6 +91,12 @@ FLOOR_OFF_WORDS = (
     f"{1.0 - FLOOR_OFF.absent:.0%} of floors are bowed, or their fields out of square, by "
     f"{1e3 * 4.5 * FLOOR_OFF.sizes[-1]:.0f} mm on 9 m"
 )
+SMOOTH_ERRORS = SizePrior(0.8, tuple(np.geomspace(0.01, 3.0, 14).tolist()))
+"""Of what displaces a view smoothly, in px; as rare as errors that go together, see DEPENDENCE."""
+LENS_LEAVES = SizePrior(0.8, tuple(np.geomspace(0.01, 1.0, 11).tolist()))
+"""Of what displaces all views alike, in px at the corners: a lens that the data chose leaves no more."""
+CENTRE_MOVES = SizePrior(0.9, tuple(np.geomspace(0.5, 60.0, 14).tolist()))
+"""Of a principal point that moves from view to view, in px: of ten cameras one is stabilised."""
 DEPENDENCE = SizePrior(0.8, ())
 """Of errors that go together within views, and of views that scatter more than their equations say: errors are
 independent in four of five calibrations. The sizes are those of a grid, or of a factor.
@@ -278,7 +284,7 @@ class RepeatedAmounts(Frozen):
         freedom = int(np.sum(np.maximum(np.count_nonzero(there, axis=0) - 1, 0)))
         return float(np.sum(squares)) / max(freedom, 1) / self.noise, freedom
 
-    def _beside(self, numbers: Indices, others: Indices, sigmas_m: Array) -> tuple[Array, Array]:
+    def beside(self, numbers: Indices, others: Indices, sigmas_m: Array) -> tuple[Array, Array]:
         """Score and information of some numbers, with others scattering by sigmas (K,)."""
         score, information = self.score[numbers], self.information[np.ix_(numbers, numbers)]
         if not len(others):
@@ -308,7 +314,7 @@ class RepeatedAmounts(Frozen):
         if freedom < _FEWEST:
             return float(np.sqrt(np.mean(np.square(prior.sizes)))), 1.0 - prior.absent
         within = max(within, 1.0)
-        score, information = self._beside(numbers, others, sigmas)
+        score, information = self.beside(numbers, others, sigmas)
         effects = RandomEffects.of(information / within, score / within, 0.0, self.rest, share=tells)
         effects = replace(effects, freedom=self.spare + len(effects.size))
         sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))

@@ -155,11 +155,12 @@ class Linearised(Frozen):
         """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
         return np.where(self.used, self.placed_score - self.shared @ self.step, 0.0)
 
-    def freed(self, columns: Array) -> AddedNumbers:
-        """More numbers to be free besides: columns (E, Q), px per unit."""
+    def freed(self, columns: Array, sigma: float = np.inf) -> AddedNumbers:
+        """More numbers to be free besides, or to scatter by sigma about nought: columns (E, Q), px per unit."""
         scaled = columns * self.weight[:, None]
         rest, taken = self._projected(scaled)
         normal, slope = self._normal(rest, taken)
+        normal += np.eye(len(normal)) / sigma**2
         root = inverse_root(normal, np.sum(scaled[self.used] ** 2, axis=0), LEAST_LEFT)
         return AddedNumbers(rest, taken, root, root.T @ slope)
 
@@ -181,9 +182,9 @@ class Linearised(Frozen):
         shared = self.shared @ back
         return replace(self, shared=shared, root=self.root @ back, step=shared.T @ self.placed_score)
 
-    def with_columns(self, columns: Array) -> Linearised:
-        """The same model with these numbers free."""
-        more = self.freed(columns)
+    def with_columns(self, columns: Array, sigma: float = np.inf) -> Linearised:
+        """The same model with these numbers free, or scattering by sigma about nought."""
+        more = self.freed(columns, sigma)
         basis = (more.rest - self.shared @ more.taken) @ more.root
         return replace(
             self,

@@ -69,6 +69,7 @@ class Problem(Frozen):
         elsewhere: more observations of the world, which are not at hand.
         smoothness: camera -> standard deviations (px) of its lens's `roughness`; its loose ones where it is not named.
         weighting: of the observations. options: iterations and threads.
+        taken_up: equations that effects use up which were taken off the observations.
         feet: (M,) where on its track each curve observation's foot is sought first (see `residuals`), by row.
     """
 
@@ -80,6 +81,7 @@ class Problem(Frozen):
     feet: Array | None = None
     smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     elsewhere: Elsewhere | None = None
+    taken_up: float = 0.0
 
     @cached_property
     def private(self) -> frozenset[str | None]:

@@ -257,7 +257,7 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
         return Built((), structure.carrying(stated))
-    sights = _some(end.problem.sights, most_screened)
+    sights = some_sights(end.problem.sights, most_screened)
     equations, weights = _equations(stated, observations, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
@@ -269,7 +269,7 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
     structure = whole_structure(observations.targets, {target for target, kind in repeat if kind == "heights"})
     numbered = numbers_by_kind(structure, observations.targets)
     kinds, as_stated = {of: numbered[of] for of in kinds if of in numbered}, structure.carrying(stated)
-    equations, weights = _equations(stated, observations, end, _some(end.problem.sights, most_sights))
+    equations, weights = _equations(stated, observations, end, some_sights(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
     every = tuple(_likely(repeats, kinds, observations))
@@ -282,7 +282,7 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
     return Built(every, structure.with_values(values), sd)
 
 
-def _some(sights: Sights, most: int) -> Sights:
+def some_sights(sights: Sights, most: int) -> Sights:
     """All of the world, and of each camera's others at most so many, evenly."""
     chosen = [sights.numbers(placements=(None,))]
     world = set(chosen[0].tolist())
@@ -320,13 +320,14 @@ def _drawn(equations: Equations, weights: Weights, stated: Structure, end: Robus
     estimate = replace(end.solution.estimate, structure=stated)
     problem = end.problem.of_sights(np.flatnonzero([key in equations.sights.keys for key in end.problem.sights.keys]))
     model = make_linear_model(problem, estimate, equations, weights)
-    return model.with_columns(np.column_stack(list(_of_image(equations, estimate))))
+    return model.with_columns(smooth_image(equations, estimate))
 
 
-def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
+def smooth_image(equations: Equations, estimate: Estimate) -> Array:
     """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
     radius.
     """
+    every = []
     degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
     owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
     for name in equations.sights.cameras:
@@ -336,8 +337,9 @@ def _of_image(equations: Equations, estimate: Estimate) -> Iterator[Array]:
         smooth = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
         along = np.sum(place * equations.direction, axis=1)
         radial = [np.sum(place**2, axis=1) ** power * along for power in powers]
-        every = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
-        yield np.column_stack(every) * (owner == name)[:, None]
+        columns = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
+        every.append(np.column_stack(columns) * (owner == name)[:, None])
+    return np.column_stack(every)
 
 
 # ---- the sigmas -----------------------------------------------------------------------------------------------------

@@ -298,7 +298,9 @@ class _RowRounds(Rounds[RobustSolution]):
         reduced = information(state.problem, state.solution.estimate)
         self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
         sights = state.problem.sights
-        self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), reduced.leverages)
+        points, curves = reduced.leverages
+        taken = points + self._problem.taken_up, curves
+        self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
         return self._judge(state.solution, state.residuals), reduced
 
     def _judged(

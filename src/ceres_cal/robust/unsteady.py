@@ -1,0 +1,312 @@
+"""Cameras whose principal point moves from view to view, as where a lens is stabilised: solved for, view by view.
+
+A stabilised lens or sensor is shifted against the hand's motion, by some pixels in each picture, and what a hand moves
+is sheared while rows are read out one after the other. In each view of a board the principal point, and the motion
+while it is read out, are random effects with sigmas that all views of a camera share; so are smooth displacements of
+each view besides, and those that all views have alike, which are the lens's. The evidence of each is taken beside the
+others (`effects.evidence`): by itself the principal point of any camera seems to move where views err smoothly. Where
+it does, best linear unbiased predictions are taken off the observations, and everything else is solved for again
+(Henderson, Biometrics 31, 1975). What they leave open goes into the covariance of the shared numbers.
+
+Read-out and smooth displacements alone are not taken off. They are found in nearly all public photographs of boards,
+and explain most of what is left; but without them lenses predict other views worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.words import first_of, two_digits
+from ceres_cal.effects.columns import SparseColumns
+from ceres_cal.effects.effect import Amount, EffectEstimate
+from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RandomEffects, RepeatedAmounts
+from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
+from ceres_cal.observations import Observations
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import free_keys
+from ceres_cal.problem.residuals import Equations, Residuals, residuals, write_equations
+from ceres_cal.robust.as_built import smooth_image, some_sights
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+
+KIND = "principal point moves"
+# What a view's coefficients are, in their order, how many, and what is expected of them; those of all views come last.
+_MODES = {"principal point": (2, CENTRE_MOVES), "read-out": (6, SMOOTH_ERRORS), "smooth": (10, SMOOTH_ERRORS)}
+_IMAGE = "image"
+_OF_MODE = np.repeat(list(_MODES), [count for count, _ in _MODES.values()])
+_CENTRE = [2, 3]  # places of the principal point in the intrinsics vector
+_FEWEST, _ENOUGH = 5, 20  # views of a camera: that tell anything, and whose coefficients are asked how large they are
+_LEAST_PX = 3.0  # by which a principal point moves: no lens is stabilised for a third of an arc minute
+_NONE_PX = 1e-6  # a sigma of coefficients that there are none of
+
+Sizes = Mapping[str, float]
+"""Sigma, px, of each likely kind of a camera's coefficients."""
+
+
+class Unsteady(Frozen):
+    """By how much the views of cameras whose principal point moves are displaced.
+
+    Attributes:
+        sizes: camera -> sigmas. displacement: (N + M, 2) px by which the observations are moved. taken_up: equations
+            that this uses up. keys, shifts: (R, K) of the shared numbers, whose products with themselves go into their
+            covariance. noise_px: what is left beside it.
+    """
+
+    sizes: Mapping[str, Sizes]
+    displacement: Array
+    taken_up: float
+    keys: Sequence[Key]
+    shifts: Array
+    noise_px: float
+
+    def taken_off(self, problem: Problem, points: int, before: Unsteady | None = None) -> Problem:
+        """The problem of observations, of which so many are points, without it in place of with what was before."""
+        off = -self.displacement if before is None else before.displacement - self.displacement
+        sights = problem.sights.displaced(off[:points], off[points:])
+        return replace(problem, sights=sights, taken_up=self.taken_up)
+
+    def stays(self, before: Unsteady | None) -> bool:
+        """Whether it is about the same as before."""
+        at_rest = 0.1  # of the noise
+        if before is None:
+            return False
+        moved = self.displacement - before.displacement
+        return float(np.sqrt(np.mean(moved**2))) < at_rest * self.noise_px
+
+    def estimates(self, observations: Observations) -> tuple[EffectEstimate, ...]:
+        """What is said of each camera."""
+        points = observations.points
+        views, moved = len(observations.views), np.sum(self.displacement[: len(points)] ** 2, axis=1)
+        count = np.bincount(points.view, minlength=views)
+        rms = np.sqrt(np.bincount(points.view, moved, views) / np.maximum(count, 1))
+        return tuple(self._estimate(observations, rms, camera) for camera in self.sizes)
+
+    def _estimate(self, observations: Observations, rms: Array, camera: str) -> EffectEstimate:
+        own = [number for number, view in enumerate(observations.views) if view.camera == camera and rms[number] > 0.0]
+        worst = sorted(own, key=lambda number: -float(rms[number]))
+        named = [f"{observations.views[n].frame!r}, {two_digits(rms[n])} px" for n in worst]
+        sizes = self.sizes[camera]
+        sigma_px = sizes["principal point"]
+        sentence = (
+            f"camera {camera!r}: its principal point moves by {two_digits(sigma_px)} px from view to view, as where a "
+            f"lens or pictures are stabilised (most displaced are corners of {first_of(named, 3)}). Stated is where it "
+            "is on average: switch stabilisation off, or what a picture shows may be as far from there"
+        )
+        every = tuple(Amount(kind, float(sigma), 0.0, "px") for kind, sigma in sizes.items())
+        return EffectEstimate(KIND, camera, None, float(sigma_px), 1.0, sentence, every)
+
+
+def solve_unsteady(
+    problem: Problem, part: Problem, observations: Observations, end: RobustSolution, before: Unsteady | None
+) -> Unsteady | None:
+    """What is found of cameras whose principal point moves, and found again once everything but targets as built was
+    solved for without it; None where there is none.
+
+    Args:
+        problem: of all the observations, what was found `before` taken off. part: of those that take part.
+            end: of its rounds.
+    """
+    most_rounds = 4
+    points = len(observations.points)
+    for _ in range(most_rounds):
+        found = _found(problem, observations, end, before)
+        if found is None or found.stays(before):
+            return found
+        problem, part = (found.taken_off(one, points, before) for one in (problem, part))
+        built, estimate = part.built_as(end.solution.estimate)
+        structure, before = end.solution.estimate.structure, found
+        end = solve_robustly(built, observations, estimate, is_near=True)
+        end = end.moved_to(replace(end.solution.estimate, structure=structure), observations, problem)
+    return before
+
+
+def _found(
+    problem: Problem, observations: Observations, end: RobustSolution, before: Unsteady | None
+) -> Unsteady | None:
+    """Of the cameras whose principal point is likely to move."""
+    count, estimate = len(observations.points) + len(observations.curves), end.solution.estimate
+    off = np.zeros((count, 2)) if before is None else before.displacement
+    model_of = partial(_model, observations, estimate, end.residuals, partial(end.weights_of, observations), off)
+    sizes, noise = {}, 1.0
+    for camera in problem.sights.cameras:
+        sights = problem.sights.numbers(camera)
+        boards = [number for number in sights.tolist() if problem.sights.keys[number].placement is not None]
+        if len(boards) < _FEWEST:
+            continue
+        few = set(some_sights(problem.sights.take(np.array(boards)), _ENOUGH).keys)
+        model = model_of(problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys])))
+        if before is not None or _seems_to_move(model):
+            own, left = _sizes(model, smooth_image(model.equations, estimate))
+            if own.get("principal point", 0.0) > _LEAST_PX:
+                sizes[camera], noise = own, max(left, noise) if len(sizes) else left
+    return _predicted(model_of(problem), problem, estimate, sizes, noise, count) if sizes else None
+
+
+def without_unsteadiness(
+    problem: Problem,
+    observations: Observations,
+    estimate: Estimate,
+    taking_part: tuple[Mask, Mask],
+    effects: Sequence[EffectEstimate],
+) -> Problem:
+    """The problem of all the observations, what was found to move them taken off."""
+    sizes = {one.subject: {a.name: a.value for a in one.amounts} for one in effects if one.kind == KIND}
+    if not sizes:
+        return problem
+    there, points = residuals(observations, problem.sights, estimate), len(observations.points)
+    off = np.zeros((points + len(observations.curves), 2))
+    weights_of = partial(equation_weights, observations, problem.weighting, there=there, taking_part=taking_part)
+    model = _model(observations, estimate, there, weights_of, off, problem)
+    return _predicted(model, problem, estimate, sizes, 1.0, len(off)).taken_off(problem, points)
+
+
+def _model(
+    observations: Observations,
+    estimate: Estimate,
+    there: Residuals,
+    weights_of: Callable[[Equations], Weights],
+    off: Array,
+    problem: Problem,
+) -> Linearised:
+    """Of a problem's sights, with the residuals before anything was taken off; views that were taken out as a whole
+    speak again, for they may be those that are displaced most. What takes part counts whole: a robust weight is that of
+    an observation whose view is displaced.
+    """
+    equations = write_equations(observations, problem.sights, estimate, there)
+    along = np.sum(off[equations.observation] * equations.direction, axis=1)
+    equations = replace(equations, residual=equations.residual - along)
+    weights = weights_of(equations)
+    silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0
+    used = weights.used | silent[equations.sight]
+    weights = Weights(weights.inverse_sigma, used, np.ones_like(weights.robust))
+    return make_linear_model(problem, estimate, equations, weights)
+
+
+def _modes(equations: Equations) -> Array:
+    """(E, 18) px per px of each coefficient of a view: the principal point's x and y; a turn and a shift of the pose
+    that grow from row to row; polynomials along both axes of the image but for the constant, which is the pose's. x and
+    y are from -1 to 1 over what is seen of the view.
+    """
+    starts = equations.bounds[:-1]
+    low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
+    half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
+    x, y = ((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T
+    read_out = equations.pose * y[:, None]
+    read_out /= np.sqrt(np.maximum(np.mean(read_out**2, axis=0), 1e-300))
+    third = 1.0 / 3.0  # the mean of x^2
+    smooth = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
+    along = [smooth * equations.direction[:, axis, None] for axis in range(2)]
+    return np.hstack([equations.intrinsics[:, _CENTRE], read_out, *along])
+
+
+def _seems_to_move(model: Linearised) -> bool:
+    """Whether principal points of views move by themselves, by moments: their scores have the variance T + T^2 sigma^2.
+
+    Beside what else displaces views they move by less. Where they moved once, from some view on, pictures of two
+    cameras were joined, or the lens was touched: that is told by `diagnose`, and not solved for.
+    """
+    columns = model.equations.intrinsics[:, _CENTRE] * model.weight[:, None]
+    beyond = np.where(model.used[:, None], model.beyond_private(columns), 0.0)
+    starts = model.equations.bounds[:-1]
+    told = np.maximum(np.add.reduceat(beyond**2, starts), 1e-300)
+    score = np.add.reduceat(beyond * model.placed_score[:, None], starts)
+    least, once = (0.75 * _LEAST_PX) ** 2 * np.sum(told), 0.25  # share of the variance that one step leaves
+
+    def about_mean(views: slice) -> float:
+        mean = np.sum(score[views], axis=0) / np.sum(told[views], axis=0)
+        return float(np.sum((score[views] - told[views] * mean) ** 2 / told[views] - 1.0))
+
+    whole = about_mean(slice(0, None))
+    steps = (about_mean(slice(0, at)) + about_mean(slice(at, None)) for at in range(1, len(starts)))
+    return whole > least and min(steps) > once * whole
+
+
+def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
+    """Those that are likely, each beside the others, and the mean square of the noise beside all of them.
+
+    Args:
+        model: of some views. image: (E, I) smooth displacements that all views have alike.
+    """
+    told, sweeps = 1e-4, 2  # share of the largest: of directions that tell anything beside the poses
+    modes, views = _modes(model.equations), len(model.equations.bounds) - 1
+    of_views = SparseColumns.of_groups(model, modes * model.weight[:, None], model.equations.sight, views)
+    together = np.zeros(len(image), dtype=np.int64)
+    alike = SparseColumns.of_groups(model, image * model.weight[:, None], together, 1)
+    repeated = RepeatedAmounts.of(model, SparseColumns.side_by_side([of_views, alike], len(image)))
+    if repeated.spare < modes.shape[1]:
+        return {}, 1.0
+    numbers = {kind: np.flatnonzero(np.tile(kind == _OF_MODE, views)) for kind in _MODES}
+    numbers = {_IMAGE: of_views.size + np.arange(alike.size), **numbers}
+    found: dict[str, float] = {}
+    for kind in [*numbers] * sweeps:
+        found.pop(kind, None)
+        beside = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[other] for other in found)])
+        sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[other]), of) for other, of in found.items())])
+        score, information = repeated.beside(numbers[kind], beside, sigmas)
+        effects = RandomEffects.of(information, score, 0.0, repeated.rest, share=told)
+        effects = replace(effects, freedom=repeated.spare + len(effects.size))
+        prior = LENS_LEAVES if kind == _IMAGE else _MODES[kind][1]
+        sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(repeated.noise)))
+        if probability > LIKELY:
+            found[kind] = sigma * np.sqrt(repeated.noise)
+    return found, repeated.noise
+
+
+def _predicted(
+    own: Linearised, problem: Problem, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float, count: int
+) -> Unsteady:
+    """The best linear unbiased predictions at these sizes and a mean square of the noise, everything that is free at
+    its best beside them; of so many observations.
+
+    Of each view, T is what its equations say of its coefficients beyond its pose, z how, and G what shared directions
+    have in common with them, all over the noise. C = (T + 1 / sigma^2)^-1 is what they leave open. Of the shared
+    directions 1 - sum of G^T C G is known, and what follows of these goes back into the coefficients.
+    """
+    equations = own.equations
+    image_px = max(one.get(_IMAGE, _NONE_PX) for one in sizes.values())
+    model = own.with_columns(smooth_image(equations, estimate), image_px / np.sqrt(noise))
+    modes, shared = _modes(equations), model.shared.shape[1]
+    beyond = np.where(model.used[:, None], model.beyond_private(modes * model.weight[:, None]), 0.0)
+    both = np.column_stack([beyond, model.shared * np.sqrt(noise), model.placed_score])
+    parts = zip(equations.bounds, equations.bounds[1:], strict=False)
+    sums = np.array([beyond[start:stop].T @ both[start:stop] for start, stop in parts]) / noise
+    width = modes.shape[1]
+    told, common, slope = sums[:, :, :width], sums[:, :, width:-1], sums[:, :, -1:]
+    sigma = np.array([_of_sight(sizes.get(key.camera, {}) if key.placement else {}) for key in equations.sights.keys])
+    left_open = np.linalg.inv(told + np.eye(width) * sigma[:, None] ** -2.0)
+    through = left_open @ common
+    covariance = np.linalg.inv(np.eye(shared) - np.sum(common.transpose(0, 2, 1) @ through, axis=0))
+    step = model.step / np.sqrt(noise) - np.sum(through.transpose(0, 2, 1) @ slope, axis=0)[:, 0]
+    coefficients = through @ (covariance @ step) - (left_open @ slope)[:, :, 0]
+    moved = np.sum(modes * coefficients[equations.sight], axis=1)
+    moved = model.beyond_private((moved * model.weight)[:, None])[:, 0] / model.weight  # what poses do not follow
+    displacement = np.zeros((count, 2))
+    np.add.at(displacement, equations.observation, moved[:, None] * equations.direction)
+    return Unsteady(
+        sizes,
+        displacement,
+        float(np.einsum("sij,sji->", told, left_open)),
+        free_keys(estimate, problem.layout, problem.private),
+        _shifts(own, common, through, covariance) * np.sqrt(noise),
+        float(np.sqrt(noise) / np.median(model.weight[model.used])),
+    )
+
+
+def _of_sight(sizes: Sizes) -> Array:
+    """(18,) the sigma of each coefficient."""
+    return np.array([sizes.get(kind, _NONE_PX) for kind in _OF_MODE.tolist()])
+
+
+def _shifts(own: Linearised, common: Array, through: Array, covariance: Array) -> Array:
+    """(R, K) by which what is open of the coefficients moves the shared numbers, over the noise."""
+    taken = common[:, :, : own.shared.shape[1]].transpose(0, 2, 1)
+    across = np.sum(taken @ through, axis=0)
+    alone = across[:, : taken.shape[1]]
+    values, vectors = np.linalg.eigh(alone + across @ covariance @ across.T)
+    return np.asarray((own.root @ vectors * np.sqrt(np.maximum(values, 0.0))).T)

@@ -1,0 +1,69 @@
+"""Principal points that move from view to view: found by themselves, named, and what is stated holds beside them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from accuracy.as_built import CAMERAS, Board, observed
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.diagnostics import diagnose
+from ceres_cal.observations import Observations
+from ceres_cal.robust.unsteady import KIND
+
+VIEWS, MOVED_PX = 14, 12.0
+
+
+def shifted(seed: int, sigma_px: float) -> Observations:
+    """Views of a flat board whose principal points are off by so much each: all that a view shows is shifted by it."""
+    _, observations = observed(Board(views=VIEWS), seed)
+    points = observations.points
+    moved = np.random.default_rng(seed).normal(0.0, sigma_px, (len(observations.views), 2))
+    return replace(observations, points=replace(points, pixels=points.pixels + moved[points.view]))
+
+
+def phi_off(calibration: Calibration) -> float:
+    """In standard deviations."""
+    verdict = calibration.uncertainty.verdict("camera", "camera", "phi")
+    return (verdict.value - CAMERAS["camera"].phi) / verdict.sd
+
+
+@pytest.fixture(scope="module")
+def moving() -> list[tuple[Observations, Calibration]]:
+    return [(each, calibrate(each)) for each in (shifted(seed, MOVED_PX) for seed in range(4))]
+
+
+def test_a_steady_camera_is_left_alone() -> None:
+    for seed in range(4):
+        calibration = calibrate(shifted(seed, 0.0))
+        assert not [one for one in calibration.effects if one.kind == KIND]  # none of 40
+
+
+def test_principal_points_that_move_are_found_and_named(moving: list[tuple[Observations, Calibration]]) -> None:
+    for _, calibration in moving:
+        (found,) = [one for one in calibration.effects if one.kind == KIND]
+        assert found.subject == "camera"
+        assert 0.5 < found.sigma / MOVED_PX < 1.6  # 0.78 to 1.01 measured; 11 of 12 scenes are found
+        assert any("principal point moves" in warning for warning in calibration.warnings)
+        assert not calibration.outliers
+
+
+def test_what_is_stated_holds_beside_them(moving: list[tuple[Observations, Calibration]]) -> None:
+    off = np.array([phi_off(calibration) for _, calibration in moving])
+    assert np.max(np.abs(off)) < 3.5  # 1.2 measured; of 12 scenes 2.0
+    for observations, calibration in moving:
+        assert calibration.fit.point_scale < 1.2  # of the noise alone: 0.99 measured
+        assert len(observations.shown_views) == VIEWS
+
+
+def test_a_saved_calibration_is_diagnosed_beside_them(
+    moving: list[tuple[Observations, Calibration]], tmp_path: Path
+) -> None:
+    observations, calibration = moving[0]
+    calibration.save(tmp_path / "camera.json")
+    diagnosis = diagnose(Calibration.load(tmp_path / "camera.json"), observations)
+    assert not [one for one in diagnosis.findings if one.is_model_error]
+    (noise,) = diagnosis.noise
+    assert noise.sigma_px == pytest.approx(0.3, rel=0.1)  # the simulation's: 0.292 measured
