@@ -66,7 +66,7 @@ class Unsteady(Frozen):
     noise_px: float
 
     def taken_off(self, problem: Problem, points: int, before: Unsteady | None = None) -> Problem:
-        """The problem of observations, of which so many are points, without it in place of with what was before."""
+        """The problem of observations, of which so many are points, without it; what was `before` is off already."""
         off = -self.displacement if before is None else before.displacement - self.displacement
         sights = problem.sights.displaced(off[:points], off[points:])
         return replace(problem, sights=sights, taken_up=self.taken_up)
@@ -95,8 +95,8 @@ class Unsteady(Frozen):
         sigma_px = sizes["principal point"]
         sentence = (
             f"camera {camera!r}: its principal point moves by {two_digits(sigma_px)} px from view to view, as where a "
-            f"lens or pictures are stabilised (most displaced are corners of {first_of(named, 3)}). Stated is where it "
-            "is on average: switch stabilisation off, or what a picture shows may be as far from there"
+            f"lens or pictures are stabilised (most displaced are corners of {first_of(named, 3)}). The point that is "
+            "stated is the average; in a single picture it may be as far from there. Switch stabilisation off"
         )
         every = tuple(Amount(kind, float(sigma), 0.0, "px") for kind, sigma in sizes.items())
         return EffectEstimate(KIND, camera, None, float(sigma_px), 1.0, sentence, every)
@@ -133,7 +133,7 @@ def _found(
     count, estimate = len(observations.points) + len(observations.curves), end.solution.estimate
     off = np.zeros((count, 2)) if before is None else before.displacement
     model_of = partial(_model, observations, estimate, end.residuals, partial(end.weights_of, observations), off)
-    sizes, noise = {}, 1.0
+    sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
         sights = problem.sights.numbers(camera)
         boards = [number for number in sights.tolist() if problem.sights.keys[number].placement is not None]
@@ -144,7 +144,7 @@ def _found(
         if before is not None or _seems_to_move(model):
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own.get("principal point", 0.0) > _LEAST_PX:
-                sizes[camera], noise = own, max(left, noise) if len(sizes) else left
+                sizes[camera], noise = own, max(left, noise)
     return _predicted(model_of(problem), problem, estimate, sizes, noise, count) if sizes else None
 
 

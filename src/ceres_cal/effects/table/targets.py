@@ -177,8 +177,7 @@ class FloorBowed(_Floor):
     prior = FLOOR_OFF
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
-        target, names = _target_of(case)
-        x, y = _over_extent(case, target, len(names)).T
+        target, names, (x, y) = _over_targets(case)
         heights = np.column_stack([x * x, y * y, x * y])
         yield EffectColumns(self.kind, _moved(case, 2)[:, None] * heights, target, names)
 
@@ -200,8 +199,7 @@ class FieldSheared(_Floor):
     prior = FLOOR_OFF
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
-        target, names = _target_of(case)
-        x, y = _over_extent(case, target, len(names)).T
+        target, names, (x, y) = _over_targets(case)
         yield EffectColumns(self.kind, (_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
 
     def words(self, evidence: Evidence) -> Words:
@@ -268,14 +266,17 @@ def _moved(case: Case, axis: int) -> Array:
     return np.asarray(np.sum(case.equations.motion * along, axis=1))
 
 
-def _over_extent(case: Case, target: Indices, count: int) -> Array:
-    """(E, 2) places on so many targets, from the middle of what was observed of each over half of its longer side."""
-    over = np.zeros((len(target), 2))
-    for number in range(count):
+def _over_targets(case: Case) -> tuple[Indices, tuple[str, ...], Array]:
+    """What `_target_of` says, and (2, E) places from the middle of what was observed of each target over half of its
+    longer side.
+    """
+    target, names = _target_of(case)
+    over = np.zeros((2, len(target)))
+    for number in range(len(names)):
         own = target == number
         middle, reach_m = _extent(case.equations.place[own])
-        over[own] = (case.equations.place[own, :2] - middle) / reach_m
-    return over
+        over[:, own] = (case.equations.place[own, :2] - middle).T / reach_m
+    return target, names, over
 
 
 def _extent(places: Array) -> tuple[Array, float]:
