@@ -145,7 +145,9 @@ class Comparison:
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness:
             return found
-        near = attempt(lambda: self.seen.solved_near(self.chosen))  # reads: "other lenses could not be compared, ..."
+        near = attempt(
+            lambda: self.seen.solved_near(self.chosen, np.inf)
+        )  # reads: "other lenses could not be compared, ..."
         if isinstance(near, CalibrationError):
             return replace(found, failed=str(near))
         found = replace(found, near=near)
