@@ -24,6 +24,7 @@ from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
 from ceres_cal.posterior.other_lenses import AGREES, LeftOver
 from ceres_cal.posterior.posterior import Posterior
@@ -41,7 +42,7 @@ from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.robust.unsteady import Unsteady, solve_unsteady
+from ceres_cal.robust.unsteady import Unsteady, find_unsteady
 from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
@@ -101,9 +102,10 @@ def solved_from(
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
-    seen = _explained(start, observations, problem, again, watched, built)
+    first, steady = _solved(start, observations, problem, again, watched, built), None
     if watched.chosen and watched.settle is None:
-        seen = _made_steady(seen, observations, problem, watched)
+        steady = _made_steady(first, observations, problem, watched)
+    seen = steady or _explained(first, observations, problem.sights, again, watched, built)
     conflicts, assessed = Conflicts(), again is None or again.assessed
     if assessed:
         part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
@@ -186,41 +188,53 @@ class _Explained:
         return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
 
 
-def _made_steady(seen: _Explained, observations: Observations, problem: Problem, watched: Watched) -> _Explained:
-    """With what moves the principal points of single views taken off, where any do."""
-    most_rounds = 2
-    unsteady, as_found = None, seen
+def _made_steady(
+    first: _Explained, observations: Observations, problem: Problem, watched: Watched
+) -> _Explained | None:
+    """With what moves the principal points of single views taken off, found again until it stays; None where none do.
+
+    It is looked for before groups are asked whether they belong, which it displaces.
+    """
+    most_rounds = 6
+    seen, unsteady = first, find_unsteady(first.problem, observations, first.end, None)
     for _ in range(most_rounds):
-        part = taking_part(seen.problem, observations, seen.explanations)
-        found = solve_unsteady(seen.problem, part, observations, seen.end, unsteady)
-        if found is None:  # what seemed to move was what the lens or the target left
-            return as_found
-        if found.stays(unsteady):
-            break
-        unsteady = found
-        stated = replace(seen.end.solution.estimate, structure=seen.start.estimate.structure)
-        start = replace(seen.start, estimate=stated, is_near=True)
+        if unsteady is None:  # or what seemed to move was what the lens or the target left
+            return None
+        stated = replace(seen.end.solution.estimate, structure=first.start.estimate.structure)
+        start = replace(first.start, estimate=stated, is_near=True)
         steady = unsteady.taken_off(problem, len(observations.points))
-        seen = _explained(start, observations, steady, None, watched, AS_DRAWN)
-    return replace(seen, unsteady=unsteady)
+        solved = _solved(start, observations, steady, None, watched, AS_DRAWN)
+        seen = replace(_explained(solved, observations, steady.sights, None, watched, AS_DRAWN), unsteady=unsteady)
+        before, unsteady = unsteady, find_unsteady(seen.problem, observations, seen.end, unsteady)
+        if unsteady is not None and unsteady.stays(before):
+            break
+    return seen
 
 
-def _explained(
+def _solved(
     start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched, built: Built
 ) -> _Explained:
-    """Solve, reject, solve, let explanations compete; solve for targets as built and for effects."""
-    usual, drawn = again.scales if again else None, problem.sights
-    problem = replace(problem, sights=built.held(drawn, observations))
+    """Solve, reject, solve: nothing else is explained yet, and targets are drawn as they seemed to be built."""
+    usual = again.scales if again else None
+    problem = replace(problem, sights=built.held(problem.sights, observations))
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
         problem, start, end = _as_long_as_asked(problem, observations, start, end, watched.progress)
         require_measured(end.problem, end.solution.estimate)
+    return _Explained(problem, start, end, ())
+
+
+def _explained(
+    first: _Explained, observations: Observations, drawn: Sights, again: Again | None, watched: Watched, built: Built
+) -> _Explained:
+    """Let explanations compete; solve for targets as built, where they are drawn otherwise, and for effects."""
 
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
-        return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
+        usual = again.scales if again else None
+        return solve_robustly(others, some.observations, _start_of(others, some, first.start, again), usual)
 
-    end, explanations = compete(problem, observations, end, solved)
-    seen = _Explained(replace(problem, sights=drawn), start, end, explanations)
+    end, explanations = compete(first.problem, observations, first.end, solved)
+    seen = _Explained(replace(first.problem, sights=drawn), first.start, end, explanations)
     if again is None:
         seen = _of_targets(seen, observations, solved, watched, built)
     require_fits(seen.end, seen.problem)
