@@ -102,10 +102,12 @@ def solved_from(
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
-    first, steady = _solved(start, observations, problem, again, watched, built), None
-    if watched.chosen and watched.settle is None:
-        steady = _made_steady(first, observations, problem, watched)
-    seen = steady or _explained(first, observations, problem.sights, again, watched, built)
+    seen, may_move = _solved(start, observations, problem, again, watched, built), watched.chosen and not watched.settle
+    steady = _made_steady(seen, observations, problem, watched) if may_move else None
+    if steady is None:
+        seen = _explained(seen, observations, problem.sights, again, watched, built)
+        steady = _made_steady(seen, observations, problem, watched) if may_move else None
+    seen = steady or seen
     conflicts, assessed = Conflicts(), again is None or again.assessed
     if assessed:
         part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
@@ -193,7 +195,8 @@ def _made_steady(
 ) -> _Explained | None:
     """With what moves the principal points of single views taken off, found again until it stays; None where none do.
 
-    It is looked for before groups are asked whether they belong, which it displaces.
+    It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
+    it is hidden by how their target is built.
     """
     most_rounds = 6
     seen, unsteady = first, find_unsteady(first.problem, observations, first.end, None)
