@@ -106,6 +106,7 @@ def solved_from(
     steady = _made_steady(seen, observations, problem, watched) if may_move else None
     if steady is None:
         seen = _explained(seen, observations, problem.sights, again, watched, built)
+        may_move = may_move and bool(seen.explanations or seen.as_built)
         steady = _made_steady(seen, observations, problem, watched) if may_move else None
     seen = steady or seen
     conflicts, assessed = Conflicts(), again is None or again.assessed

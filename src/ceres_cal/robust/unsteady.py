@@ -109,7 +109,11 @@ def find_unsteady(
     """
     count, estimate = len(observations.points) + len(observations.curves), end.solution.estimate
     off = np.zeros((count, 2)) if before is None else before.displacement
-    model_of = partial(_model, observations, estimate, end.residuals, partial(end.weights_of, observations), off)
+    weights_of = partial(end.weights_of, observations)
+
+    def model_of(some: Problem, there: Estimate = estimate) -> Linearised:
+        return _model(observations, there, end.residuals, weights_of, off, some)
+
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
         sights = problem.sights.numbers(camera)
@@ -117,8 +121,9 @@ def find_unsteady(
         if len(boards) < _FEWEST:
             continue
         few = set(some_sights(problem.sights.take(np.array(boards)), _ENOUGH).keys)
-        model = model_of(problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys])))
-        if before is not None or _seems_to_move(model):
+        some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
+        if before is not None or _seems_to_move(model_of(*some.built_as(estimate))):
+            model = model_of(some)
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own.get("principal point", 0.0) > _LEAST_PX:
                 sizes[camera], noise = own, max(left, noise)
