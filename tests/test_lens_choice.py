@@ -23,7 +23,7 @@ from photos import disturbed as disturbed
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.calibration import Calibration, LensChoice, calibrating
+from ceres_cal.calibration import Calibration, LensChoice, calibrating, solving
 from ceres_cal.calibration import lens_choice as choosing
 from ceres_cal.calibration import lens_seen as seen
 from ceres_cal.calibration.calibrating import calibrate
@@ -151,7 +151,7 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
         calibration = calibrate(seen)
     assert calibration.lens_choice is not None and "no lens can be calibrated" in calibration.lens_choice.words
     assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (no lens can be")]
-    explained, gone = calibrating.explained, {"kannala-brandt"}
+    explained, gone = solving.explained, {"kannala-brandt"}
 
     def broken(start: Start, seen: Observations, problem: Problem, *others: Any) -> Explained:
         if problem.options.lens in gone:
