@@ -144,8 +144,8 @@ def test_each_of_many_is_judged_as_it_is_alone(name: str) -> None:
     first, *others = (ground.information_of(promise.measurement) for promise in advised(name).promises)
     for errors, one in zip(outlook.after_each(first, others), others, strict=True):
         alone = outlook.after(first + one)
-        assert errors.worst_mm == pytest.approx(alone.worst_mm, rel=1e-6)  # 5e-8 measured
-        assert errors.mean_mm == pytest.approx(alone.mean_mm, rel=1e-6)
+        assert errors.worst_mm == pytest.approx(alone.worst_mm, rel=1e-9)  # 3e-12 measured
+        assert errors.mean_mm == pytest.approx(alone.mean_mm, rel=1e-9)
 
 
 def test_how_smooth_a_lens_is_is_no_news() -> None:
