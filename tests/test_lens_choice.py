@@ -23,26 +23,26 @@ from photos import disturbed as disturbed
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.calibration import Calibration, LensChoice, calibrating
+from ceres_cal.calibration import Calibration, LensChoice, calibrating, solving
 from ceres_cal.calibration import lens_choice as choosing
 from ceres_cal.calibration import lens_seen as seen
 from ceres_cal.calibration.calibrating import calibrate, lens_by_held_out
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
 from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
 from ceres_cal.calibration.lens_seen import Candidate
-from ceres_cal.calibration.solving import Watched
+from ceres_cal.calibration.solving import Explained
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.photographs import detect_field
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import AUTO, Options
+from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals, write_equations
-from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
@@ -150,18 +150,14 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
         calibration = calibrate(seen)
     assert calibration.lens_choice is not None and "no lens can be calibrated" in calibration.lens_choice.words
     assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (no lens can be")]
-    of_lens = calibrating._of_lens
+    explained, gone = solving.explained, {"kannala-brandt"}
 
-    gone = {"kannala-brandt"}
-
-    def broken(
-        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
-    ) -> Calibration:
-        if options.lens in gone:
+    def broken(start: Start, seen: Observations, problem: Problem, *others: Any) -> Explained:
+        if problem.options.lens in gone:
             raise SolutionError("no camera")
-        return of_lens(start, seen, sights, options, watched, built)
+        return explained(start, seen, problem, *others)
 
-    monkeypatch.setattr(calibrating, "_of_lens", broken)
+    monkeypatch.setattr(calibrating, "explained", broken)
     calibration = calibrate(seen)
     label = label_of(calibration.options)
     assert not label.startswith("kannala-brandt")
@@ -193,13 +189,11 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     """After every other kind; what it says is said."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
-    def broken(
-        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
-    ) -> Calibration:
-        asked.append(label_of(options))
+    def broken(start: Start, seen: Observations, problem: Problem, *_: Any) -> Explained:
+        asked.append(label_of(problem.options))
         raise SolutionError(f"no camera with {asked[-1]}")
 
-    monkeypatch.setattr(calibrating, "_of_lens", broken)
+    monkeypatch.setattr(calibrating, "explained", broken)
     with pytest.raises(SolutionError, match=f"no camera with {PAPER}"):
         calibrate(seen)
     assert asked[0] == asked[-1] == PAPER and len(asked) <= len(LENSES)  # once near, once from nothing

@@ -33,7 +33,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, write_equations
 from ceres_cal.robust.as_built import smooth_image, some_sights
-from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.robust import RobustSolution
 
 KIND = "principal point moves"
 # What a view's coefficients are, in their order, how many, and what is expected of them; those of all views come last.
@@ -65,17 +65,14 @@ class Unsteady(Frozen):
     shifts: Array
     noise_px: float
 
-    def taken_off(self, problem: Problem, points: int, before: Unsteady | None = None) -> Problem:
-        """The problem of observations, of which so many are points, without it; what was `before` is off already."""
-        off = -self.displacement if before is None else before.displacement - self.displacement
-        sights = problem.sights.displaced(off[:points], off[points:])
+    def taken_off(self, problem: Problem, points: int) -> Problem:
+        """The problem of observations, of which so many are points, without it."""
+        sights = problem.sights.displaced(-self.displacement[:points], -self.displacement[points:])
         return replace(problem, sights=sights, taken_up=self.taken_up)
 
-    def stays(self, before: Unsteady | None) -> bool:
+    def stays(self, before: Unsteady) -> bool:
         """Whether it is about the same as before."""
-        at_rest = 0.1  # of the noise
-        if before is None:
-            return False
+        at_rest = 0.1  # of the noise: the next one moves by a fifth of that
         moved = self.displacement - before.displacement
         return float(np.sqrt(np.mean(moved**2))) < at_rest * self.noise_px
 
@@ -102,37 +99,21 @@ class Unsteady(Frozen):
         return EffectEstimate(KIND, camera, None, float(sigma_px), 1.0, sentence, every)
 
 
-def solve_unsteady(
-    problem: Problem, part: Problem, observations: Observations, end: RobustSolution, before: Unsteady | None
-) -> Unsteady | None:
-    """What is found of cameras whose principal point moves, and found again once everything but targets as built was
-    solved for without it; None where there is none.
-
-    Args:
-        problem: of all the observations, what was found `before` taken off. part: of those that take part.
-            end: of its rounds.
-    """
-    most_rounds = 4
-    points = len(observations.points)
-    for _ in range(most_rounds):
-        found = _found(problem, observations, end, before)
-        if found is None or found.stays(before):
-            return found
-        problem, part = (found.taken_off(one, points, before) for one in (problem, part))
-        built, estimate = part.built_as(end.solution.estimate)
-        structure, before = end.solution.estimate.structure, found
-        end = solve_robustly(built, observations, estimate, is_near=True)
-        end = end.moved_to(replace(end.solution.estimate, structure=structure), observations, problem)
-    return before
-
-
-def _found(
+def find_unsteady(
     problem: Problem, observations: Observations, end: RobustSolution, before: Unsteady | None
 ) -> Unsteady | None:
-    """Of the cameras whose principal point is likely to move."""
+    """What is found of cameras whose principal point is likely to move; None where none is.
+
+    Args:
+        problem: of all the observations, what was found `before` taken off. end: of its rounds.
+    """
     count, estimate = len(observations.points) + len(observations.curves), end.solution.estimate
     off = np.zeros((count, 2)) if before is None else before.displacement
-    model_of = partial(_model, observations, estimate, end.residuals, partial(end.weights_of, observations), off)
+    weights_of = partial(end.weights_of, observations)
+
+    def model_of(some: Problem, there: Estimate = estimate) -> Linearised:
+        return _model(observations, there, end.residuals, weights_of, off, some)
+
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
         sights = problem.sights.numbers(camera)
@@ -140,8 +121,9 @@ def _found(
         if len(boards) < _FEWEST:
             continue
         few = set(some_sights(problem.sights.take(np.array(boards)), _ENOUGH).keys)
-        model = model_of(problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys])))
-        if before is not None or _seems_to_move(model):
+        some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
+        if before is not None or _seems_to_move(model_of(*some.built_as(estimate))):
+            model = model_of(some)
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own.get("principal point", 0.0) > _LEAST_PX:
                 sizes[camera], noise = own, max(left, noise)
