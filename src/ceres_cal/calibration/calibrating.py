@@ -13,7 +13,8 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.typed import checked
-from ceres_cal.calibration import Calibration
+from ceres_cal.calibration import Calibration, LensChoice
+from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import (
     of_closed_form,
@@ -83,6 +84,11 @@ def calibrate(
                 raise
             words = _contradicted(observations, options, free)
             raise SolutionError(words or _OTHERWISE) from None
+
+
+def lens_by_held_out(observations: Observations, options: Options) -> LensChoice | None:
+    """The lens that predicts held-out parts of the observations best, whichever the options name."""
+    return calibrate(observations, any_lens(options)).lens_choice
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options, *, knows: bool = True) -> Calibration:
