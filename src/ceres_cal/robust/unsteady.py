@@ -72,7 +72,7 @@ class Unsteady(Frozen):
 
     def stays(self, before: Unsteady) -> bool:
         """Whether it is about the same as before."""
-        at_rest = 0.2  # of the noise: the next one moves by a fifth of that, no camera by a tenth of its sd
+        at_rest = 0.1  # of the noise: the next one moves by a fifth of that
         moved = self.displacement - before.displacement
         return float(np.sqrt(np.mean(moved**2))) < at_rest * self.noise_px
 
@@ -114,24 +114,20 @@ def find_unsteady(
     def model_of(some: Problem, there: Estimate = estimate) -> Linearised:
         return _model(observations, there, end.residuals, weights_of, off, some)
 
-    sizes, noise, model = {}, 0.0, None
+    sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
         sights = problem.sights.numbers(camera)
         boards = [number for number in sights.tolist() if problem.sights.keys[number].placement is not None]
         if len(boards) < _FEWEST:
             continue
         few = set(some_sights(problem.sights.take(np.array(boards)), _ENOUGH).keys)
-        chosen = np.flatnonzero([key in few for key in problem.sights.keys])
-        some = problem if len(chosen) == len(problem.sights) else problem.of_sights(chosen)
+        some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
         if before is not None or _seems_to_move(model_of(*some.built_as(estimate))):
             model = model_of(some)
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own.get("principal point", 0.0) > _LEAST_PX:
                 sizes[camera], noise = own, max(left, noise)
-    if model is None or not sizes:
-        return None
-    model = model if len(model.equations.sights) == len(problem.sights) else model_of(problem)
-    return _predicted(model, problem, estimate, sizes, noise, count)
+    return _predicted(model_of(problem), problem, estimate, sizes, noise, count) if sizes else None
 
 
 def without_unsteadiness(
