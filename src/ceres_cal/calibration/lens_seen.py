@@ -288,11 +288,12 @@ class InlierRows:
         Raises:
             CalibrationError: it cannot be solved for.
         """
-        posed = (
-            1e-6  # share of a placement's cost: from one that is taken for less, whatever the solve does is rejected
-        )
+        # Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected;
+        # and of all, where the next step is of a thousandth of a standard deviation.
+        at_best = 1e-6
         problem = self._problem(candidate.form.of(self.options), candidate.estimate)
-        solution = solve(problem, with_placements_at_best(problem, candidate.estimate, posed))
+        near = with_placements_at_best(problem, candidate.estimate, at_best)
+        solution = solve(problem, near, precision=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
         return solution.estimate

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import attempt
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import meanwhile
@@ -109,6 +109,13 @@ class Explained:
         """Whether the lens leaves the same in views of different placements."""
         placed = of_placements(self.end.problem.sights)
         return bool(len(placed)) and LeftOver.of_end(self.end, placed).asks_for_more
+
+    def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """See `Calibration.outlier_masks`."""
+        inliers = self.end.inliers
+        if inliers.rows.all():
+            return ~inliers.points, ~inliers.curves
+        return self.came_out(observations).outlier_masks(observations)
 
     def came_out(self, observations: Observations) -> Calibration:
         """The calibration, not assessed."""
