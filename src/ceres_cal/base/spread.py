@@ -80,6 +80,21 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
     return np.asarray(root @ root.T)
 
 
+def thin_root(information: Array, sd: Array) -> Array:
+    """(R, n) with root^T root = information (n, n), but for what tells next to nothing of numbers that are known to sd
+    (n,): a Cholesky factor, the row that tells most first.
+    """
+    negligible = 1e-9  # of what is known of a number
+    left, rows = np.diagonal(information).copy(), np.empty((0, len(sd)))
+    for _ in range(len(sd)):
+        most = int(np.argmax(left * sd**2))
+        if left[most] * sd[most] ** 2 <= negligible:
+            break
+        row = (information[most] - rows[:, most] @ rows) / np.sqrt(left[most])
+        rows, left = np.vstack([rows, row]), left - row**2
+    return rows
+
+
 class Spread(Struct, frozen=True, eq=False):
     """What is known of n numbers.
 

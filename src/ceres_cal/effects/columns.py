@@ -187,9 +187,9 @@ class SparseColumns(Frozen):
     @cached_property
     def _matrix(self) -> Array | None:
         """(E, Q) the same as one matrix; None where sums one by one take less time, or less memory."""
-        most, times = 4_000_000, 30  # entries, 32 MB; as many numbers as move an equation
+        most, few, many = 4_000_000, 2, 30  # entries, 32 MB; times as many numbers as move an equation
         equations, width = self.slots.shape
-        if equations * self.size > most or self.size > times * width:
+        if self.size > (many if equations * self.size <= most else few) * width:
             return None
         at = np.arange(equations)[:, None] * (self.size + 1) + self.slots
         whole = np.bincount(at.ravel(), self.values.ravel(), minlength=equations * (self.size + 1))
@@ -222,7 +222,7 @@ class SparseColumns(Frozen):
             return np.asarray(model.shared.T @ self._matrix)
         return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
 
-    def left_of(self, model: Linearised) -> tuple[Array, Array]:
-        """V (Q, Q) and u (Q,), see `effects.evidence`."""
+    def left_of(self, model: Linearised) -> tuple[Array, Array, Array]:
+        """V (Q, Q) and u (Q,), see `effects.evidence`, and what the shared numbers take (P, Q)."""
         private, shared = self.in_private(model).reshape(-1, self.size), self.in_shared(model)
-        return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over)
+        return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over), shared

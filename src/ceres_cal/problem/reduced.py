@@ -250,8 +250,12 @@ class _InformationSums:
     def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
         steps, everywhere = steps_of(key, pose, self._estimate, self._columns)
+        own = len(steps) - 6  # which are shared themselves; the pose's steps follow
+        chain = steps[own:, own:]
         for kind, normal in normals.items():
-            self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
+            along = np.hstack([normal[:, :own], normal[:, own:] @ chain])
+            whole = np.vstack([along[:own], chain.T @ along[own:]])
+            self._matrices[kind][np.ix_(everywhere, everywhere)] += whole
 
 
 def _limits(own: Array) -> Array:
