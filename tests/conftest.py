@@ -1,4 +1,6 @@
-"""What several test modules share."""
+"""What several test modules share. Nothing is imported before it is needed: most modules ask for little of it."""
+
+from __future__ import annotations
 
 import fcntl
 import gc
@@ -6,22 +8,19 @@ import os
 import pickle
 import runpy
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
-from accuracy.moves import DAY, HOME, MOVED, calibrated, seen
-from hypothesis import settings
-from photos.real_data import real_place
 
-from ceres_cal.detect.boards import BoardDetections, detect_boards
-from ceres_cal.detect.photographs import FieldDetections
-from ceres_cal.moves.refit_plan import MIRRORED, relabelled
-from ceres_cal.scene.targets import checkerboard
+if TYPE_CHECKING:
+    from ceres_cal.detect.boards import BoardDetections
+    from ceres_cal.detect.photographs import FieldDetections
 
-settings.register_profile("untimed", deadline=None)  # how long an example takes is no property of it
-settings.load_profile("untimed")
+# Hypothesis' profile for it: the same examples every time, and no deadline. Its option would import it for all modules.
+os.environ["CI"] = "true"
 
 _T = TypeVar("_T")
 
@@ -29,19 +28,28 @@ _T = TypeVar("_T")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+if sys.dont_write_bytecode:  # a suite's many processes compile what they import once, beside pytest's own cache
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
+    os.environ |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": sys.pycache_prefix}
+
+
 def pytest_collection() -> None:
     """All that is imported and collected stays: nobody needs to look through it for garbage."""
     gc.disable()
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish(session: pytest.Session) -> None:
     gc.freeze()
     gc.enable()
+    if "hypothesis" not in sys.modules:  # which its plugin would import at the end all the same
+        session.config.pluginmanager.unregister(name="hypothesispytest")
 
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real images and calibrations: $CERES_CAL_REAL, or shared/real beside the repository."""
+    from photos.real_data import real_place
+
     folder = real_place()
     if not folder.is_dir():
         pytest.skip(f"no real data: {folder} is not there (set CERES_CAL_REAL to its place)")
@@ -80,11 +88,19 @@ def words_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ceres_cal.report.page.to_svg", lambda *_: "<svg></svg>")
 
 
+def _boards(
+    factory: pytest.TempPathFactory, name: str, folder: Path, which: str, board: tuple[int, int, float]
+) -> BoardDetections:
+    from ceres_cal.detect.boards import detect_boards
+    from ceres_cal.scene.targets import checkerboard
+
+    return made_once(factory, name, lambda: detect_boards(sorted(folder.glob(which)), checkerboard(*board)))
+
+
 @pytest.fixture(scope="session")
 def sony_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
     """What is detected in BoofCV's 13 photographs."""
-    images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
-    return made_once(tmp_path_factory, "sony", lambda: detect_boards(images, checkerboard(4, 6, 0.03)))
+    return _boards(tmp_path_factory, "sony", real_data / "boofcv_sony_chess", "*.jpg", (4, 6, 0.03))
 
 
 @pytest.fixture(scope="session")
@@ -98,8 +114,7 @@ def tigers_field(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> t
 @pytest.fixture(scope="session")
 def gopro_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
     """What is detected in the 36 wide-angle photographs; the size of a square is not known."""
-    images = sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg"))
-    return made_once(tmp_path_factory, "gopro", lambda: detect_boards(images, checkerboard(8, 6, 1.0)))
+    return _boards(tmp_path_factory, "gopro", real_data / "udacity_gopro_wide", "GOPR*.jpg", (8, 6, 1.0))
 
 
 @pytest.fixture(scope="session")
@@ -107,6 +122,10 @@ def files_of_a_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder to copy: a calibration (old.json), observations from before (same.json) and after a move (after.json),
     and such that nothing explains (mirrored.json).
     """
+    from accuracy.moves import DAY, HOME, MOVED, calibrated, seen
+
+    from ceres_cal.moves.refit_plan import MIRRORED, relabelled
+
     folder = tmp_path_factory.mktemp("move")
     calibrated(0).save(folder / "old.json")
     seen(HOME, DAY, 1000).observations.save(folder / "same.json")

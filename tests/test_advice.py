@@ -137,6 +137,27 @@ def test_the_best_of_a_pool_tell_together_what_each_tells() -> None:
         assert ground.information_of(whole).matrix == expected
 
 
+@pytest.mark.parametrize("name", ["whole field, 8 deg", "as built"])
+def test_each_of_many_is_judged_as_it_is_alone(name: str) -> None:
+    """By the few directions that it tells of, and by everything that is then known."""
+    ground, outlook = _prepared(calibrated(name), None, 0.15)
+    first, *others = (ground.information_of(promise.measurement) for promise in advised(name).promises)
+    for errors, one in zip(outlook.after_each(first, others), others, strict=True):
+        alone = outlook.after(first + one)
+        assert errors.worst_mm == pytest.approx(alone.worst_mm, rel=1e-9)  # 3e-12 measured
+        assert errors.mean_mm == pytest.approx(alone.mean_mm, rel=1e-9)
+
+
+def test_how_smooth_a_lens_is_is_no_news() -> None:
+    calibration = calibrate(observed("whole field, 8 deg"), Options(lens="spline"))
+    ground, _ = _prepared(calibration, None, 0.15)
+    (tape,) = [one.measurement for one in advised("whole field, 8 deg").promises if "position" in str(one.measurement)]
+    told = ground.information_of(tape)
+    of_lens = [number for number, key in enumerate(told.keys) if key.kind == "camera"]
+    assert len(of_lens) > 10 and not np.any(told.matrix[of_lens])
+    assert np.any(told.matrix)
+
+
 def test_what_the_camera_does_not_see_tells_nothing() -> None:
     ground, _ = _prepared(calibrated("whole field, 8 deg"), None, 0.15)
     pole = first_of(advised("whole field, 8 deg"))["pole"].measurement

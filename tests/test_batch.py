@@ -12,7 +12,6 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ceres_cal import Options, advise, calibrate
@@ -25,7 +24,6 @@ from ceres_cal.cli.batch import _of_calibration
 from ceres_cal.cli.files import finishing
 from ceres_cal.cli.jobs import RESULTS, Job, Outcome, read_plan, remember, remembered, run_jobs
 from ceres_cal.diagnostics.advice.ranking import _prepared
-from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import built_in_scene, simulate
 
@@ -256,16 +254,9 @@ def test_one_process_is_none() -> None:
         pass
 
 
-def test_folds_and_advice_are_the_same_over_an_executor() -> None:
-    observations = simulate(*built_in_scene("boards"), seed=1).observations
-    calibration = calibrate(observations, Options(lens="brown", coefficients=("k1", "k2")))
-    alone = cross_validate(observations, calibration.options, 2, calibration=calibration)
+def test_advice_is_the_same_over_an_executor() -> None:
     straight = calibrate(simulate(*built_in_scene("ssl-field"), seed=1).observations, Options(lens="radial"))
     promised = advise(straight)
-    with processes(2) as executor:
-        spread = cross_validate(observations, calibration.options, 2, calibration=calibration, executor=executor)
-    assert (alone.rms_px, alone.rms_mm) == (spread.rms_px, spread.rms_mm)
-    assert np.array_equal(alone.frame_squares, spread.frame_squares)
     with ThreadPoolExecutor(2) as pool:
         same = advise(straight, executor=pool)
     assert [(one.measurement.words, vars(one.after)) for one in promised.promises] == [

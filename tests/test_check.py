@@ -14,7 +14,7 @@ from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.cli.check import _station
+from ceres_cal.cli.holds import _checked_station
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refit_plan import MIRRORED, relabelled
 from ceres_cal.observations import Observations
@@ -111,7 +111,7 @@ def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibrat
     ):
         found = check(without, lines(pose, 1))["overhead"]
         assert found.change is not None and not found.change.maps and words in found.words
-        assert "nan" not in "\n".join(_station(found).lines)
+        assert "nan" not in "\n".join(_checked_station(found).lines)
 
 
 def test_each_station_by_itself() -> None:

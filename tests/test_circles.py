@@ -15,7 +15,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.report.sheet import sheet_pdf
+from ceres_cal.report.target_pictures import sheet_pdf
 from ceres_cal.scene.targets import Target, checkerboard, circle_grid, rings, ssl_field, target_from_spec
 from ceres_cal.scene.targets.target import Disc
 

@@ -203,7 +203,7 @@ def test_a_bent_board(seen: Seen) -> None:
     model, prior = seen.model, SizePrior(0.5, (1e-4, 3e-4, 1e-3))
     columns = (seen.model.equations.built[:, 2:4] * model.weight[:, None]) * ~model.equations.is_curve[:, None]
     bows = SparseColumns.of_groups(model, columns, np.zeros(len(columns), dtype=np.int64), 1)
-    normal, slope = bows.left_of(model)
+    normal, slope, _ = bows.left_of(model)
     effects = RandomEffects.of(normal, slope, 0.0)
     rest = float(model.left_over @ model.left_over - effects.value @ effects.value)
     sigma, probability = replace(effects, rest=rest, freedom=model.spare).scatter_under(prior)
@@ -253,7 +253,9 @@ def test_the_probability_of_a_diagnostic(seen: Seen) -> None:
         for score in score_all(seen.model, [EffectSums.of(seen.model, columns)])[:4]:
             own = score.columns[:, np.any(score.columns != 0.0, axis=0)] * seen.model.weight[:, None]
             one = RandomEffects.of(
-                *SparseColumns.of_groups(seen.model, own, np.zeros(len(own), dtype=np.int64), 1).left_of(seen.model),
+                *SparseColumns.of_groups(seen.model, own, np.zeros(len(own), dtype=np.int64), 1).left_of(seen.model)[
+                    :2
+                ],
                 0.0,
             )
             best = 1e9 * one.amounts(1e9 * np.eye(own.shape[1]))[0]

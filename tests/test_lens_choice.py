@@ -23,27 +23,26 @@ from photos import disturbed as disturbed
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.calibration import Calibration, LensChoice, calibrating
+from ceres_cal.calibration import Calibration, LensChoice, calibrating, solving
 from ceres_cal.calibration import lens_choice as choosing
 from ceres_cal.calibration import lens_seen as seen
-from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate, lens_by_held_out
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
 from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
 from ceres_cal.calibration.lens_seen import Candidate
-from ceres_cal.calibration.solving import Watched
+from ceres_cal.calibration.solving import Explained
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.photographs import detect_field
-from ceres_cal.diagnostics.held_out import choose
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import AUTO, Options
+from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals, write_equations
-from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
@@ -151,18 +150,14 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
         calibration = calibrate(seen)
     assert calibration.lens_choice is not None and "no lens can be calibrated" in calibration.lens_choice.words
     assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (no lens can be")]
-    of_lens = calibrating._of_lens
+    explained, gone = solving.explained, {"kannala-brandt"}
 
-    gone = {"kannala-brandt"}
-
-    def broken(
-        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
-    ) -> Calibration:
-        if options.lens in gone:
+    def broken(start: Start, seen: Observations, problem: Problem, *others: Any) -> Explained:
+        if problem.options.lens in gone:
             raise SolutionError("no camera")
-        return of_lens(start, seen, sights, options, watched, built)
+        return explained(start, seen, problem, *others)
 
-    monkeypatch.setattr(calibrating, "_of_lens", broken)
+    monkeypatch.setattr(calibrating, "explained", broken)
     calibration = calibrate(seen)
     label = label_of(calibration.options)
     assert not label.startswith("kannala-brandt")
@@ -194,13 +189,11 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     """After every other kind; what it says is said."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
-    def broken(
-        start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched, built: Built
-    ) -> Calibration:
-        asked.append(label_of(options))
+    def broken(start: Start, seen: Observations, problem: Problem, *_: Any) -> Explained:
+        asked.append(label_of(problem.options))
         raise SolutionError(f"no camera with {asked[-1]}")
 
-    monkeypatch.setattr(calibrating, "_of_lens", broken)
+    monkeypatch.setattr(calibrating, "explained", broken)
     with pytest.raises(SolutionError, match=f"no camera with {PAPER}"):
         calibrate(seen)
     assert asked[0] == asked[-1] == PAPER and len(asked) <= len(LENSES)  # once near, once from nothing
@@ -271,7 +264,8 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
 
     def solved(*given: Any, **more: Any) -> Solution:
         found = solve(*given, **more)
-        return replace(found, cost=np.inf, failed=True) if "precision" not in more and next(failing) else found
+        is_close = more.get("precision", 0.0) < 1e-3
+        return replace(found, cost=np.inf, failed=True) if is_close and next(failing) else found
 
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
     start = initialise(observations, gather_sights(observations), options)
@@ -282,12 +276,10 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
 
 
 def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A solve that ran into another minimum is not the lens that predicts as well; the chosen one is there all the same."""
+    """A solve that ran into another minimum is not the lens that predicts as well; the chosen one is there."""
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
     start = initialise(observations, gather_sights(observations), options)
-    monkeypatch.setattr(seen, "KEPT", 0.0)
-    monkeypatch.setattr(seen.InlierRows.solved_near, "__defaults__", (0.0,))
-    monkeypatch.setattr(seen.InlierRows, "reached", lambda self, candidate: candidate.estimate)
+    monkeypatch.setattr(choosing, "KEPT", 0.0)
     few = choose_lens(observations, Options(), start).others
     assert few is not None and not few.others and not few.failed
 
@@ -411,11 +403,10 @@ def test_a_lens_that_is_given_stays_and_nothing_is_compared() -> None:
     assert calibration.lens_choice is None and label_of(calibration.options) == PAPER
 
 
-def test_held_out_frames_speak_across_kinds() -> None:
-    choice = choose(_seen("kannala-brandt", "boards"), Options(powers=(3,)), k=2)
-    kinds = {one.label.split()[0] for one in choice.candidates}
-    assert choice.candidates[choice.current].label == "radial 3" and kinds > {"radial"}
-    assert not choice.candidates[choice.chosen].label.startswith("radial 3")
+def test_held_out_parts_speak_across_kinds_whatever_lens_is_named() -> None:
+    choice = lens_by_held_out(_seen("kannala-brandt", "boards"), Options(powers=(3,)))
+    assert choice is not None and choice.chosen.startswith("kannala-brandt")
+    assert {one.label.split()[0] for one in choice.tried} > {"radial"}
 
 
 def test_options_name_the_lens_by_its_powers_alone() -> None:

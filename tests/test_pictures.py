@@ -37,7 +37,7 @@ from ceres_cal.report.pictures.frames import (
 from ceres_cal.report.pictures.model import model_seen
 from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay
 from ceres_cal.report.pictures.straight import Straight, straighten
-from ceres_cal.report.pictures.top_view import TopViewGrid, make_grid, top_view
+from ceres_cal.report.pictures.warp import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.simulate import overhead_pose

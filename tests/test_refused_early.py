@@ -140,9 +140,6 @@ WRONG = {
         ("CAL OBS --output table.txt", "the table is written as .csv, .json or .npz"),
         ("CAL OBS --report page.pdf", "a report is written as .html or .htm"),
         ("CAL OBS --images PHOTO", "--images needs --report"),
-        ("CAL OBS --folds 9", "--folds needs --held-out"),
-        ("CAL OBS --held-out --folds 1", "no whole number from 2 on"),
-        ("CAL OBS --held-out --jobs -1", "no whole number from 0 on"),
         ("CAL OBS --false-alarms 2", "must lie between 0 and 1"),
     ],
     "advise": [

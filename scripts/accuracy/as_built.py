@@ -17,13 +17,13 @@ import numpy as np
 from halves import SETS
 from runner import Row, mean_and_error, over, script, share_error
 
+from accuracy.cross_validation import cross_validate
 from accuracy.scenes import RADIAL
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.quantities import difference

@@ -15,7 +15,7 @@ from ceres_cal.base.arrays import Array, Mask
 NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
 1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
-_REGULAR = 1e6  # the inverse of such an eigenvalue; plain inverses are good to 1e-9 there
+_REGULAR = 1e8  # the inverse of such an eigenvalue; plain inverses are good to 1e-7 there
 
 
 def _nothing(count: int) -> float:
@@ -78,6 +78,21 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
     values, vectors = np.linalg.eigh(0.5 * (left + left.T) * scale[:, None] * scale)
     root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) / scale[:, None]  # the rest is rounding
     return np.asarray(root @ root.T)
+
+
+def thin_root(information: Array, sd: Array) -> Array:
+    """(R, n) with root^T root = information (n, n), but for what tells next to nothing of numbers that are known to sd
+    (n,): a Cholesky factor, the row that tells most first.
+    """
+    negligible = 1e-9  # of what is known of a number
+    left, rows = np.diagonal(information).copy(), np.empty((0, len(sd)))
+    for _ in range(len(sd)):
+        most = int(np.argmax(left * sd**2))
+        if left[most] * sd[most] ** 2 <= negligible:
+            break
+        row = (information[most] - rows[:, most] @ rows) / np.sqrt(left[most])
+        rows, left = np.vstack([rows, row]), left - row**2
+    return rows
 
 
 class Spread(Struct, frozen=True, eq=False):

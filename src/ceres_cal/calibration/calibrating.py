@@ -13,12 +13,13 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.typed import checked
-from ceres_cal.calibration import Calibration
+from ceres_cal.calibration import Calibration, LensChoice
+from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import (
     of_closed_form,
 )
-from ceres_cal.calibration.solving import Watched, solved_from
+from ceres_cal.calibration.solving import Explained, Watched, explained, known_of, solved_from
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import unfilled
@@ -83,6 +84,11 @@ def calibrate(
                 raise
             words = _contradicted(observations, options, free)
             raise SolutionError(words or _OTHERWISE) from None
+
+
+def lens_by_held_out(observations: Observations, options: Options) -> LensChoice | None:
+    """The lens that predicts held-out parts of the observations best, whichever the options name."""
+    return calibrate(observations, any_lens(options)).lens_choice
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options, *, knows: bool = True) -> Calibration:
@@ -156,31 +162,41 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
     if options.closed_form_only:
         return _of_lens(start, observations, sights, papers(options), watched)
 
-    def solved(one: Chosen) -> Calibration:
-        named = replace(one.options, priors=options.priors)  # which lenses were compared without
-        return _of_lens(one.start, observations, sights, named, replace(watched, chosen=True), one.built)
+    watched = replace(watched, chosen=True)
+
+    def seen_with(one: Chosen) -> Explained:
+        named = replace(one.options, priors=options.priors).with_first_power(len(sights))  # compared without priors
+        problem = problem_of(observations, sights, named, one.start.estimate)
+        return explained(one.start, observations, problem, None, watched, one.built)
 
     chosen = choose_lens(observations, options, start)
-    calibration, chosen = chosen.first_solved(solved, papers(options), start)
-    known = calibration.posterior
-    too_few = chosen.choice.share < 1.0 and known is not None and known.left_alike
-    if too_few or (calibration.as_built and not chosen.built.every):
+    seen, chosen = chosen.first_solved(seen_with, papers(options), start)
+    too_few = chosen.choice.share < 1.0 and seen.leaves_alike
+    if too_few or (seen.as_built and not chosen.built.every):
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
         # all views leave in the same places need not show in the few of them that lenses were compared by.
-        near = replace(calibration.estimate, structure=EXACT)
+        near = replace(seen.end.solution.estimate, structure=EXACT)
         before, anew = chosen, replace(start, estimate=near)
-        built = Built(calibration.as_built, calibration.estimate.structure)
+        built = Built(seen.as_built, seen.end.solution.estimate.structure)
         chosen = choose_lens(observations, options, anew, built, by_most=too_few)
         if chosen.choice.chosen != before.choice.chosen:
-            calibration, chosen = chosen.first_solved(solved, papers(options), start)
+            seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     said = []
-    while other := chosen.instead(*calibration.outlier_masks(observations)):
-        found = attempt(partial(solved, other))  # reads: "another lens explains observations that were taken out, ..."
+    while other := chosen.instead(*seen.outlier_masks(observations)):
+        found = attempt(
+            partial(seen_with, other)
+        )  # reads: "another lens explains observations that were taken out, ..."
         if isinstance(found, CalibrationError):
             without = "but makes no calibration of all"
             said.append(f"another lens explains observations that were taken out, {without}: {found}")
             break
-        calibration, chosen = found, other
+        seen, chosen = found, other
+    last = chosen
+
+    def known_with(one: Chosen) -> Calibration:
+        return known_of(seen if one is last else seen_with(one), observations, None, watched)
+
+    calibration, chosen = last.first_solved(known_with, papers(options), start)
     if calibration.posterior is not None and (others := chosen.others) is not None:
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import attempt
-from ceres_cal.base.frozen import replace
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import meanwhile
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
@@ -24,8 +24,9 @@ from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
-from ceres_cal.posterior.other_lenses import AGREES, LeftOver
+from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress, Solution
 from ceres_cal.problem.information import Key, over
@@ -41,7 +42,7 @@ from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.robust.unsteady import Unsteady, solve_unsteady
+from ceres_cal.robust.unsteady import Unsteady, find_unsteady
 from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
@@ -51,8 +52,7 @@ if TYPE_CHECKING:
     from ceres_cal.robust.competing import Explanation
 
 
-@dataclass(frozen=True)
-class Again:
+class Again(Frozen, eq=True):
     """How a calibration is taken up again after an earlier one.
 
     Attributes:
@@ -66,8 +66,7 @@ class Again:
     assessed: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Watched:
+class Watched(Frozen):
     """Who is told of the solves, and what solves for all observations where these are a part.
 
     Attributes:
@@ -82,12 +81,80 @@ class Watched:
     chosen: bool = False
 
 
+_UNWATCHED = Watched()
+
+
+class Explained(Frozen):
+    """A solution, and what explains the observations that it does not fit.
+
+    Attributes:
+        explanations: what else groups of observations may be. as_built: how targets were built.
+        beside: effects of the table that were solved for. others: further minima.
+        unsteady: what moves single views. digest: of the observations, which remember it, while it is worked out.
+    """
+
+    problem: Problem
+    start: Start
+    end: RobustSolution
+    explanations: tuple[Explanation, ...]
+    as_built: tuple[AsBuilt, ...] = ()
+    beside: EffectsEnd | None = None
+    others: tuple[Solution, ...] = ()
+    unsteady: Unsteady | None = None
+    digest: Future[str] | None = None
+
+    @property
+    def leaves_alike(self) -> bool:
+        """Whether the lens leaves the same in views of different placements."""
+        placed = of_placements(self.end.problem.sights)
+        return bool(len(placed)) and LeftOver.of_end(self.end, placed).asks_for_more
+
+    def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """See `Calibration.outlier_masks`."""
+        inliers = self.end.inliers
+        if inliers.rows.all():
+            return ~inliers.points, ~inliers.curves
+        return self.came_out(observations).outlier_masks(observations)
+
+    def came_out(self, observations: Observations) -> Calibration:
+        """The calibration, not assessed."""
+        if self.digest is not None:
+            self.digest.result()
+        return came_out(self.start.phi_from, observations, self.problem, self.end, self.explanations)
+
+    def effects(self, observations: Observations) -> tuple[EffectEstimate, ...]:
+        """What was solved for beside the problem."""
+        moving = self.unsteady.estimates(observations) if self.unsteady else ()
+        return (*moving, *(self.beside.estimates if self.beside else ()))
+
+    @property
+    def shifts_at(self) -> ShiftsAt | None:
+        """By which numbers scatter besides."""
+        if self.unsteady is None:
+            return self.beside.shifts_at if self.beside else None
+        unsteady, beside = self.unsteady, self.beside
+
+        def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
+            keys, shifts = beside.shifts_at(there, priors) if beside else (unsteady.keys, ())
+            return keys, [*shifts, *over(unsteady.shifts, unsteady.keys, keys)]
+
+        return shifts_at
+
+    def without(self, conflicts: Conflicts, observations: Observations) -> Explained:
+        """The answer without what was stated and everything else contradicts."""
+        if conflicts.answer is None:
+            return self
+        problem = replace(self.problem, priors=conflicts.answer.problem.priors)
+        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
+
+
 def solved_from(
     start: Start,
     observations: Observations,
     problem: Problem,
     again: Again | None = None,
-    watched: Watched = Watched(),
+    watched: Watched = _UNWATCHED,
     built: Built = AS_DRAWN,
 ) -> Calibration:
     """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.
@@ -98,12 +165,27 @@ def solved_from(
     Raises:
         CalibrationError: see `calibrate`.
     """
+    return known_of(explained(start, observations, problem, again, watched, built), observations, again, watched)
+
+
+def explained(
+    start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched, built: Built
+) -> Explained:
+    """Solve and explain what is left; see `solved_from`."""
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
-    seen = _explained(start, observations, problem, again, watched, built)
-    if watched.chosen and watched.settle is None:
-        seen = _made_steady(seen, observations, problem, watched)
+    seen, may_move = _solved(start, observations, problem, again, watched, built), watched.chosen and not watched.settle
+    steady = _made_steady(seen, observations, problem, watched) if may_move else None
+    if steady is None:
+        seen = _explained(seen, observations, problem.sights, again, watched, built)
+        may_move = may_move and bool(seen.explanations or seen.as_built)
+        steady = _made_steady(seen, observations, problem, watched) if may_move else None
+    return replace(steady or seen, digest=digest)
+
+
+def known_of(seen: Explained, observations: Observations, again: Again | None, watched: Watched) -> Calibration:
+    """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
     conflicts, assessed = Conflicts(), again is None or again.assessed
     if assessed:
         part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
@@ -127,9 +209,7 @@ def solved_from(
             *seen_from_behind(seen.end.solution.estimate, observations),
         )
         warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
-    if digest is not None:
-        digest.result()  # which the observations remember
-    calibration = came_out(seen.start.phi_from, observations, seen.problem, seen.end, seen.explanations)
+    calibration = seen.came_out(observations)
     if settled is not None:
         calibration = of_all(calibration, settled)
     wholes = [one.rows for one in seen.explanations if one.is_taken]
@@ -140,87 +220,52 @@ def solved_from(
     return replace(calibration, options=options, as_built=seen.as_built, effects=effects)
 
 
-@dataclass(frozen=True, eq=False)
-class _Explained:
-    """A solution, and what explains the observations that it does not fit.
+def _made_steady(first: Explained, observations: Observations, problem: Problem, watched: Watched) -> Explained | None:
+    """With what moves the principal points of single views taken off, found again until it stays; None where none do.
 
-    Attributes:
-        explanations: what else groups of observations may be. as_built: how targets were built.
-        beside: effects of the table that were solved for. others: further minima.
-        unsteady: what moves single views.
+    It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
+    it is hidden by how their target is built.
     """
-
-    problem: Problem
-    start: Start
-    end: RobustSolution
-    explanations: tuple[Explanation, ...]
-    as_built: tuple[AsBuilt, ...] = ()
-    beside: EffectsEnd | None = None
-    others: tuple[Solution, ...] = ()
-    unsteady: Unsteady | None = None
-
-    def effects(self, observations: Observations) -> tuple[EffectEstimate, ...]:
-        """What was solved for beside the problem."""
-        moving = self.unsteady.estimates(observations) if self.unsteady else ()
-        return (*moving, *(self.beside.estimates if self.beside else ()))
-
-    @property
-    def shifts_at(self) -> ShiftsAt | None:
-        """By which numbers scatter besides."""
-        if self.unsteady is None:
-            return self.beside.shifts_at if self.beside else None
-        unsteady, beside = self.unsteady, self.beside
-
-        def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
-            keys, shifts = beside.shifts_at(there, priors) if beside else (unsteady.keys, ())
-            return keys, [*shifts, *over(unsteady.shifts, unsteady.keys, keys)]
-
-        return shifts_at
-
-    def without(self, conflicts: Conflicts, observations: Observations) -> _Explained:
-        """The answer without what was stated and everything else contradicts."""
-        if conflicts.answer is None:
-            return self
-        problem = replace(self.problem, priors=conflicts.answer.problem.priors)
-        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
-        return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
-
-
-def _made_steady(seen: _Explained, observations: Observations, problem: Problem, watched: Watched) -> _Explained:
-    """With what moves the principal points of single views taken off, where any do."""
-    most_rounds = 2
-    unsteady, as_found = None, seen
+    most_rounds = 6
+    seen, unsteady = first, find_unsteady(first.problem, observations, first.end, None)
     for _ in range(most_rounds):
-        part = taking_part(seen.problem, observations, seen.explanations)
-        found = solve_unsteady(seen.problem, part, observations, seen.end, unsteady)
-        if found is None:  # what seemed to move was what the lens or the target left
-            return as_found
-        if found.stays(unsteady):
-            break
-        unsteady = found
-        stated = replace(seen.end.solution.estimate, structure=seen.start.estimate.structure)
-        start = replace(seen.start, estimate=stated, is_near=True)
+        if unsteady is None:  # or what seemed to move was what the lens or the target left
+            return None
+        stated = replace(seen.end.solution.estimate, structure=first.start.estimate.structure)
+        start = replace(first.start, estimate=stated, is_near=True)
         steady = unsteady.taken_off(problem, len(observations.points))
-        seen = _explained(start, observations, steady, None, watched, AS_DRAWN)
-    return replace(seen, unsteady=unsteady)
+        solved = _solved(start, observations, steady, None, watched, AS_DRAWN)
+        seen = replace(_explained(solved, observations, steady.sights, None, watched, AS_DRAWN), unsteady=unsteady)
+        before, unsteady = unsteady, find_unsteady(seen.problem, observations, seen.end, unsteady)
+        if unsteady is not None and unsteady.stays(before):
+            break
+    return seen
 
 
-def _explained(
+def _solved(
     start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched, built: Built
-) -> _Explained:
-    """Solve, reject, solve, let explanations compete; solve for targets as built and for effects."""
-    usual, drawn = again.scales if again else None, problem.sights
-    problem = replace(problem, sights=built.held(drawn, observations))
+) -> Explained:
+    """Solve, reject, solve: nothing else is explained yet, and targets are drawn as they seemed to be built."""
+    usual = again.scales if again else None
+    problem = replace(problem, sights=built.held(problem.sights, observations))
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
         problem, start, end = _as_long_as_asked(problem, observations, start, end, watched.progress)
         require_measured(end.problem, end.solution.estimate)
+    return Explained(problem, start, end, ())
+
+
+def _explained(
+    first: Explained, observations: Observations, drawn: Sights, again: Again | None, watched: Watched, built: Built
+) -> Explained:
+    """Let explanations compete; solve for targets as built, where they are drawn otherwise, and for effects."""
 
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
-        return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
+        usual = again.scales if again else None
+        return solve_robustly(others, some.observations, _start_of(others, some, first.start, again), usual)
 
-    end, explanations = compete(problem, observations, end, solved)
-    seen = _Explained(replace(problem, sights=drawn), start, end, explanations)
+    end, explanations = compete(first.problem, observations, first.end, solved)
+    seen = Explained(replace(first.problem, sights=drawn), first.start, end, explanations)
     if again is None:
         seen = _of_targets(seen, observations, solved, watched, built)
     require_fits(seen.end, seen.problem)
@@ -229,12 +274,12 @@ def _explained(
 
 
 def _of_targets(
-    seen: _Explained,
+    seen: Explained,
     observations: Observations,
     solved: Callable[[Problem, Subproblem], RobustSolution],
     watched: Watched,
     built: Built,
-) -> _Explained:
+) -> Explained:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
     is_asked = problem.options.as_built == "estimate"
@@ -249,12 +294,12 @@ def _of_targets(
         least, others = least_of_few(end.problem, end.solution.estimate, seen.start.others)
         if least is not end.solution.estimate:
             end = replace(end.moved_to(least, observations, problem), reduced=None)
-    return _Explained(problem, seen.start, end, explanations, as_built, beside, others)
+    return Explained(problem, seen.start, end, explanations, as_built, beside, others)
 
 
 def _known(
-    seen: _Explained, observations: Observations, conflicts: Conflicts, again: Again | None
-) -> tuple[_Explained, Posterior]:
+    seen: Explained, observations: Observations, conflicts: Conflicts, again: Again | None
+) -> tuple[Explained, Posterior]:
     """What is known of every number, with what the lens hides and whatever else may be."""
     end, posterior = _assess(seen, observations, again)
     if again is None:
@@ -264,7 +309,7 @@ def _known(
     return replace(seen, end=end), with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
-def _assess(seen: _Explained, observations: Observations, again: Again | None) -> tuple[RobustSolution, Posterior]:
+def _assess(seen: Explained, observations: Observations, again: Again | None) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
     Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.

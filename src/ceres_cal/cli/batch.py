@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import plural, printable
+from ceres_cal.base.words import DASH, counted, mm, plural, printable
 from ceres_cal.cli.arguments import jobs_option, output_option
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
-from ceres_cal.report.document import Document, Section
+from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile, Tiles
 
 if TYPE_CHECKING:
     from ceres_cal.cli.jobs import Job, Outcome
@@ -25,6 +25,9 @@ _READ = ("observations", "calibration", "inputs", "images")  # arguments that na
 _OWN = {"-o", "--output", "--report", "--json"}
 _SUMMARY = "summary.html"
 _EXIT_CODES = {"failed": 3, "no": 1}
+_WORDS = {"failed": "failed", "no": "not to be trusted, or moved", "care": "usable with limits", "good": "good"}
+_LEVELS = {"failed": "no"}
+"""What the page colours otherwise."""
 _MOST_REASONS = 4
 
 
@@ -56,7 +59,6 @@ class BatchArguments(QuietArguments):
 def _run(args: BatchArguments) -> Document:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
-    from ceres_cal.cli.batch_page import summary_page
     from ceres_cal.cli.jobs import run_jobs
 
     jobs = plan_jobs(args.plan, args.output, args.options, reports=args.reports)
@@ -190,3 +192,43 @@ def _sections(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> 
         Section("jobs", [said], {"jobs": ranked, "from_before": again}),
         Section("written", [page], {"output": page}),
     )
+
+
+# ---- the page: what needs attention first ----------------------------------------------------------------------------
+
+
+def summary_page(title: str, outcomes: Sequence[Outcome], links: dict[str, str]) -> str:
+    """The page.
+
+    Args:
+        links: a job's name -> file beside the page to look at.
+    """
+    most_cards = 40
+    from ceres_cal.cli.jobs import LEVELS
+    from ceres_cal.report.page import page
+
+    ranked = sorted(outcomes, key=lambda one: one.order)
+    attention = [one for one in ranked if one.level != "good"]
+    count = Counter(one.level for one in outcomes)
+    level = _LEVELS.get(ranked[0].level, ranked[0].level)
+    how = f"{counted(len(attention), 'job')} of {len(ranked)} to look at" if attention else "Nothing to look at"
+    tiles = Tiles(tuple(Tile(_WORDS[name], str(count[name]), "", "", _LEVELS.get(name, name)) for name in LEVELS))
+    chapters = [Chapter("verdict", f"{how}.", (tiles,), level)]
+    if attention:
+        cards: list[Piece] = [_card(one, links.get(one.job, "")) for one in attention[:most_cards]]
+        if len(attention) > most_cards:
+            cards.append(Text(f"And {len(attention) - most_cards} more, in the table."))
+        chapters.append(Chapter("attention", "What needs attention, the worst first", tuple(cards)))
+    rows = tuple(
+        (one.job, one.command, one.level, DASH if one.worst_mm is None else mm(one.worst_mm), one.line)
+        for one in ranked
+    )
+    table = Table(("job", "command", "level", "worst", "what it says"), rows, stacked=True, most=len(rows))
+    chapters.append(Chapter("jobs", "All jobs", (table,)))
+    return page(title, counted(len(ranked), "job"), chapters, "Written by ceres-cal batch.", "Batch summary")
+
+
+def _card(one: Outcome, link: str) -> Card:
+    facts = [one.command, one.level] + ([] if one.worst_mm is None else [f"worst {mm(one.worst_mm)}"])
+    reasons = " ".join(one.reasons)
+    return Card(_LEVELS.get(one.level, one.level), f"{one.job}: {one.line}", reasons, tuple(facts), link)

@@ -7,7 +7,6 @@ from pathlib import Path
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
-from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document
 
 
@@ -18,15 +17,8 @@ class DiagnoseArguments(arguments.ReportArguments):
     observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order")
     output: Path | None = arguments.output_option("the residual of every observation (.csv, .json or .npz)", None)
     new_data: bool = switch("the observations are others than those it was made from")
-    held_out: bool = switch(
-        "also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
-        "lens predicts best"
-    )
+    held_out: bool = switch("say, too, which lens predicts held-out parts best, as `calibrate` does")
     strict: bool = switch("exit with 1 for any finding, also one that does no harm")
-    folds: int = option(
-        "parts into which frames go for --held-out", "K", 5, read=arguments.whole(2), beside=("held_out",)
-    )
-    jobs: int = arguments.jobs_option("folds, for --held-out,", 1, beside=("held_out",))
     false_alarms: float = option(
         "probability of any finding where nothing is wrong", "P", 0.01, read=arguments.number("--false-alarms")
     )
@@ -40,25 +32,20 @@ class DiagnoseArguments(arguments.ReportArguments):
 )
 def _run(args: DiagnoseArguments) -> Document:
     _require_fitting(args)
-    from ceres_cal.base.executing import processes
+    from ceres_cal.calibration.calibrating import lens_by_held_out
     from ceres_cal.diagnostics import diagnose
-    from ceres_cal.diagnostics.held_out import choose
 
     calibration, observations = files.read_calibration(args.calibration), files.read_observations(args.observations)
     photographs = files.report_photographs(args, observations)
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=args.false_alarms)
-    choice = None
-    if args.held_out:
-        with progress_bar(args) as bar, processes(args.jobs) as executor:
-            options = calibration.options
-            choice = choose(observations, options, args.folds, progress=bar.update, executor=executor)
+    choice = lens_by_held_out(observations, calibration.options) if args.held_out else None
     page, unmade = files.report_page(args, calibration, observations, photographs, diagnosis, choice)
     from ceres_cal.report.findings import diagnosis_sections
     from ceres_cal.report.grounds import is_against
 
     # Wrong labels that were taken out do no harm, and a noise is estimated.
     against = [finding for finding in diagnosis.findings if args.strict or is_against(finding)]
-    answer = tuple(diagnosis_sections(diagnosis, choice))
+    answer = tuple(diagnosis_sections(diagnosis, choice, calibration.options))
     sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))
     return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)
 

@@ -19,9 +19,8 @@ from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Section
 
 if TYPE_CHECKING:
-    from ceres_cal.calibration import Calibration
+    from ceres_cal.calibration import Calibration, LensChoice
     from ceres_cal.diagnostics import Diagnosis
-    from ceres_cal.diagnostics.held_out import Choice
     from ceres_cal.observations import Observations
     from ceres_cal.problem.ranges import Range
     from ceres_cal.report import FramePhotographs
@@ -275,7 +274,7 @@ def report_page(
     observations: Observations,
     photographs: FramePhotographs | None,
     diagnosis: Diagnosis | None = None,
-    choice: Choice | None = None,
+    choice: LensChoice | None = None,
 ) -> tuple[str | None, Section]:
     """The page that --report asks for, or None; see `attempted`."""
     if args.report is None:

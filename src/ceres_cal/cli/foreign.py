@@ -1,36 +1,155 @@
-"""`ceres-cal import`, `publish`, `listen` and `targets import`: the files and messages of other programs."""
+"""The files and messages of other programs: `ceres-cal export`, `export-table`, `import`, `publish`, `listen` and
+`targets import`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import no_such
-from ceres_cal.cli.arguments import calibration_argument, length, output_option
-from ceres_cal.cli.command import Arguments, argument, command, option, options_of, switch
-from ceres_cal.cli.export import format_options, import_forms, listed, losses
+from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
+from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch
 from ceres_cal.cli.files import read_calibration, require_ending, require_output, save
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.formats import Group
+    from ceres_cal.formats import Exported, ExportFormat, Group, ImportFormat
     from ceres_cal.scene.targets import Target
+
+
+# ---- export ---------------------------------------------------------------------------------------------------------
+
+
+def _export_forms() -> Mapping[str, ExportFormat]:
+    """The formats that are written, by name."""
+    from ceres_cal.formats import EXPORT_FORMATS
+
+    return EXPORT_FORMATS
+
+
+def _import_forms() -> Mapping[str, ImportFormat]:
+    """The formats that are read, by name."""
+    from ceres_cal.formats import IMPORT_FORMATS
+
+    return IMPORT_FORMATS
+
+
+def _listed(forms: Iterable[ExportFormat | ImportFormat]) -> str:
+    """What there is to choose from."""
+    return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
+
+
+class TableArguments(Arguments):
+    """What is written of a calibration, and how much of it may be lost."""
+
+    calibration: Path = calibration_argument()
+    output: Path = output_option("the export; its ending is one of the format's")
+    station: tuple[str, ...] = option(
+        "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
+    )
+    max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm"))
+    options: Mapping[str, str] = options_of(lambda: [_export_forms()["table"]])
+
+
+class ExportArguments(TableArguments):
+    """The same, of a format that is named."""
+
+    to: str = option(lambda: _listed(_export_forms().values()), "FORMAT", REQUIRED)
+    options: Mapping[str, str] = options_of(lambda: _export_forms().values())
+
+
+@command(
+    "export",
+    "a calibration in a format that others read, and what that loses",
+    "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
+    "calibration.json --to opencv -o camera.yml",
+    "calibration.json --to table -o table.npz --error-mm 0.05",
+)
+def _export(args: ExportArguments) -> Document:
+    return _exported(args, args.to)
+
+
+@command("export-table", "a look-up table from pixels to the field (NPZ)", "calibration.json -o table.npz")
+def _export_table(args: TableArguments) -> Document:
+    return _exported(args, "table")
+
+
+def _exported(args: TableArguments, name: str) -> Document:
+    from ceres_cal.formats import export_format, prepare_export
+
+    form = export_format(name)
+    if form.endings:
+        require_output(args.output, [args.calibration])
+    options = _typed(args.options, [form])
+    exported = prepare_export(read_calibration(args.calibration), form.name, args.output, args.station or None, options)
+    exported.require_loss_mm(args.max_loss_mm)
+    save(args.output, exported)
+    about = {"format": form.name, "output": str(args.output), **exported.facts}
+    first = Section(form.name, [f"{exported.words}, written to {args.output}"], about)
+    return Document((first, *_losses(exported)))
+
+
+def _typed(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
+    """What was given of the formats' options, of the types that they have."""
+    from typing import get_type_hints
+
+    import msgspec
+
+    types = {name: kind for form in forms for name, kind in get_type_hints(form.options).items()}
+    options = {}
+    for name, text in given.items():
+        if name not in types:
+            raise InputError(f"{flag(name)} is no option of format {forms[0].name}")
+        try:
+            plain = str(parse_length(text, flag(name), "mm")) if name.endswith("_mm") else text
+            options[name] = msgspec.convert(plain, types[name], strict=False)
+        except (msgspec.ValidationError, UnicodeEncodeError):  # a word that is no UTF-8 is none of those either
+            raise InputError(f"{flag(name)}: {text!r} is not the number or word that it takes") from None
+    return options
+
+
+def _losses(exported: Exported) -> Iterator[Section]:
+    """What is lost, in px and mm, and what else to know."""
+    from ceres_cal.formats import loss_words
+
+    every = exported.losses
+    errors = [
+        {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
+        for loss in every
+        for height_m, (rms, worst) in loss.field_mm.items()
+    ]
+    shown = [(loss.station, loss.image_px) for loss in every if loss.image_px is not None]
+    errors_px = [{"station": name, "rms_px": rms, "worst_px": worst} for name, (rms, worst) in shown]
+    yield Section(data={"errors": errors, "errors_px": errors_px, "warnings": list(exported.warnings)})
+    yield from (Section("error", [text]) for loss in every for text in loss_words(loss))
+    yield from (Section("warning", [text]) for text in exported.warnings)
 
 
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-class ImportArguments(Arguments):
+class ForeignArguments(Arguments):
     """A file of another program."""
 
     file: Path = argument("FILE", "of another program")
     form: str | None = option(
-        lambda: f"default: by ending and content. {listed(import_forms().values())}", "FORMAT", flags=("--from",)
+        lambda: f"default: by ending and content. {_listed(_import_forms().values())}", "FORMAT", flags=("--from",)
     )
+    options: Mapping[str, str] = options_of(lambda: _import_forms().values())
+
+
+def typed_options(args: ForeignArguments) -> dict[str, Any]:
+    """What was given of the options of the format that is named, or of any."""
+    forms = _import_forms().values()
+    return _typed(args.options, [one for one in forms if one.name == args.form] or list(forms))
+
+
+class ImportArguments(ForeignArguments):
+    """The same, and what it becomes."""
+
     output: Path = output_option("the calibration or the observations (.json; observations also .npz)")
-    options: Mapping[str, str] = options_of(lambda: import_forms().values())
 
 
 @command(
@@ -44,10 +163,7 @@ def _import(args: ImportArguments) -> Document:
     from ceres_cal.observations import Observations
 
     require_output(args.output, [args.file])
-    if args.form is not None and args.form not in import_forms():
-        raise InputError(no_such("import format", args.form, import_forms()))
-    forms = list(import_forms().values()) if args.form is None else [import_forms()[args.form]]
-    given = read_foreign(args.file, args.form, **format_options(args.options, forms))
+    given = read_foreign(args.file, args.form, **typed_options(args))
     save(args.output, given)
     path, place = str(args.output), f"written to {args.output}"
     if isinstance(given, Observations):
@@ -109,7 +225,7 @@ def _publish(args: PublishArguments) -> Document:
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
     ]
     data = {"sent": sent, "bytes": len(packet), "losses": lost}
-    return Document((Section("published", [words], data), *losses(exported)))
+    return Document((Section("published", [words], data), *_losses(exported)))
 
 
 class ListenArguments(GroupArguments):

@@ -63,7 +63,7 @@ def _run(args: TargetsArguments) -> Document:
 
 
 def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
-    from ceres_cal.report.target_picture import target_svg
+    from ceres_cal.report.target_pictures import target_svg
 
     if len(targets) > 1:
         raise InputError(f"{wanted}: it has several targets: {', '.join(targets)}: --picture draws one of them")
@@ -89,7 +89,7 @@ def _print(args: PrintArguments) -> Document:
     require_ending(args.output, "sheets are", ".pdf")
     import json
 
-    from ceres_cal.report.sheet import sheet_pdf
+    from ceres_cal.report.target_pictures import sheet_pdf
 
     targets = _targets(args.target)
     if len(targets) > 1:

@@ -250,7 +250,7 @@ def _black(size: tuple[int, int], count: int) -> str:
 
 
 def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.report.pictures.top_view import make_grid, top_view
+    from ceres_cal.report.pictures.warp import make_grid, top_view
 
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera

@@ -1,4 +1,4 @@
-"""Reading what is left over: a table, what it says of the model, the choice of lens by held-out error."""
+"""Reading what is left over: a table, what it says of the model."""
 
 from ceres_cal.diagnostics.checks import Noise as Noise
 from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE as FALSE_ALARM_RATE

@@ -18,7 +18,7 @@ from ceres_cal.base.shown import brief
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
 from ceres_cal.problem.noise import Inliers
-from ceres_cal.problem.residuals import Equations, pairs_of, plane_shift
+from ceres_cal.problem.residuals import Equations, plane_shift
 from ceres_cal.scene.camera import Camera
 
 INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3
@@ -225,20 +225,9 @@ def _mean_leverage(model: Linearised, count: int) -> Array:
 
 
 def _standardised(model: Linearised, count: int) -> Array:
-    """e' (1 - H)^-1 e as a length; 1 + H where the observation took no part."""
-    equations = model.equations
-    sign = np.where(model.used, -1.0, 1.0)
-    residual, leverage = model.weight * equations.residual, model.leverage
     answer = np.full(count, np.nan)
-    variance = np.maximum(1.0 + sign * leverage, 1e-9)
-    curves = equations.is_curve
-    answer[equations.observation[curves]] = (residual / np.sqrt(variance))[curves]
-    first, second = pairs_of(equations)
-    cross = sign[first] * model.overlap(first, second)
-    p, q = residual[first], residual[second]
-    determinant = np.maximum(variance[first] * variance[second] - cross**2, 1e-18)
-    squared = (variance[second] * p * p - 2.0 * cross * p * q + variance[first] * q * q) / determinant
-    answer[equations.observation[first]] = np.sqrt(np.maximum(squared, 0.0))
+    observation, length = model.studentised
+    answer[observation] = length
     return answer
 
 

@@ -184,15 +184,21 @@ class SparseColumns(Frozen):
         """(Q,) the same over all equations."""
         return np.asarray(self.gathered(factors, np.zeros(len(self.slots), dtype=np.int64), 1)[0])
 
+    @cached_property
+    def _matrix(self) -> Array | None:
+        """(E, Q) the same as one matrix; None where sums one by one take less time, or less memory."""
+        most, few, many = 4_000_000, 2, 30  # entries, 32 MB; times as many numbers as move an equation
+        equations, width = self.slots.shape
+        if self.size > (many if equations * self.size <= most else few) * width:
+            return None
+        at = np.arange(equations)[:, None] * (self.size + 1) + self.slots
+        whole = np.bincount(at.ravel(), self.values.ravel(), minlength=equations * (self.size + 1))
+        return np.asarray(whole.reshape(equations, -1)[:, :-1])
+
     def products(self) -> Array:
         """(Q, Q) X^T X."""
-        most = 4_000_000  # entries of a matrix that takes less time than sums one by one, and 32 MB
-        equations = len(self.slots)
-        if equations * self.size <= most:
-            whole = np.zeros((equations, self.size + 1))
-            for slots, values in zip(self.slots.T, self.values.T, strict=True):
-                whole[np.arange(equations), slots] += values
-            return np.asarray(whole[:, :-1].T @ whole[:, :-1])
+        if self._matrix is not None:
+            return np.asarray(self._matrix.T @ self._matrix)
         every = [self.gathered(self.values[:, k], self.slots[:, k], self.size + 1) for k in range(self.slots.shape[1])]
         return np.asarray(np.sum(every, axis=0)[:-1])
 
@@ -206,17 +212,19 @@ class SparseColumns(Frozen):
         parts = int(part.max()) + 1
         if not model.of_private.any():
             return np.zeros((6, parts, self.size))
+        bounds = model.equations.bounds
+        if part is model.equations.sight and (whole := self._matrix) is not None:
+            rows = list(map(slice, bounds[:-1], bounds[1:]))
+            return np.stack([model.private[own].T @ whole[own] for own in rows], axis=1)
         return np.array([self.gathered(column, part, parts) for column in model.private.T])
 
     def in_shared(self, model: Linearised) -> Array:
         """(P, Q) what the shared numbers take of them."""
-        if self.size <= 2 * self.slots.shape[1]:  # hardly more numbers than move each equation: as one matrix
-            dense = np.zeros((len(self.slots), self.size + 1))
-            dense[np.arange(len(dense))[:, None], self.slots] = self.values
-            return np.asarray(model.shared.T @ dense[:, :-1])
+        if self._matrix is not None:
+            return np.asarray(model.shared.T @ self._matrix)
         return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
 
-    def left_of(self, model: Linearised) -> tuple[Array, Array]:
-        """V (Q, Q) and u (Q,), see `effects.evidence`."""
+    def left_of(self, model: Linearised) -> tuple[Array, Array, Array]:
+        """V (Q, Q) and u (Q,), see `effects.evidence`, and what the shared numbers take (P, Q)."""
         private, shared = self.in_private(model).reshape(-1, self.size), self.in_shared(model)
-        return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over)
+        return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over), shared

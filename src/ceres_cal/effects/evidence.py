@@ -241,6 +241,7 @@ class RepeatedAmounts(Frozen):
         score: (Q,) u. information: (Q, Q) V. scores, informations: (S, Q) those of each sight by itself, or of each
             strand where there are few sights: the scores of what the best offsets leave.
         rest: squared residuals that the best offsets leave. spare: equations left over for these.
+        in_shared: (P, Q) what the shared directions take of them.
     """
 
     score: Array
@@ -249,6 +250,7 @@ class RepeatedAmounts(Frozen):
     informations: Array
     rest: float
     spare: float
+    in_shared: Array
 
     @classmethod
     def of(cls, model: Linearised, columns: SparseColumns, part: Indices | None = None) -> RepeatedAmounts:
@@ -259,7 +261,7 @@ class RepeatedAmounts(Frozen):
         """
         part = model.equations.sight if part is None else part
         parts = int(part.max()) + 1
-        information, score = columns.left_of(model)
+        information, score, in_shared = columns.left_of(model)
         ridge = _DETERMINED * float(np.max(np.diagonal(information))) * np.eye(columns.size)
         inverse = np.linalg.inv(information + ridge)
         left = np.where(model.used, model.left_over - model.left_of_column(columns.at(inverse @ score)), 0.0)
@@ -272,6 +274,7 @@ class RepeatedAmounts(Frozen):
             columns.gathered(columns.values, part, parts) - np.sum(columns.in_private(model, part) ** 2, axis=0),
             max(float(left @ left), least),
             spare,
+            in_shared,
         )
 
     @property
@@ -398,7 +401,7 @@ def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) 
     rows = np.flatnonzero((group >= 0) & model.used)
     every = SparseColumns.of_groups(model, columns, group, groups)
     there = np.flatnonzero(every.summed(every.values))
-    normal, slope = every.left_of(model)
+    normal, slope, _ = every.left_of(model)
     normal, slope = normal[np.ix_(there, there)], slope[there]
     least = 1e-5 * float(np.bincount(group[rows]).max())  # what the model leaves of directions that can be judged
     effects = RandomEffects.of(normal, slope, least)

@@ -22,7 +22,7 @@ from ceres_cal.problem.information import Information, Key, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
-from ceres_cal.problem.residuals import Equations, Residuals, of_observations
+from ceres_cal.problem.residuals import Equations, Residuals, of_observations, pairs_of
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
@@ -224,6 +224,13 @@ class Linearised(Frozen):
         """
         return np.asarray(np.sum(self.private**2, axis=1) + np.sum(self.shared**2, axis=1))
 
+    @cached_property
+    def studentised(self) -> tuple[Indices, Array]:
+        """See `studentised`: of every observation, which it is and its length."""
+        pairs = pairs_of(self.equations)
+        residual = self.weight * self.equations.residual
+        return studentised(self.equations, residual, self.used.astype(float), self.leverage, self.overlap(*pairs))
+
     def spare_of(self, rows: Mask) -> float:
         """How many of these equations (E,) are left over for the noise."""
         return float(np.sum(1.0 - self.leverage[rows]))
@@ -236,6 +243,37 @@ class Linearised(Frozen):
         """Entries of the hat matrix between pairs of equations of one sight, (N,)."""
         private = np.sum(self.private[first] * self.private[second], axis=1)
         return np.asarray(private + np.sum(self.shared[first] * self.shared[second], axis=1))
+
+
+def studentised(
+    equations: Equations, residual: Array, share: Array, leverage: Array, overlap: Array
+) -> tuple[Indices, Array]:
+    """Deleted residuals over their standard deviations: how far off each observation is where the others alone predict
+    it (Cook and Weisberg 1982, 2.2).
+
+    With M what the fit's covariance makes of its variance, and with a weight w in the fit, e' (I - w M)^-1 (I + (1 - w)
+    M)^-1 e as a length: e' (I - M)^-1 e of one that counts in full, e' (I + M)^-1 e of one that took no part.
+
+    Args:
+        residual: (E,) in standard deviations. share: (E,) w. leverage, overlap: M's diagonal (E,), and (P,) its entry
+            between the two equations of each point.
+
+    Returns:
+        (N,) the observations, and (N,) the lengths.
+    """
+    curves, (first, second) = equations.is_curve, pairs_of(equations)
+    square = leverage**2
+    square[first] += overlap**2
+    square[second] += overlap**2
+    variance = np.maximum(1.0 + (1.0 - 2.0 * share) * leverage - share * (1.0 - share) * square, 1e-9)
+    w, p, q = share[first], residual[first], residual[second]
+    cross = overlap * ((1.0 - 2.0 * w) - w * (1.0 - w) * (leverage[first] + leverage[second]))
+    determinant = np.maximum(variance[first] * variance[second] - cross**2, 1e-18)
+    squared = (variance[second] * p * p - 2.0 * cross * p * q + variance[first] * q * q) / determinant
+    return (
+        np.concatenate([equations.observation[first], equations.observation[curves]]),
+        np.concatenate([np.sqrt(np.maximum(squared, 0.0)), (residual / np.sqrt(variance))[curves]]),
+    )
 
 
 def inverse_root(normal: Array, sizes: Array, least: float) -> Array:

@@ -18,7 +18,7 @@ from ceres_cal.base.files import read_bytes
 from ceres_cal.base.threads import kept_signals
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
-from ceres_cal.formats.loss import as_foreign, field_box
+from ceres_cal.formats.loss import as_foreign
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera
 
 _MODELS = {
@@ -36,20 +36,16 @@ def _export(request: ExportRequest) -> Exported:
     with kept_signals():
         import pycolmap
 
-    box, losses, models = field_box(request.calibration.targets), [], []
+    cameras, losses = as_foreign(request, lambda _: tuple(_MODELS))
     model, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
-    first, images = request.calibration.station(request.stations[0]).cam_from_world, []
-    for number, name in enumerate(request.stations, start=1):
-        camera = request.calibration.station(name)
-        foreign, loss = as_foreign(camera, name, tuple(_MODELS), box)
-        losses.append(loss)
-        models.append(_MODELS[foreign.model])
+    first, images = cameras[0].pose, []
+    for number, (name, foreign) in enumerate(zip(request.stations, cameras, strict=True), start=1):
         model.add_camera(_camera(foreign, number))
         sensor = model.camera(number).sensor_id
         if number == 1:
             rig.add_ref_sensor(sensor)
         else:
-            rig.add_sensor(sensor, _rigid(camera.cam_from_world @ first.inverse))
+            rig.add_sensor(sensor, _rigid(foreign.pose @ first.inverse))
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)
         image.frame_id = 1
         frame.add_data_id(image.data_id)
@@ -62,7 +58,8 @@ def _export(request: ExportRequest) -> Exported:
     with tempfile.TemporaryDirectory() as folder:
         model.write_text(folder)
         content = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
-    return Exported(content, tuple(losses), f"{len(models)} cameras, {' and '.join(models)}, one rig, one frame")
+    models = " and ".join(_MODELS[one.model] for one in cameras)
+    return Exported(content, losses, f"{len(cameras)} cameras, {models}, one rig, one frame")
 
 
 def _camera(foreign: ForeignCamera, number: int) -> Any:
@@ -158,5 +155,7 @@ def _at_focal_length_1(camera: Any) -> list[float]:
     return [float(value) for value in params]
 
 
-FORMAT = ExportFormat("colmap", "COLMAP's text model: cameras, rig, frame, images", (), _export, several_stations=True)
-IMPORT = ImportFormat("colmap", "a folder with COLMAP's model", (), lambda content: not content, _read)
+FORMATS = (
+    ExportFormat("colmap", "COLMAP's text model: cameras, rig, frame, images", (), _export, several_stations=True),
+    ImportFormat("colmap", "a folder with COLMAP's model", (), lambda content: not content, _read),
+)

@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.archives import read_foreign_npz
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
-from ceres_cal.base.frozen import Frozen, field
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
 from ceres_cal.formats.opencv import parse_size
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Curves, Observations, Points, View
 from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, target_named, targets_by_name
 
 
@@ -66,13 +65,7 @@ def _read_corners(request: ImportRequest) -> Observations:
         raise InputError("two images are called alike but for their folders: import one camera at a time")
     bare = Observations.from_points(frames, board, size, camera=camera)
     level = np.concatenate([corners[np.isfinite(corners[:, 0]), 2] for corners in whole.values()])
-    return Observations(
-        bare.targets, bare.cameras, bare.views, _with_sigma(bare.points, options.sigma_px * level), bare.curves
-    )
-
-
-def _with_sigma(points: Points, sigma_px: Array) -> Points:
-    return Points(points.view, points.feature, points.pixels, sigma_px)
+    return replace(bare, points=replace(bare.points, sigma_px=options.sigma_px * level))
 
 
 # ---- named columns --------------------------------------------------------------------------------------------------
@@ -227,11 +220,7 @@ def _read_mrcal(request: ImportRequest) -> Observations:
     names = {f"camera{number}": (int(w), int(h)) for number, (w, h) in enumerate(sizes.tolist())}
     points = Points(*(np.concatenate(column) for column in (view, feature, pixels, sigma)))
     used = {name: size for name, size in names.items() if any(one.camera == name for one in views)}
-    return Observations({"board": checkerboard(columns, rows, spacing)}, used, tuple(views), points, _no_curves())
-
-
-def _no_curves() -> Curves:
-    return Curves(*_split([], 5))
+    return Observations({"board": checkerboard(columns, rows, spacing)}, used, tuple(views), points, NO_CURVES)
 
 
 def _read_colmap(request: ImportRequest) -> Observations:
@@ -250,7 +239,7 @@ def _read_colmap(request: ImportRequest) -> Observations:
         cameras[camera] = (int(image.camera.width), int(image.camera.height))
         views.append(View(image.name, camera, image.name, "target"))
         rows += [(len(views) - 1, names[point.point3D_id], point.xy - 0.5, 1.0) for point in seen]
-    return Observations({"target": target}, cameras, tuple(views), Points(*_split(rows, 4)), _no_curves())
+    return Observations({"target": target}, cameras, tuple(views), Points(*_split(rows, 4)), NO_CURVES)
 
 
 def _never(_: bytes) -> bool:

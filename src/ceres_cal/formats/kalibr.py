@@ -15,7 +15,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
-from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
 
@@ -25,13 +25,10 @@ _DISTORTIONS = {"none": 0, "radtan": 4, "equidistant": 4, "fov": 1}
 
 
 def _export(request: ExportRequest) -> Exported:
-    box, chain, losses = field_box(request.calibration.targets), {}, []
-    before = Pose.identity()
-    for number, name in enumerate(request.stations):
-        camera = request.calibration.station(name)
-        foreign, loss = as_foreign(camera, name, tuple(_MODELS), box)
-        between = camera.cam_from_world @ before.inverse
-        before = camera.cam_from_world
+    cameras, losses = as_foreign(request, lambda _: tuple(_MODELS))
+    chain, before = {}, Pose.identity()
+    for number, (name, foreign) in enumerate(zip(request.stations, cameras, strict=True)):
+        between, before = foreign.pose @ before.inverse, foreign.pose
         chain[f"cam{number}"] = {
             "camera_model": "pinhole",
             "intrinsics": [*foreign.focal, *foreign.centre],
@@ -41,11 +38,10 @@ def _export(request: ExportRequest) -> Exported:
             "resolution": list(foreign.image_size),
             "rostopic": f"/{name}",
         }
-        losses.append(loss)
     comments = [f"# {line}\n" for loss in losses for line in loss_words(loss)]
     comments.append("# T_cn_cnm1 of cam0 takes points of the field (m) to cam0, as mrcal-to-kalibr writes it\n")
     models = " and ".join(str(one["distortion_model"]) for one in chain.values())
-    return Exported(("".join(comments) + yaml_text(chain)).encode(), tuple(losses), f"{len(chain)} cameras, {models}")
+    return Exported(("".join(comments) + yaml_text(chain)).encode(), losses, f"{len(chain)} cameras, {models}")
 
 
 def _read(request: ImportRequest) -> Any:
@@ -122,7 +118,8 @@ def _distort(model: str, own: Array, bent: str, coefficients: Array) -> Callable
     return distort
 
 
-FORMAT = ExportFormat("kalibr", "Kalibr's camchain", (".yaml", ".yml"), _export, several_stations=True)
-IMPORT = ImportFormat(
-    "kalibr", "Kalibr's camchain", (".yaml", ".yml"), lambda content: b"camera_model" in content, _read
+_ABOUT = ("kalibr", "Kalibr's camchain", (".yaml", ".yml"))
+FORMATS = (
+    ExportFormat(*_ABOUT, _export, several_stations=True),
+    ImportFormat(*_ABOUT, lambda content: b"camera_model" in content, _read),
 )

@@ -152,19 +152,8 @@ def make_lookup_table(
 
 def _table(camera: Camera, station: str, step: int, x_m: Array, y_m: Array) -> LookupTable:
     x, y = (step * np.arange(-1, int(np.ceil((size - 0.5) / step)) + 1, dtype=float) for size in camera.image_size)
-    floor, slope = _rays(camera, x, y)
-    plain = LookupTable(
-        station,
-        camera.image_size,
-        step,
-        x,
-        y,
-        floor,
-        slope,
-        {},
-        camera.homography(),
-        np.array(camera.cam_from_world.rotation[:, 2]),
-    )
+    flat = camera.homography(), np.array(camera.cam_from_world.rotation[:, 2])
+    plain = LookupTable(station, camera.image_size, step, x, y, *_rays(camera, x, y), {}, *flat)
     pixels = np.column_stack([part.ravel() for part in np.meshgrid(x[:-1] + 0.5 * step, y[:-1] + 0.5 * step)])
     inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
     errors = field_error_mm(camera, plain.locate, pixels[inside], (x_m, y_m), HEIGHTS_M)
@@ -211,4 +200,4 @@ def _export(request: ExportRequest) -> Exported:
     )
 
 
-FORMAT = ExportFormat("table", "a look-up table from pixels to the field", (".npz",), _export, options=LookupOptions)
+FORMATS = (ExportFormat("table", "a look-up table from pixels to the field", (".npz",), _export, LookupOptions),)

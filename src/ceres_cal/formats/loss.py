@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import HEIGHTS_M, at_height
-from ceres_cal.formats.format import ExportLoss
+from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid
 
@@ -92,6 +92,18 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
 
 
 def as_foreign(
+    request: ExportRequest, models: Callable[[Camera], Sequence[str]]
+) -> tuple[list[ForeignCamera], tuple[ExportLoss, ...]]:
+    """The cameras of all stations that are asked for, as `nearest_foreign`, and what is lost of each."""
+    box_m, cameras = field_box(request.calibration.targets), map(request.calibration.station, request.stations)
+    every = [
+        nearest_foreign(camera, name, models(camera), box_m)
+        for name, camera in zip(request.stations, cameras, strict=True)
+    ]
+    return [foreign for foreign, _ in every], tuple(loss for _, loss in every)
+
+
+def nearest_foreign(
     camera: Camera, station: str, models: Sequence[str], box_m: Box | None
 ) -> tuple[ForeignCamera, ExportLoss]:
     """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""

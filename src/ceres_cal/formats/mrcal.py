@@ -16,7 +16,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
-from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera
 
@@ -25,20 +25,18 @@ _POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
 
 
 def _export(request: ExportRequest) -> Exported:
-    (name,) = request.stations
-    camera = request.calibration.station(name)
-    foreign, loss = as_foreign(camera, name, ("opencv5", "opencv8", "opencv12"), field_box(request.calibration.targets))
+    (name,), ((foreign,), losses) = request.stations, as_foreign(request, lambda _: ("opencv5", "opencv8", "opencv12"))
     model = f"LENSMODEL_{foreign.model.upper()}"
-    pose = camera.cam_from_world.log().tolist()
+    pose = foreign.pose.log().tolist()
     entries = {
         "lensmodel": model,
         "intrinsics": [*foreign.focal, *foreign.centre, *foreign.coefficients],
         **dict.fromkeys(reversed(_POSES), pose),
         "imagersize": list(foreign.image_size),
     }
-    lines = [f"# {line}\n" for line in (f"station {name}; reference: the field, metres", *loss_words(loss))]
+    lines = [f"# {line}\n" for line in (f"station {name}; reference: the field, metres", *loss_words(*losses))]
     body = "".join(f"    '{key}': {value!r},\n" for key, value in entries.items())
-    return Exported(("".join(lines) + "{\n" + body + "}\n").encode(), (loss,), f"{model}, pose")
+    return Exported(("".join(lines) + "{\n" + body + "}\n").encode(), losses, f"{model}, pose")
 
 
 def literal_of(content: bytes) -> dict[str, Any]:
@@ -81,5 +79,5 @@ def _pose(data: Mapping[str, Any]) -> Pose:
     return Pose.exp(given[0])
 
 
-FORMAT = ExportFormat("mrcal", "mrcal's .cameramodel", (".cameramodel",), _export)
-IMPORT = ImportFormat("mrcal", "mrcal's .cameramodel", (".cameramodel",), lambda _: True, _read)
+_ABOUT = ("mrcal", "mrcal's .cameramodel", (".cameramodel",))
+FORMATS = ExportFormat(*_ABOUT, _export), ImportFormat(*_ABOUT, lambda _: True, _read)

@@ -24,7 +24,7 @@ from ceres_cal.formats.format import (
     ImportFormat,
     ImportRequest,
 )
-from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.scene.camera import LARGEST
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid, opencv_models
 
@@ -42,13 +42,7 @@ def _export(request: ExportRequest) -> Exported:
 
     if len(request.stations) > 2:
         raise InputError(f"OpenCV's files hold one camera or two, not {len(request.stations)}: name the stations")
-    box = field_box(request.calibration.targets)
-    cameras, losses = [], []
-    for name in request.stations:
-        camera = request.calibration.station(name)
-        foreign, loss = as_foreign(camera, name, opencv_models(camera), box)
-        cameras.append(foreign)
-        losses.append(loss)
+    cameras, losses = as_foreign(request, opencv_models)
     entries = _mono(cameras[0], losses[0]) if len(cameras) == 1 else _stereo(cameras)
     storage = cv2.FileStorage(request.ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for key, value in {"stations": " ".join(request.stations), **entries}.items():
@@ -59,7 +53,7 @@ def _export(request: ExportRequest) -> Exported:
     models_used = " and ".join(camera.model for camera in cameras)
     named = zip(request.stations, cameras, strict=True)
     warnings = [f"station {name!r}: {text}" for name, camera in named for text in _reader_traps(camera)]
-    return Exported(content.encode(), tuple(losses), f"K, {models_used}, pose", {}, tuple(warnings))
+    return Exported(content.encode(), losses, f"K, {models_used}, pose", {}, tuple(warnings))
 
 
 def _reader_traps(camera: ForeignCamera) -> list[str]:
@@ -81,8 +75,7 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
 
 def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:
     """K, coefficients (1, N) and the pose (1, 6): rvec, tvec."""
-    pose = camera.cam_from_world or Pose.identity()
-    return camera.matrix, np.array([camera.coefficients]), pose.log()[None]
+    return camera.matrix, np.array([camera.coefficients]), camera.pose.log()[None]
 
 
 def _common(camera: ForeignCamera) -> dict[str, Any]:
@@ -107,8 +100,7 @@ def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
     for number, camera in enumerate(cameras, start=1):
         matrix, coefficients, pose = _numbers(camera)
         entries |= {f"M{number}": matrix, f"D{number}": coefficients, f"extrinsic_parameters{number}": pose}
-    one, other = (camera.cam_from_world or Pose.identity() for camera in cameras)
-    between = other @ one.inverse
+    between = second.pose @ first.pose.inverse
     turn, shift = between.rotation, between.translation[:, None]
     given = (entries["M1"], entries["D1"].T, entries["M2"], entries["D2"].T, first.image_size, turn, shift)
     rectified: Any = cv2.fisheye.stereoRectify(*given, flags=0) if first.model == FISHEYE else cv2.stereoRectify(*given)
@@ -152,7 +144,7 @@ def _read(request: ImportRequest) -> Any:
         stations = stations if len(stations) == 2 else ["left", "right"]
         cameras = {name: _camera(storage, request, str(n)) for n, name in enumerate(stations, start=1)}
         if cameras[stations[1]].cam_from_world is None:
-            first = cameras[stations[0]].cam_from_world or Pose.identity()
+            first = cameras[stations[0]].pose
             between = Pose(_mat(storage, ("R",), (3, 3)), _mat(storage, ("T",), (3, 1)).ravel())
             cameras[stations[1]] = replace(cameras[stations[1]], cam_from_world=between @ first)
         return ImportedCameras(cameras).calibration("OpenCV")
@@ -168,12 +160,8 @@ def _camera(storage: Any, request: ImportRequest, number: str) -> ForeignCamera:
     if poses.shape == (1, 6):  # of several, each is of one view of a board
         pose = Pose.exp(poses[0])
         pose = pose if np.any(poses) else None
-    camera = ForeignCamera.opencv(_size(storage, request), matrix, coefficients, pose)
-    if _text(storage, "distortion_model") == FISHEYE:
-        if len(coefficients) != 4:
-            raise InputError(f"a fisheye has 4 coefficients, not {len(coefficients)}")
-        return replace(camera, model=FISHEYE, coefficients=tuple(coefficients.tolist()))
-    return camera
+    fisheye = _text(storage, "distortion_model") == FISHEYE
+    return ForeignCamera.opencv(_size(storage, request), matrix, coefficients, pose, fisheye=fisheye)
 
 
 def _size(storage: Any, request: ImportRequest) -> tuple[int, int]:
@@ -236,7 +224,8 @@ def _recognises(content: bytes) -> bool:
     return b"opencv-matrix" in content or b"opencv_storage" in content
 
 
-FORMAT = ExportFormat(
-    "opencv", "OpenCV's FileStorage of one camera, or of two as stereo", _ENDINGS, _export, several_stations=True
+_WRITTEN = "OpenCV's FileStorage of one camera, or of two as stereo"
+FORMATS = (
+    ExportFormat("opencv", _WRITTEN, _ENDINGS, _export, several_stations=True),
+    ImportFormat("opencv", "OpenCV's FileStorage", _ENDINGS, _recognises, _read, OpenCvOptions),
 )
-IMPORT = ImportFormat("opencv", "OpenCV's FileStorage", _ENDINGS, _recognises, _read, OpenCvOptions)

@@ -70,5 +70,7 @@ def _read(request: ImportRequest) -> Any:
     return ImportedCameras({request.path.stem: camera}).calibration("the paper's numbers")
 
 
-FORMAT = ExportFormat("paper", "the paper's a1, a2, a3, K, H, R, t and angles as text", (".txt",), _export)
-IMPORT = ImportFormat("paper", "the paper's numbers as text", (".txt",), lambda content: b"a1 =" in content, _read)
+FORMATS = (
+    ExportFormat("paper", "the paper's a1, a2, a3, K, H, R, t and angles as text", (".txt",), _export),
+    ImportFormat("paper", "the paper's numbers as text", (".txt",), lambda content: b"a1 =" in content, _read),
+)

@@ -18,36 +18,11 @@ if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.observations import Observations
 
-EXPORT_FORMATS: dict[str, ExportFormat] = {
-    form.name: form
-    for form in (
-        lookup.FORMAT,
-        ssl_geometry.PACKET,
-        ssl_geometry.GEOMETRY_YML,
-        ssl_settings.FORMAT,
-        opencv.FORMAT,
-        ros.FORMAT,
-        kalibr.FORMAT,
-        mrcal.FORMAT,
-        colmap.FORMAT,
-        paper.FORMAT,
-    )
-}
-IMPORT_FORMATS: dict[str, ImportFormat] = {
-    form.name: form
-    for form in (
-        ssl_geometry.IMPORT_PACKET,
-        ssl_geometry.IMPORT_YML,
-        ssl_settings.IMPORT,
-        opencv.IMPORT,
-        ros.IMPORT,
-        kalibr.IMPORT,
-        mrcal.IMPORT,
-        colmap.IMPORT,
-        paper.IMPORT,
-        *detections.FORMATS,
-    )
-}
+_MODULES = (lookup, ssl_geometry, ssl_settings, opencv, ros, kalibr, mrcal, colmap, paper, detections)
+_EVERY: list[ExportFormat | ImportFormat] = [form for module in _MODULES for form in module.FORMATS]
+EXPORT_FORMATS = {form.name: form for form in _EVERY if isinstance(form, ExportFormat)}
+IMPORT_FORMATS = {form.name: form for form in _EVERY if isinstance(form, ImportFormat)}
+"""By their names; those that are read, in the order in which a file is asked whether it is one."""
 
 
 def export_format(name: str) -> ExportFormat:

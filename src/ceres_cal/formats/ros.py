@@ -13,10 +13,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.transforms import Pose, quaternion, rotation_of
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
-from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
 
@@ -30,11 +30,9 @@ class RosOptions(Frozen, eq=True):
 
 
 def _export(request: ExportRequest) -> Exported:
-    (name,) = request.stations
-    camera = request.calibration.station(name)
-    foreign, loss = as_foreign(camera, name, tuple(_MODELS), field_box(request.calibration.targets))
+    (name,), ((foreign,), losses) = request.stations, as_foreign(request, lambda _: tuple(_MODELS))
     projection = np.column_stack([foreign.matrix, np.zeros(3)])
-    (width, height), pose = foreign.image_size, camera.cam_from_world.inverse
+    (width, height), pose = foreign.image_size, foreign.pose.inverse
     frames = {"frame_id": request.options.world_frame, "child_frame_id": f"{name}_optical_frame"}
     x, y, z = pose.translation.tolist()
     qx, qy, qz, qw = quaternion(pose.rotation).tolist()
@@ -48,13 +46,12 @@ def _export(request: ExportRequest) -> Exported:
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(projection),
         "static_transform": frames | {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
-        "loss": "; ".join(loss_words(loss)),
+        "loss": "; ".join(loss_words(*losses)),
     }
     words = f"{_MODELS[foreign.model]}, and the pose as static_transform, whose names are static_transform_publisher's"
     warnings = ["equidistant is unknown to installations before 2021"] if foreign.model == FISHEYE else []
-    return Exported(
-        yaml_text(data).encode(), (loss,), words, {"static_transform": data["static_transform"]}, (*warnings,)
-    )
+    facts = {"static_transform": data["static_transform"]}
+    return Exported(yaml_text(data).encode(), losses, words, facts, (*warnings,))
 
 
 def _matrix(values: Array) -> dict[str, Any]:
@@ -73,11 +70,8 @@ def _read(request: ImportRequest) -> Any:
     model = data.get("distortion_model", "plumb_bob")
     if model not in _MODELS.values():
         raise InputError(f"distortion_model {model!r} is unknown: one of {', '.join(_MODELS.values())}")
-    camera = ForeignCamera.opencv((sizes[0] or 0, sizes[1] or 0), matrix, coefficients, _pose(data))
-    if model == "equidistant":
-        if len(coefficients) != 4:
-            raise InputError(f"equidistant has 4 coefficients, not {len(coefficients)}")
-        camera = replace(camera, model=FISHEYE, coefficients=tuple(coefficients.tolist()))
+    size, fisheye = (sizes[0] or 0, sizes[1] or 0), model == _MODELS[FISHEYE]
+    camera = ForeignCamera.opencv(size, matrix, coefficients, _pose(data), fisheye=fisheye)
     name = str(data.get("camera_name") or "camera")
     return ImportedCameras({name: camera}).calibration("a ROS camera_info")
 
@@ -98,8 +92,11 @@ def _pose(data: Mapping[str, Any]) -> Pose | None:
     return Pose(rotation_of(values[3:]), values[:3]).inverse
 
 
-FORMAT = ExportFormat("ros", "ROS camera_info, the pose beside it", (".yaml", ".yml"), _export, RosOptions)
-IMPORT = ImportFormat(
-    "ros", "ROS camera_info", (".yaml", ".yml"), lambda content: b"distortion_model" in content and b"cols" in content
-    and b"opencv-matrix" not in content, _read
-)  # fmt: skip
+def _recognises(content: bytes) -> bool:
+    return b"distortion_model" in content and b"cols" in content and b"opencv-matrix" not in content
+
+
+FORMATS = (
+    ExportFormat("ros", "ROS camera_info, the pose beside it", (".yaml", ".yml"), _export, RosOptions),
+    ImportFormat("ros", "ROS camera_info", (".yaml", ".yml"), _recognises, _read),
+)

@@ -7,7 +7,7 @@ height would trade off.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import ExportLoss, ExportRequest
-from ceres_cal.formats.loss import Box, as_foreign, camera_loss, field_pixels
+from ceres_cal.formats.loss import Box, camera_loss, field_pixels, nearest_foreign
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene.camera import LARGEST, Camera
 from ceres_cal.scene.foreign import opencv_models
@@ -82,7 +82,7 @@ def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]
     worst = max((worst for _, worst in loss.field_mm.values()), default=0.0)
     if not worst > much_mm:
         return []
-    other = as_foreign(camera, loss.station, opencv_models(camera), box_m)[1]
+    other = nearest_foreign(camera, loss.station, opencv_models(camera), box_m)[1]
     left = max(worst for _, worst in other.field_mm.values())
     return [
         f"one coefficient does not hold this lens, {worst:.3g} mm are lost at most: to lose less, read --to opencv "
@@ -153,6 +153,17 @@ def to_entry(camera: Camera, number: int) -> dict[str, Any]:
 def _single(value: float) -> float:
     """A number as float32 holds it, with no more digits than that takes."""
     return float(str(np.float32(value)))
+
+
+def to_cameras(entries: Iterable[Mapping[str, Any]], image_size: str) -> tuple[dict[str, Camera], list[str]]:
+    """The cameras of SSL_GeometryCameraCalibrations by name, and what to know of those who read them."""
+    cameras, warnings = {}, []
+    for entry in entries:
+        name = f"camera{entry['camera_id']}"
+        cameras[name] = to_camera(entry, image_size)
+        cameras[name].require_monotone(name)
+        warnings += [f"camera {name!r}: {text}" for text in reader_traps(entry)]
+    return cameras, warnings
 
 
 def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:

@@ -13,12 +13,10 @@ from ceres_cal.base.errors import InputError, attempt
 from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import field_box
-from ceres_cal.formats.ssl_cameras import SslOptions, as_before, reader_traps, to_camera, to_entries
+from ceres_cal.formats.ssl_cameras import SslOptions, as_before, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import geometry_from_bytes, to_bytes
 from ceres_cal.formats.yaml_files import read_yaml, yaml_text
-
-_YAML = (".yml", ".yaml")
 
 
 def geometry_of(request: ExportRequest, before: Mapping[str, Any]) -> tuple[dict[str, Any], Exported]:
@@ -105,12 +103,7 @@ def read_geometry(content: bytes) -> dict[str, Any]:
 
 def _read(request: ImportRequest) -> Any:
     data = read_geometry(request.content)
-    cameras, warnings = {}, []
-    for entry in data.get("calib", []):
-        name = f"camera{entry['camera_id']}"
-        cameras[name] = to_camera(entry, request.options.image_size)
-        cameras[name].require_monotone(name)
-        warnings += [f"camera {name!r}: {text}" for text in reader_traps(entry)]
+    cameras, warnings = to_cameras(data.get("calib", []), request.options.image_size)
     if not cameras:
         raise InputError("it holds no calibrated camera, only a field: `ceres-cal targets import` takes that")
     warnings.append(
@@ -119,35 +112,19 @@ def _read(request: ImportRequest) -> Any:
     return ImportedCameras(cameras, {"field": target_of(data["field"])}, warnings).calibration("an SSL geometry")
 
 
-def _recognises_yaml(content: bytes) -> bool:
-    return b"field_length" in content
-
-
 def _recognises_packet(content: bytes) -> bool:
     return isinstance(attempt(lambda: geometry_from_bytes(content)), dict)  # quiet: which format it is, is asked
 
 
-PACKET = ExportFormat(
-    "ssl-vision",
-    "the league's geometry message (SSL_GeometryData, protobuf); a file that is there is edited",
-    (".pb", ".bin"),
-    _export_packet,
-    SslOptions,
-    several_stations=True,
-    edits=True,
-)
-GEOMETRY_YML = ExportFormat(
-    "vision-processor",
-    "vision-processor's geometry.yml; a file that is there is edited",
-    _YAML,
-    _export_yaml,
-    SslOptions,
-    several_stations=True,
-    edits=True,
-)
-IMPORT_PACKET = ImportFormat(
-    "ssl-vision", "the league's geometry message", (".pb", ".bin"), _recognises_packet, _read, SslReadOptions
-)
-IMPORT_YML = ImportFormat(
-    "vision-processor", "vision-processor's geometry.yml", _YAML, _recognises_yaml, _read, SslReadOptions
+_NAME, _YAML_NAME, _ENDINGS, _YAML = "ssl-vision", "vision-processor", (".pb", ".bin"), (".yml", ".yaml")
+_PACKET, _GEOMETRY_YML = "the league's geometry message", "vision-processor's geometry.yml"
+_EDITED = "; a file that is there is edited"
+_WRITTEN = f"{_PACKET} (SSL_GeometryData, protobuf){_EDITED}"
+FORMATS = (
+    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export_packet, SslOptions, several_stations=True, edits=True),
+    ExportFormat(
+        _YAML_NAME, _GEOMETRY_YML + _EDITED, _YAML, _export_yaml, SslOptions, several_stations=True, edits=True
+    ),
+    ImportFormat(_NAME, _PACKET, _ENDINGS, _recognises_packet, _read, SslReadOptions),
+    ImportFormat(_YAML_NAME, _GEOMETRY_YML, _YAML, lambda content: b"field_length" in content, _read, SslReadOptions),
 )

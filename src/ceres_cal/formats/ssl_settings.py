@@ -16,7 +16,7 @@ from msgspec import Struct
 from ceres_cal.base.errors import InputError
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import field_box
-from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, reader_traps, to_camera, to_entries
+from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import SslReadOptions
 from ceres_cal.scene.camera import LARGEST
@@ -174,15 +174,14 @@ def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -
 
 def _read(request: ImportRequest) -> Any:
     values = _values(request.content)
-    cameras, warnings = {}, []
-    for number, there in sorted(_cameras(values).items()):
-        name = f"camera{number}"
+    every = sorted(_cameras(values).items())
+    cameras, warnings = to_cameras((_entry(*one) for one in every), request.options.image_size)
+    for number, there in every:
         if _OPENCV in there and there[_OPENCV].text == "true":
-            warnings.append(f"camera {name!r}: ssl-vision's OpenCV mode is on, which ignores all distortion when it "
-                            "locates: what was read are the numbers of its own model")  # fmt: skip
-        cameras[name] = to_camera(_entry(number, there), request.options.image_size)
-        cameras[name].require_monotone(name)
-        warnings += [f"camera {name!r}: {text}" for text in reader_traps(_entry(number, there))]
+            warnings.append(
+                f"camera 'camera{number}': ssl-vision's OpenCV mode is on, which ignores all distortion when it "
+                "locates: what was read are the numbers of its own model"
+            )
     return ImportedCameras(cameras, {"field": settings_target(values)}, warnings).calibration("ssl-vision's settings")
 
 
@@ -233,20 +232,9 @@ def _shape(group: Mapping[str, _Var]) -> dict[str, Any]:
         raise InputError(f"a line or arc of the field lacks {missing}") from None
 
 
-FORMAT = ExportFormat(
-    "ssl-vision-xml",
-    "ssl-vision's robocup-ssl.xml, edited in place",
-    (".xml",),
-    _export,
-    SslOptions,
-    several_stations=True,
-    edits=True,
-)
-IMPORT = ImportFormat(
-    "ssl-vision-xml",
-    "ssl-vision's robocup-ssl.xml",
-    (".xml",),
-    lambda content: b"<VarXML" in content,
-    _read,
-    SslReadOptions,
+_NAME, _FILE, _ENDINGS = "ssl-vision-xml", "ssl-vision's robocup-ssl.xml", (".xml",)
+_WRITTEN = f"{_FILE}, edited in place"
+FORMATS = (
+    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export, SslOptions, several_stations=True, edits=True),
+    ImportFormat(_NAME, _FILE, _ENDINGS, lambda content: b"<VarXML" in content, _read, SslReadOptions),
 )

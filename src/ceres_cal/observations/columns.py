@@ -215,14 +215,8 @@ def read_rows(rows: AnyArray | FileRows) -> AnyArray:
     return rows.read() if isinstance(rows, FileRows) else rows
 
 
-class Alone(Frozen):
-    """A single column."""
-
-    values: AnyArray
-
-
 def in_blocks(columns: C) -> Iterator[tuple[int, C]]:
-    """The columns block by block, each in memory, with the number of its first row: at least one."""
+    """The columns, or a single one, block by block, each in memory, with the number of its first row: at least one."""
     return (_block(columns, number) for number in range(_blocks(columns)))
 
 
@@ -237,12 +231,14 @@ def each_block(function: Callable[[int, C], T], columns: C) -> list[T]:
     return list(chain.from_iterable(run_parts(part, parts)))
 
 
-def _blocks(columns: object) -> int:
-    return max(-(-len(next(iter(vars(columns).values()))) // _BLOCK), 1)
+def _blocks(columns: Any) -> int:
+    return max(-(-len(columns) // _BLOCK), 1)
 
 
-def _block(columns: C, number: int) -> tuple[int, C]:
+def _block(columns: Any, number: int) -> tuple[int, Any]:
     first, stop = number * _BLOCK, (number + 1) * _BLOCK
+    if isinstance(columns, np.ndarray):
+        return first, read_rows(rows_of(columns, first, stop))
     rows = {name: read_rows(rows_of(array, first, stop)) for name, array in vars(columns).items()}
     return first, type(columns)(**rows)
 

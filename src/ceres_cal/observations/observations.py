@@ -13,15 +13,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.arrays import Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.frozen import cached_property, replace
-from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.columns import (
-    Alone,
     Columns,
     Curves,
     Prior,
@@ -32,15 +29,15 @@ from ceres_cal.observations.columns import (
     taken,
     view_label,
 )
-from ceres_cal.observations.files import Content, header_of, read_content, write_content
-from ceres_cal.observations.from_points import gathered_curves, gathered_points
+from ceres_cal.observations.files import header_of, read_content, write_content
+from ceres_cal.observations.from_points import FromArrays
 from ceres_cal.observations.validation import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.scene.targets import Target
 
 _NAMES = attrgetter("camera", "station", "target", "placement")
 
 
-class Observations(Content):
+class Observations(FromArrays):
     """Everything that was observed.
 
     Attributes:
@@ -92,59 +89,6 @@ class Observations(Content):
             )
         return combine([self, other])
 
-    @classmethod
-    @checked
-    def from_points(
-        cls,
-        pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
-        points: Target | ArrayLike,
-        image_size: tuple[int, int],
-        *,
-        camera: str = "camera",
-        sigma_px: float = 1.0,
-        moves: bool | None = None,
-    ) -> Observations:
-        """Observations of points of one target by one camera, in one frame or in many.
-
-        Args:
-            pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
-                of the points, NaN where it was not seen.
-            points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
-            image_size: (width, height) px. sigma_px: standard deviation of each coordinate.
-            moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
-                are the world.
-
-        Raises:
-            InputError: shapes or counts that do not fit; naming the frame.
-        """
-        return cls(**vars(gathered_points(pixels, points, image_size, camera, sigma_px, moves)))
-
-    @classmethod
-    @checked
-    def from_curves(
-        cls,
-        pixels: Mapping[str, ArrayLike],
-        target: Target,
-        image_size: tuple[int, int],
-        *,
-        camera: str = "camera",
-        frame: str = "0",
-        sigma_px: float = 1.0,
-        side: str = "centre",
-    ) -> Observations:
-        """Observations of painted lines and arcs of one target in one frame of one camera.
-
-        Args:
-            pixels: name of each line -> pixels (N, 2) that lie on it, anywhere along it, such as
-                `{"HalfwayLine": [[640.1, 92.4], [641.0, 180.2]]}`.
-            image_size: (width, height) px. sigma_px: standard deviation of the distance to the line.
-            side: "centre" of the paint, or its "left" or "right" edge, as seen along the line.
-
-        Raises:
-            InputError: a line that the target does not have, or a shape that does not fit; naming the line.
-        """
-        return cls(**vars(gathered_curves(pixels, target, image_size, camera, frame, sigma_px, side)))
-
     # ---- files --------------------------------------------------------------------------------------------------
 
     @classmethod
@@ -170,8 +114,8 @@ class Observations(Content):
         content = hashlib.sha256(msgspec.json.encode(header))
         for column in (self.points, self.curves):
             for name in vars(column):  # the whole of a column before the next
-                for _, block in in_blocks(Alone(getattr(column, name))):
-                    content.update(np.ascontiguousarray(block.values).data)
+                for _, block in in_blocks(getattr(column, name)):
+                    content.update(np.ascontiguousarray(block).data)
         return content.hexdigest()
 
     @cached_property
@@ -179,7 +123,7 @@ class Observations(Content):
         """(V + 1,) where the points of each view begin, and where its curve observations do."""
         counts = np.zeros((2, len(self.views)), dtype=np.int64)
         for own, column in zip(counts, (self.points, self.curves), strict=True):
-            for first, some in each_block(_counted, Alone(column.view)):
+            for first, some in each_block(_counted, column.view):
                 own[first : first + len(some)] += some
         ends = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
         return ends[0], ends[1]
@@ -342,10 +286,10 @@ class Observations(Content):
             raise InputError(f"a prior: {no_such('curve', prior.curve, self.targets[prior.name].curves)}")
 
 
-def _counted(_: int, block: Alone) -> tuple[int, Indices]:
+def _counted(_: int, views: Indices32) -> tuple[int, Indices]:
     """The first view of a block in the order of its views, and how many rows it and each one behind it has."""
-    first = int(block.values[0]) if len(block.values) else 0
-    return first, np.bincount(block.values - first)
+    first = int(views[0]) if len(views) else 0
+    return first, np.bincount(views - first)
 
 
 def combine(parts: Sequence[Observations]) -> Observations:

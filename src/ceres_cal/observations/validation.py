@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ceres_cal.base.arrays import Array, Indices, Mask, median
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.observations.columns import Alone, Columns, Curves, Points, View, each_block, view_label
+from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, view_label
 from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
@@ -40,7 +40,7 @@ _SIGMA_RATIO = 1e4
 def require_alike(content: Content) -> None:
     """Raise InputError where a sigma is so far from the others that its observation, or they, decide nothing."""
     columns = {"point": content.points, "curve": content.curves}
-    ends = [end for column in columns.values() for end in each_block(_extremes, Alone(column.sigma_px))]
+    ends = [end for column in columns.values() for end in each_block(_extremes, column.sigma_px)]
     if max(high for _, high in ends) <= _SIGMA_RATIO * min(low for low, _ in ends):
         return
     sigmas = np.concatenate([column.sigma_px for column in columns.values()])
@@ -54,9 +54,9 @@ def require_alike(content: Content) -> None:
     )
 
 
-def _extremes(_: int, block: Alone) -> tuple[float, float]:
+def _extremes(_: int, block: Array) -> tuple[float, float]:
     """The smallest and the largest of a block."""
-    return (float(block.values.min()), float(block.values.max())) if len(block.values) else (np.inf, 0.0)
+    return (float(block.min()), float(block.max())) if len(block) else (np.inf, 0.0)
 
 
 def stray_pixels(content: Content) -> tuple[str, ...]:
@@ -100,11 +100,11 @@ def _all_inside(content: Content) -> bool:
     """Whether no pixel lies outside the smallest image."""
     ends = _end(np.min(list(content.cameras.values()), axis=0))
 
-    def inside(_: int, block: Alone) -> bool:
-        each = zip(block.values.T, ends, strict=True)
-        return not len(block.values) or all(own.min() >= -_MARGIN_PX and own.max() <= end for own, end in each)
+    def inside(_: int, pixels: Array) -> bool:
+        each = zip(pixels.T, ends, strict=True)
+        return not len(pixels) or all(own.min() >= -_MARGIN_PX and own.max() <= end for own, end in each)
 
-    return all(all(each_block(inside, Alone(column.pixels))) for column in (content.points, content.curves))
+    return all(all(each_block(inside, column.pixels)) for column in (content.points, content.curves))
 
 
 def _end(size: Sequence[int] | Array) -> Array:

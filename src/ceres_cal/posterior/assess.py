@@ -195,12 +195,10 @@ def with_roughness(posterior: Posterior, end: RobustSolution, observations: Obse
     """Wider by what the lens leaves in the same places of all views; one with a formula in views of placements."""
     from ceres_cal.posterior.other_lenses import LeftOver, of_placements, shifts_by_roughness
 
-    every, placed = end.problem.sights, of_placements(end.problem.sights)
-    asks = alike = bool(len(placed)) and LeftOver.of_end(end, placed).asks_for_more
-    if end.problem.options.blank_lens.roughness and len(placed) < len(every):
-        asks = LeftOver.of_end(end, every).asks_for_more
-    wider = posterior.widened(*shifts_by_roughness(end, observations)) if asks else posterior
-    return replace(wider, left_alike=alike)
+    rough, every = bool(end.problem.options.blank_lens.roughness), end.problem.sights
+    asked = every if rough else of_placements(every)
+    asks = bool(len(asked)) and LeftOver.of_end(end, asked).asks_for_more
+    return posterior.widened(*shifts_by_roughness(end, observations)) if asks else posterior
 
 
 def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:

@@ -70,7 +70,8 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
         """The mixture; InputError where its numbers do not fit each other, or those known."""
         where = f"posterior.mixtures.{name}"
         require_keys(self.keys, known, where)
-        free = [key for key in self.keys if key not in set(self.held)]
+        held = set(self.held)
+        free = [key for key in self.keys if key not in held]
         every = [information_from(row, free, f"{where}.information") for row in self.information]
         require_alike(where, self.keys, self.steps, (self.weights, self.at))
         if not all(0 <= number < len(every) for number in self.at) or not self.weights:

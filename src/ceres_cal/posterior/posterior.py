@@ -40,7 +40,6 @@ class Posterior(Frozen):
         stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
         by_model: what the model alone says of the shared numbers, were every error independent of the others; None
             where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
-        left_alike: whether the lens leaves the same in views of different placements; files do not say.
     """
 
     information: Information
@@ -51,7 +50,6 @@ class Posterior(Frozen):
     dependence: Dependence | None = None
     stated: Information = field(default_factory=Information.nothing)
     lenses: tuple[Estimate, ...] = ()
-    left_alike: bool = False
 
     __repr__ = brief
 

@@ -138,7 +138,8 @@ class Information(Frozen):
 
     def marginal(self, keys: Sequence[Key]) -> Information:
         """About some of the numbers, all others integrated out: the Schur complement."""
-        rest = [key for key in self.keys if key not in set(keys)]
+        wanted = set(keys)
+        rest = [key for key in self.keys if key not in wanted]
         if not rest:
             return self.given(keys)
         at, others = self.columns(keys), self.columns(rest)

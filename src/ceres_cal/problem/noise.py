@@ -62,6 +62,7 @@ class Inliers(Frozen):
         point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
             cannot show the observation.
         degrees_of_freedom: spare equations that the scales rest on; infinite where they are the stated ones.
+        bound: standard deviations from which on an observation is an outlier.
     """
 
     points: Mask
@@ -71,6 +72,7 @@ class Inliers(Frozen):
     point_sigmas: Array
     curve_sigmas: Array
     degrees_of_freedom: float = np.inf
+    bound: float = np.inf
 
     def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
         """Whether nothing worth another solve changed: scales by no more than `relative`, and rows by none, or by a few
@@ -97,13 +99,13 @@ class Inliers(Frozen):
         """Of these lengths at a noise."""
         p, c = noise.bounds
         scales, relative = (noise.points, noise.curves), (points / noise.points, curves / noise.curves)
-        return cls(points <= p, curves <= c, *scales, *relative, noise.degrees_of_freedom)
+        return cls(points <= p, curves <= c, *scales, *relative, noise.degrees_of_freedom, noise.reject_sigma)
 
     def of_rows(self, points: Indices, curves: Indices) -> Inliers:
         """Those of some of the observations, as if there were no others."""
         sigmas = self.point_sigmas[points], self.curve_sigmas[curves]
         both = Inliers(self.points[points], self.curves[curves], self.point_scale, self.curve_scale, *sigmas)
-        return replace(both, degrees_of_freedom=self.degrees_of_freedom)
+        return replace(both, degrees_of_freedom=self.degrees_of_freedom, bound=self.bound)
 
     def weighting(self, options: Options) -> Weighting:
         """Of the observations at these noise scales."""
@@ -113,6 +115,15 @@ class Inliers(Frozen):
     def rows(self) -> Mask:
         """(N + M,) which observations take part, points by row and then curves by row."""
         return np.concatenate([self.points, self.curves])
+
+    @property
+    def sigmas(self) -> Array:
+        """(N + M,) how many standard deviations each residual is long."""
+        return np.concatenate([self.point_sigmas, self.curve_sigmas])
+
+    def with_rows(self, rows: Mask) -> Inliers:
+        """The same with other observations (N + M,) taking part."""
+        return replace(self, points=rows[: len(self.points)], curves=rows[len(self.points) :])
 
     @property
     def scales(self) -> tuple[float, float]:

@@ -33,11 +33,12 @@ class Eliminated(Frozen):
     """Private placements of one station: their own information, and how they follow the shared numbers.
 
     Attributes:
-        names: (S). own: (S, 6, 6) information about each with everything shared held; inverses: (S, 6, 6) of that,
-            over what is known.
+        station: its name. names: (S). own: (S, 6, 6) information about each with everything shared held; inverses:
+            (S, 6, 6) of that, over what is known.
         gains: (S, 6, K); a step d of the shared numbers `keys` (K) takes each placement along by -gains d.
     """
 
+    station: str
     names: tuple[str, ...]
     own: Array
     inverses: Array
@@ -225,7 +226,9 @@ class _InformationSums:
         self._matrices[:, lead[:, None], lead] += reduced
         own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
         names = tuple(str(key.placement) for key in sights.keys)
-        return Eliminated(names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station])))
+        return Eliminated(
+            key.station, names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station]))
+        )
 
     def _add_reduced(self, sums: Array, normals: dict[int, Array], covariance: Array, follows: Array) -> None:
         """V^T N V of each kind, with V how a sight's numbers follow the shared ones, added to the sums (2, K, K).
@@ -247,8 +250,12 @@ class _InformationSums:
     def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
         steps, everywhere = steps_of(key, pose, self._estimate, self._columns)
+        own = len(steps) - 6  # which are shared themselves; the pose's steps follow
+        chain = steps[own:, own:]
         for kind, normal in normals.items():
-            self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
+            along = np.hstack([normal[:, :own], normal[:, own:] @ chain])
+            whole = np.vstack([along[:own], chain.T @ along[own:]])
+            self._matrices[kind][np.ix_(everywhere, everywhere)] += whole
 
 
 def _limits(own: Array) -> Array:

@@ -7,15 +7,17 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, plural, powered, sentence, short
+from ceres_cal.base.words import chance, counted, fixed, grouped, mm, plural, powered, sentence, short
+from ceres_cal.calibration import LensChoice
+from ceres_cal.calibration.lens_forms import label_of
 from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable
-from ceres_cal.diagnostics.held_out import Choice
 from ceres_cal.diagnostics.summaries import Summary
+from ceres_cal.problem.parameters import Options
 from ceres_cal.report.document import Card, Chapter, Piece, Section, Table, Text, wrapped
 from ceres_cal.report.grounds import is_against
+from ceres_cal.report.numbers import lens_choice
 
 _MOST_CARDS, _MOST_ROWS = 8, 8
-_CHOSEN_BY = "the simplest within 1.75 standard errors of the least error; radial 2,3 wins ties"
 _MODEL_ERROR = (
     "the model is wrong by more than its noise: no covariance or standard deviation of this calibration includes that "
     "error"
@@ -25,7 +27,7 @@ _NEW_DATA = (
 )
 
 
-def diagnosis_sections(diagnosis: Diagnosis, choice: Choice | None) -> Iterator[Section]:
+def diagnosis_sections(diagnosis: Diagnosis, choice: LensChoice | None, options: Options) -> Iterator[Section]:
     """The verdict, the findings by size, then tables; everything but the table of single observations."""
     summaries = diagnosis.summaries
     own = ("model_error", "conflicts", "new_data", "tests", "false_alarm_rate", "findings")
@@ -35,7 +37,7 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: Choice | None) -> Iterator[
     for number, finding in enumerate(diagnosis.findings, start=1):
         yield Section(f"finding {number}", _finding(finding))
     yield _noise(diagnosis.noise)
-    yield _held_out(choice) if choice is not None else Section(data={"held_out": None})
+    yield _held_out(choice, options) if choice is not None else Section(data={"held_out": None})
     yield _outliers(diagnosis.table)
     for title, name in (("frames", "frames"), ("features", "features"), ("radius", "radii"), ("regions", "regions")):
         one = getattr(summaries, name)
@@ -43,7 +45,7 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: Choice | None) -> Iterator[
     yield Section("leverage", _leverage(diagnosis.table), {"radius_trend": summaries.trends})
 
 
-def chapter(diagnosis: Diagnosis, choice: Choice | None) -> Chapter:
+def chapter(diagnosis: Diagnosis, choice: LensChoice | None, options: Options) -> Chapter:
     """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
     alternatives = counted(diagnosis.tests, "alternative")
@@ -57,7 +59,7 @@ def chapter(diagnosis: Diagnosis, choice: Choice | None) -> Chapter:
     else:
         pieces.append(Text(f"Nothing was found: the residuals look like noise. {tested}"))
     pieces += _noise(diagnosis.noise).pieces
-    pieces += () if choice is None else _held_out(choice).pieces
+    pieces += () if choice is None else _held_out(choice, options).pieces
     return Chapter("findings", "What the residuals say", tuple(pieces))
 
 
@@ -139,28 +141,13 @@ def _outliers(table: ResidualTable) -> Section:
     return Section("outliers", lines, {"rejected": rejected})
 
 
-def _held_out(choice: Choice) -> Section:
-    """Which lens predicts parts that it was not fitted to best."""
-    chosen, current, best = (choice.candidates[i].label for i in (choice.chosen, choice.current, choice.best))
-    take = "the calibration's lens is the one to take" if choice.chosen == choice.current else f"take {chosen}"
-    rows = []
-    for number, one in enumerate(choice.candidates):
-        kinds = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
-        marks = ", ".join(word for word, index in kinds if index == number)
-        if one.failed_folds:
-            marks = f"{marks} without {plural(one.failed_folds, 'part')} that failed".strip()
-        cells = (fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), marks)
-        rows.append((one.label, *((DASH, DASH, DASH, one.failed) if one.failed else cells)))
-    thinned = f"on {100.0 * choice.thinned:.0f} % of the observations" if choice.thinned < 1.0 else ""
-    parts = max(one.folds for one in choice.candidates)
-    rule = f"{parts} parts of the frames; chosen: {_CHOSEN_BY}"
-    head = ("lens", "held-out px", "mm", "fit px", "")
-    table = Table(head, tuple(rows), "Frames held out: how well others predict them", stacked=True)
-    lines = [*table.lines(), f"{rule}; {thinned}" if thinned else rule, take]
-    text = f"{sentence(take)}: {_CHOSEN_BY}." + (f" {sentence(thinned)}." if thinned else "")
-    labels = {"best": best, "chosen": chosen, "current": current}
-    data = {"candidates": choice.candidates, **labels, "share_of_observations": choice.thinned}
-    return Section("held out", lines, {"held_out": data}, (table, Text(text)))
+def _held_out(choice: LensChoice, options: Options) -> Section:
+    """Which lens predicts parts that it was not fitted to best, and whether the calibration has it."""
+    current = label_of(options)
+    take = "the calibration's lens is the one to take" if choice.chosen == current else f"take {choice.chosen}"
+    (table,) = lens_choice(choice).pieces
+    data = {**vars(choice), "current": current}
+    return Section("held out", [*wrapped(choice.words), take], {"held_out": data}, (table, Text(f"{sentence(take)}.")))
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------

@@ -12,10 +12,9 @@ from msgspec import Struct
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, attempt
 from ceres_cal.base.frozen import cached_property, replace
-from ceres_cal.calibration import Calibration
+from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis
-from ceres_cal.diagnostics.held_out import Choice
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.problem.residuals import residuals
@@ -57,7 +56,7 @@ class Material(Quality):
     """
 
     diagnosis: Diagnosis
-    choice: Choice | None = None
+    choice: LensChoice | None = None
     photographs: FramePhotographs | None = None
 
     @cached_property

@@ -50,7 +50,7 @@ def number_sections(quality: Quality) -> Iterator[Section]:
     calibration = quality.calibration
     yield _fit(calibration)
     if calibration.lens_choice is not None:
-        yield _lens_choice(calibration.lens_choice)
+        yield lens_choice(calibration.lens_choice)
     yield from (_camera(quality, name) for name in calibration.cameras)
     yield from (_station(quality, name) for name in calibration.stations)
     if calibration.estimate.structure.dimensions:
@@ -130,7 +130,7 @@ def warnings(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _lens_choice(choice: LensChoice) -> Section:
+def lens_choice(choice: LensChoice) -> Section:
     """What was chosen, over what, by how much."""
     rows = []
     for one in choice.tried:

@@ -9,9 +9,8 @@ from ceres_cal.base.files import write_bytes
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import counted, first_of
-from ceres_cal.calibration import Calibration
+from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.diagnostics.held_out import Choice
 from ceres_cal.observations import Observations
 from ceres_cal.report import findings
 from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Piece, Text
@@ -40,7 +39,7 @@ def make_report(
     calibration: Calibration,
     observations: Observations,
     diagnosis: Diagnosis | None = None,
-    choice: Choice | None = None,
+    choice: LensChoice | None = None,
     photographs: FramePhotographs | None = None,
     progress: StepProgress | None = None,
 ) -> str:
@@ -71,7 +70,7 @@ def write_report(
     calibration: Calibration,
     observations: Observations,
     diagnosis: Diagnosis | None = None,
-    choice: Choice | None = None,
+    choice: LensChoice | None = None,
     photographs: FramePhotographs | None = None,
 ) -> None:
     """Write `make_report`'s page.
@@ -90,7 +89,7 @@ def _chapters(material: Material) -> Iterator[Chapter]:
         yield in_photographs(material, material.photographs)
     supported = tuple(support(material, name) for name in list(material.observations.cameras)[:MOST_CAMERAS])
     yield Chapter("support", "What was observed", (Gallery(supported),))
-    yield findings.chapter(material.diagnosis, material.choice)
+    yield findings.chapter(material.diagnosis, material.choice, material.calibration.options)
     yield numbers_chapter(material, material.seams)
     yield from _pictures(material)
 

@@ -143,7 +143,7 @@ class _Amounts(Frozen):
         each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
         priors = {number: prior for number, prior in each if prior is not None}
         sizes = repeated.sizes(numbers, priors)
-        taken = -model.root @ every.in_shared(model)
+        taken = -model.root @ repeated.in_shared
         return cls(
             case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers], solves and not few
         )

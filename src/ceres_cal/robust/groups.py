@@ -349,7 +349,7 @@ def excess(groups: ObservationGroups, end: RobustSolution, taking_part: Mask) ->
     """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
     median one.
     """
-    lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
+    lengths = end.inliers.sigmas
     points, size = len(groups.observations.points), groups.size + 1
     of = np.where(end.inliers.rows & taking_part & (groups.of >= 0), groups.of, np.int64(groups.size))
     spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)

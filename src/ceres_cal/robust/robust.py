@@ -24,6 +24,7 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, residuals_alone
+from ceres_cal.robust.deleted import Fitted, by_deleted_residuals
 from ceres_cal.robust.other_minima import with_lost_boards_posed, without_mirrored_poses
 
 MOST_ROUNDS = 15
@@ -301,7 +302,10 @@ class _RowRounds(Rounds[RobustSolution]):
         points, curves = reduced.leverages
         taken = points + self._problem.taken_up, curves
         self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
-        return self._judge(state.solution, state.residuals), reduced
+        inliers, rows = self._judge(state.solution, state.residuals), state.inliers.rows
+        estimate, there = state.solution.estimate, state.residuals
+        fitted = Fitted(self._problem, self._observations, estimate, there, rows, reduced)
+        return by_deleted_residuals(inliers, fitted), reduced
 
     def _judged(
         self, solution: Solution, before: Residuals, rounds: int, inliers: Inliers | None = None

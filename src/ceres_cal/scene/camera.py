@@ -269,10 +269,8 @@ class Camera(Frozen, eq=True):
         vectors = (numbers_in(one, name).ravel() for one, name in ((rvec, "rvec"), (tvec, "tvec")))
         given = numbers_in(distortion, "distortion").ravel()
         pose = Pose.exp(np.concatenate([*vectors]))
-        foreign = others.ForeignCamera.opencv(size_in(image_size), numbers_in(matrix, "matrix"), given, pose)
-        if fisheye:
-            foreign = replace(foreign, model=others.FISHEYE, coefficients=tuple(given.tolist()))
-        camera: Camera = foreign.camera()[0]
+        size, k = size_in(image_size), numbers_in(matrix, "matrix")
+        camera: Camera = others.ForeignCamera.opencv(size, k, given, pose, fisheye=fisheye).camera()[0]
         return camera
 
 

@@ -77,9 +77,15 @@ class ForeignCamera(Frozen):
 
     @classmethod
     def opencv(
-        cls, image_size: Sequence[int], matrix: ArrayLike, coefficients: ArrayLike, pose: Pose | None = None
+        cls,
+        image_size: Sequence[int],
+        matrix: ArrayLike,
+        coefficients: ArrayLike,
+        pose: Pose | None = None,
+        *,
+        fisheye: bool = False,
     ) -> ForeignCamera:
-        """Of OpenCV's K (3, 3) and coefficients: 0, 1, 4, 5, 8, 12 or 14 of them.
+        """Of OpenCV's K (3, 3) and coefficients: 0, 1, 4, 5, 8, 12 or 14 of them, or the four of its fisheye.
 
         Raises:
             InputError: another number of coefficients, a skew, or a sensor that is tilted in its camera.
@@ -87,21 +93,18 @@ class ForeignCamera(Frozen):
         k, values = np.asarray(matrix, dtype=float), np.asarray(coefficients, dtype=float).ravel()
         if k.shape != (3, 3) or abs(k[0, 1]) > 1e-9 * abs(k[0, 0]) or np.any(k[2] != (0.0, 0.0, 1.0)):
             raise InputError(f"the camera matrix must be (fx 0 cx; 0 fy cy; 0 0 1), not {k.tolist()}")
+        if fisheye and len(values) != 4:
+            raise InputError(f"a fisheye has 4 coefficients, not {len(values)}")
         if len(values) not in (0, 4, 5, 8, 12, 14):
             raise InputError(f"OpenCV's models have 4, 5, 8, 12 or 14 coefficients, not {len(values)}")
         if np.any(values[12:]):
             raise InputError("a sensor that is tilted in its camera (coefficients 13 and 14) cannot be read here")
-        values = values[: 12 if np.any(values[8:]) else 8 if np.any(values[5:]) else 5]
-        values = np.concatenate([values, np.zeros(max(0, 5 - len(values)))])
-        width, height = (int(s) for s in image_size)
-        return cls(
-            (width, height),
-            (float(k[0, 0]), float(k[1, 1])),
-            (float(k[0, 2]), float(k[1, 2])),
-            f"opencv{len(values)}",
-            tuple(values.tolist()),
-            pose,
-        )
+        if not fisheye:
+            values = values[: 12 if np.any(values[8:]) else 8 if np.any(values[5:]) else 5]
+            values = np.concatenate([values, np.zeros(max(0, 5 - len(values)))])
+        model = FISHEYE if fisheye else f"opencv{len(values)}"
+        (width, height), focal, centre = image_size, np.diag(k)[:2], k[:2, 2]
+        return cls((int(width), int(height)), _two(focal), _two(centre), model, tuple(values.tolist()), pose)
 
     @classmethod
     def of(cls, camera: Camera, *models: str) -> ForeignCamera:
@@ -121,6 +124,11 @@ class ForeignCamera(Frozen):
         known = np.isfinite(rays[:, 0])
         fits = [cls.fitted(blank, rays[known], pixels[known]) for blank in blanks]
         return min(fits, key=lambda fit: fit.error_px[0])
+
+    @property
+    def pose(self) -> Pose:
+        """The pose; the identity where the file has none."""
+        return self.cam_from_world or Pose.identity()
 
     @property
     def matrix(self) -> Array:
@@ -186,7 +194,7 @@ class ForeignCamera(Frozen):
         Raises:
             InputError: it shows nothing of its image.
         """
-        pose, lens, (fx, fy) = self.cam_from_world or Pose.identity(), self.lens, self.focal
+        pose, lens, (fx, fy) = self.pose, self.lens, self.focal
         if lens is not None:
             return Camera(self.image_size, fx, self.centre, lens, fy / fx, pose), (0.0, 0.0)
         width, height = self.image_size

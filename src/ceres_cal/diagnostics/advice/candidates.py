@@ -111,7 +111,8 @@ class Ground(Frozen):
         stated = (stated_prior(prior, lenses[estimate.stations[prior.name].camera]) for prior in measurement.priors)
         priors = (*stated, *tolerances(estimate.structure, self.keys))
         problem = Problem(gather_sights(observations, predicted=True), layout, priors, self.weighting)
-        return information(problem, estimate).shared.marginal(self.keys)
+        told = information(problem, estimate)  # without how smooth a lens is, which is known already
+        return (told.points + told.curves + told.stated + told.built).marginal(self.keys)
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
         """The estimate with what the measurement brings along; of the placements those that are still free."""
@@ -179,7 +180,7 @@ class CandidateSearch(Frozen):
         taken: list[Measurement] = []
         total = Information.nothing(self.ground.keys)
         while left and len(taken) < max(counts):
-            errors = [self.outlook.after(total + one) for one in informations]
+            errors = self.outlook.after_each(total, informations)
             number = choose(left, np.array([e.worst_mm for e in errors]))
             total = total + informations.pop(number)
             taken.append(left.pop(number))

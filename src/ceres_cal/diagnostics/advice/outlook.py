@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.spread import Spread
+from ceres_cal.base.spread import Spread, thin_root
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
@@ -70,6 +70,29 @@ class Outlook(Frozen):
         bent = self.valley is not None and self._phi_sd(self.estimate, known) > BENT
         return self.shrunk(added) if bent else _errors(known, self.slopes)
 
+    def after_each(self, known: Information, informations: Sequence[Information]) -> list[Errors]:
+        """The errors with each of some informations added, beside what is known by then of all numbers (`known`).
+
+        A measurement tells of few directions: with R its root and C the covariance before it, places of slopes J lose J
+        C R^T (1 + R C R^T)^-1 R C J^T.
+        """
+        whole = self.posterior.information + known
+        spread = whole.spread
+        if self.valley is not None or spread.unknown.shape[1]:
+            return [self.after(known + one) for one in informations]
+        slopes = np.zeros((*self.slopes.shape[:2], len(whole.keys)))
+        slopes[:, :, whole.columns(self.keys)] = self.slopes
+        along = np.tensordot(slopes, spread.covariance, axes=1)
+        variances = np.sum(along * slopes, axis=(1, 2))
+
+        def after(added: Information) -> Errors:
+            root = thin_root(added.matrix, spread.sd)
+            half = np.linalg.inv(np.linalg.cholesky(np.eye(len(root)) + root @ spread.covariance @ root.T))
+            taken = np.sum((along @ (half @ root).T) ** 2, axis=(1, 2))
+            return _errors_of(variances - taken)
+
+        return list(map(after, informations))
+
     def shrunk(self, added: Information) -> Errors:
         """Today's errors, smaller as those of the quadratic picture get smaller with information added."""
         today = Information.nothing(added.keys)
@@ -87,7 +110,8 @@ class Outlook(Frozen):
 
     def _known(self, added: Information) -> Spread:
         """What is known of the K numbers with information added."""
-        others = [key for key in added.keys if key not in set(self.keys)]
+        own = set(self.keys)
+        others = [key for key in added.keys if key not in own]
         if not np.any(added.matrix[added.columns(others)]):  # nothing of what is integrated out: do that once
             return (self._own + added.given(self.keys)).spread
         whole = self.posterior.information + added
@@ -143,7 +167,12 @@ def _part(known: Spread, at: Indices) -> Spread:
 
 def _errors(known: Spread, slopes: Array) -> Errors:
     """The errors of places with slopes (N, 2, K) by numbers of which so much is known."""
-    sd = 1e3 * np.sqrt(np.trace(known.through(slopes), axis1=1, axis2=2))
+    return _errors_of(np.trace(known.through(slopes), axis1=1, axis2=2))
+
+
+def _errors_of(variances: Array) -> Errors:
+    """The errors of places whose x and y have variances (N,) together, m^2."""
+    sd = 1e3 * np.sqrt(variances)
     return Errors(float(np.max(sd)), float(np.mean(sd)))
 
 

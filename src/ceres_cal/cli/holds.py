@@ -1,0 +1,370 @@
+"""Does a calibration hold? `ceres-cal check`, `score`, `audit` and `compare`: it is held against new observations, or
+against another calibration; exit code 0 yes, 1 no, so that cron may ask.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import HEIGHTS_M, at_height, fixed
+from ceres_cal.cli import arguments
+from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, option, switch
+from ceres_cal.cli.files import (
+    read_calibration,
+    read_observations,
+    require_different,
+    require_ending,
+    require_output,
+    save,
+)
+from ceres_cal.cli.foreign import ForeignArguments, typed_options
+from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section, wrapped
+
+if TYPE_CHECKING:
+    from ceres_cal.base.arrays import Array
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.detect.photographs import KnownDetections
+    from ceres_cal.moves.agreement import Agreement, Agreements
+
+
+def _share(text: str) -> float:
+    where = f"--false-alarms {text!r}"
+    value = arguments.parse_number(text.rstrip("%"), where) / (100.0 if text.endswith("%") else 1.0)
+    if not 0.0 < value < 1.0:
+        raise InputError(f"{where}: give a share between 0 and 1, such as 0.01")
+    return value
+
+
+class CheckArguments(InputArguments):
+    """What is held against a calibration, and how sure the answer is to be."""
+
+    false_alarms: float = option(
+        "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
+    )
+    checks: int = option(
+        "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
+        "N",
+        1,
+        read=arguments.whole(1),
+    )
+
+
+@command(
+    "check",
+    "does a calibration still hold? exit code 0 yes, 1 no",
+    "calibration.json now.png",
+    "calibration.json incoming/ --checks 720 --json",
+)
+def _check(args: CheckArguments) -> Document:
+    images = photographs_in(args)
+    detections = None
+    if images:
+        answer, detections = _photographed(args, images)
+    else:
+        from ceres_cal.moves.checks import check
+
+        answer = check(
+            read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
+        )
+    often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
+    rate = f"({100.0 * args.false_alarms:g} % false alarms{often})"
+    holds = f"{'yes' if answer.holds else 'no'} {rate}"
+    headline = f"The calibration {'holds' if answer.holds else 'no longer holds'} {rate}."
+    stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
+    stations = map(_checked_station, answer.values())
+    return Document((Section("check", [holds], stated), shown(detections), *stations), answer.exit_code, headline)
+
+
+def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Agreements, KnownDetections]:
+    from ceres_cal.detect.photographs import check_photographs
+
+    calibration, not_painted = read_calibration(args.calibration), arguments.parse_names(args.not_painted)
+    with progress_bar(args) as bar:
+        return check_photographs(
+            calibration,
+            images,
+            args.station,
+            args.false_alarms,
+            checks=args.checks,
+            not_painted=not_painted,
+            progress=bar.update,
+        )
+
+
+def _checked_station(one: Agreement) -> Section:
+    lines, change, misfit = [f"{one.name} {one.words}"], one.change, one.misfit
+    used, noise = misfit.points + misfit.curves, misfit.noise[0]
+    data = {name: getattr(one, name) for name in ("holds", "probability", "statistic", "degrees", "words")}
+    data |= {"station": one.name, "used": used, "outliers": misfit.outliers, "noise": noise}
+    sizes: dict[str, float | None] = dict.fromkeys(("moved_mm", "turned_deg", "phi_change", "shift_px"))
+    maps: list[tuple[float, float | None, float | None]] = [(height_m, None, None) for height_m in HEIGHTS_M]
+    if change is not None:
+        phi_change = change.phi_px[1] / change.phi_px[0] - 1.0
+        sizes |= {"moved_mm": change.moved_mm, "turned_deg": change.turned_deg}
+        sizes |= {"phi_change": phi_change, "shift_px": change.shift_px}
+        picture = f"picture {change.shift_px:.3g} px rms, " if math.isfinite(change.shift_px) else ""
+        size = f"{picture}phi {100.0 * phi_change:+.3f} %"
+        maps = [(over.height_m, over.mean_mm, over.worst_mm) for over in change.maps]
+        lines += [
+            f"{used} observations, {misfit.outliers} outliers, noise {noise:.2f} times as before",
+            f"moved {change.moved_mm:.3g} mm, turned {change.turned_deg:.3g} deg, {size}",
+            *(
+                f"map {at_height(h)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
+                for h, mean, worst in maps
+                if mean == mean
+            ),
+        ]
+    shifts = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, mean, worst in maps]
+    return Section("station", lines, {"stations": {one.name: {**data, **sizes, "shift_mm": shifts}}})
+
+
+# ---- how well new boards or fields are predicted, poses alone at their best ------------------------------------------
+
+
+class ScoreArguments(Arguments):
+    """A calibration, new observations, and how they are weighed."""
+
+    calibration: Path = arguments.calibration_argument()
+    observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together")
+    hold_stations: bool = switch(
+        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too"
+    )
+    loss: arguments.Loss | None = option("default: the calibration's")
+    reject_sigma: float | None = option(
+        "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
+        "trivial the rms is the one that other programs state",
+        "SIGMA",
+    )
+
+
+@command(
+    "score",
+    "how well a calibration predicts new boards or fields: intrinsics held",
+    "calibration.json new.json",
+    "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf",
+)
+def _score(args: ScoreArguments) -> Document:
+    require_different(args.observations)
+    from ceres_cal.base.frozen import replace
+    from ceres_cal.moves.scores import score
+
+    calibration = read_calibration(args.calibration)
+    asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
+    options = replace(calibration.options, **asked)
+    observations = read_observations(args.observations)
+    return _scored(score(calibration, observations, options=options, hold_stations=args.hold_stations), calibration)
+
+
+def _scored(answer: Agreements, before: Calibration) -> Document:
+    most_views = 3  # shown
+    cameras = list(answer.values())
+    views = sorted((view for one in cameras for view in one.views), key=lambda view: -view.misfit.all_rms_px)
+    posed = cameras[0].solution
+    assert posed is not None
+    ratios = dict(zip(("points", "curves"), cameras[0].misfit.noise, strict=True))
+    known = [f"noise of {kind} {ratio:.2f} times the calibration's" for kind, ratio in ratios.items() if ratio == ratio]
+    numbers = {
+        "fit": posed.fit,
+        "rms_px": posed.fit.rms_px,
+        "calibration_rms_px": before.fit.rms_px,
+        "noise_ratios": ratios,
+    }
+    worst = [f"{one.name}: {_left(one)}" for one in views[:most_views]]
+    parts = {"cameras": list(map(_misfit_data, cameras)), "views": list(map(_misfit_data, views))}
+    return Document(
+        (
+            Section("score", ["intrinsics held, poses alone solved for", *known], numbers),
+            *(Section("camera", [f"{one.name}: {_left(one)}"]) for one in cameras),
+            Section("worst", worst, parts),
+        )
+    )
+
+
+def _misfit_data(one: Agreement) -> dict[str, Any]:
+    return {"name": one.name, **{name: value for name, value in vars(one.misfit).items() if name != "noise"}}
+
+
+def _left(one: Agreement) -> str:
+    left = one.misfit
+    kinds = [
+        f"rms {rms:.4f} px over {count} {kind}"
+        for kind, count, rms in (
+            ("points", left.points, left.points_rms_px),
+            ("curve observations", left.curves, left.curves_rms_px),
+        )
+        if count
+    ]
+    out = f"; {left.outliers} taken out, {left.all_rms_px:.4f} px with them" if left.outliers else ""
+    return ", ".join(kinds or ["nothing took part"]) + out
+
+
+# ---- may the calibration of another program be trusted ---------------------------------------------------------------
+
+
+class AuditArguments(ForeignArguments):
+    """A calibration, and what is held against it."""
+
+    file: Path = argument("FILE", "a calibration of ours or of another program")
+    observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True)
+
+
+@command(
+    "audit",
+    "may another program's calibration be trusted? exit code 0 yes, 1 no",
+    "opencv.yml --observations field.json",
+    "geometry.yml --observations field.json --observations more.json",
+)
+def _audit(args: AuditArguments) -> Document:
+    from ceres_cal.base.files import read_bytes
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.formats import import_calibration
+    from ceres_cal.moves.audits import audit
+
+    ours = (
+        args.form is None and args.file.suffix == ".json" and b"ceres-cal/calibration" in read_bytes(args.file)[:4096]
+    )
+    given = Calibration.load(args.file) if ours else import_calibration(args.file, args.form, **typed_options(args))
+    stations = audit(given, read_observations(args.observations))
+    return Document(
+        (
+            Section(
+                "audit",
+                ["yes" if stations.holds else "no"],
+                {"trusted": stations.holds, "warnings": list(given.warnings)},
+            ),
+            *map(_audited_station, stations.values()),
+            *(Section("warning", wrapped(text)) for text in given.warnings),
+        ),
+        stations.exit_code,
+    )
+
+
+def _audited_station(one: Agreement) -> Section:
+    from ceres_cal.moves.audits import excess_px
+
+    assert one.solution is not None and one.change is not None
+    camera, maps = one.solution.station(), one.change.maps
+    off_px, noise_px = excess_px(one)
+    known_mm = {} if one.solution.posterior is None else {over.height_m: over.known_mm for over in maps}
+    known = ", ".join(f"{sd:.2g} mm at {1e3 * h:.0f} mm" for h, sd in known_mm.items())
+    ours = f"ours: {camera!r}" + (f", known to {known}" if known else "")
+    off = f"its picture is off by {off_px:.3f} px rms beyond the noise of {noise_px:.3f} px"
+    data: dict[str, Any] = {"trusted": one.holds, "cause": one.cause, "words": one.words}
+    data |= {"off_px": off_px, "noise_px": noise_px, "posed": not one.pose_free}
+    data["off_mm"] = [{"height_m": over.height_m, "rms_mm": over.rms_mm, "worst_mm": over.most_mm} for over in maps]
+    data["known_mm"] = [{"height_m": h, "sd_mm": sd} for h, sd in known_mm.items()]
+    data["ours"] = {"phi_px": camera.phi, "lens": camera.lens.kind, "rms_px": one.solution.rms_px}
+    return Section("station", wrapped(f"{one.name} {one.words}", off, ours), {"stations": {one.name: data}})
+
+
+# ---- where two calibrations differ, on the field in mm or over the image in px ---------------------------------------
+
+
+class CompareArguments(Arguments):
+    """Two calibrations, and where to compare them."""
+
+    a: Path = argument("A", "one calibration")
+    b: Path = argument("B", "the other")
+    height_mm: float | None = arguments.height_option("of the map above the floor; default: 0")
+    station: str | None = arguments.station_option("only this one; default: all that both have")
+    picture: Path | None = option("draw the map there (of one station)", "SVG")
+    over_image: bool = switch("intrinsics, over the image in px; default where there is no field")
+    without_turn: bool = switch("the same without the turn that brings them nearest to each other")
+
+
+@command(
+    "compare",
+    "where two calibrations differ, on the field in mm or over the image in px",
+    "old.json new.json --height-mm 150",
+    "old.json new.json --over-image --without-turn",
+)
+def _compare(args: CompareArguments) -> Document:
+    require_output(args.picture, [args.a, args.b])
+    require_ending(args.picture, "pictures are", ".svg")
+    first, second = read_calibration(args.a), read_calibration(args.b)
+    if args.over_image or args.without_turn or all(target.movable for target in first.targets.values()):
+        return _over_image(args, first, second)
+    return _over_field(args, first, second)
+
+
+def _over_image(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
+    if args.picture is not None or args.station is not None:
+        raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
+    from ceres_cal.moves.comparisons import compare_cameras
+
+    comparisons = compare_cameras(first, second, without_turn=args.without_turn)
+    return Document(tuple(section for one in comparisons.values() for section in _compared_camera(one)))
+
+
+def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
+    from ceres_cal.moves.comparisons import compare
+
+    comparisons = compare(first, second, arguments.metres(args.height_mm), args.station)
+    if args.picture is not None:
+        if len(comparisons) > 1:
+            names = " or ".join(comparisons)
+            raise InputError(f"--picture shows one station: name it with --station {names}")
+        from ceres_cal.report.maps import comparison_svg
+
+        save(args.picture, comparison_svg(next(iter(comparisons.values())), first).encode())
+    return Document(tuple(section for one in comparisons.values() for section in _compared_station(one)))
+
+
+def _compared_station(one: Agreement) -> Iterator[Section]:
+    assert one.change is not None
+    change, (over,) = one.change, one.change.maps
+    before, after = change.phi_px
+    size = f"{over.mean_mm:.2f} mm on average, {over.worst_mm:.2f} mm at most"
+    data = {name: getattr(over, name) for name in ("height_m", "x_m", "y_m", "difference_mm", "expected_mm")}
+    data |= {name: getattr(change, name) for name in ("moved_mm", "turned_deg", "phi_px")}
+    data |= {"mean_mm": over.mean_mm, "worst_mm": over.worst_mm, **_tested(one)}
+    moved = f"moved {change.moved_mm:.2f} mm, turned {change.turned_deg:.4f} deg"
+    yield Section("station", [one.name], {"stations": {one.name: data}})
+    yield Section("camera", [f"{moved}, phi {before:.3f} -> {after:.3f} px"])
+    yield Section("map", [f"{size}, {1e3 * over.height_m:.0f} mm above the floor", _explained(one)])
+    yield _table("mm at y \\ x", over.errors_mm[::-1], over.x_m, over.y_m[::-1], "{:.2f} m")
+
+
+def _compared_camera(one: Agreement) -> Iterator[Section]:
+    import numpy as np
+
+    assert one.image is not None
+    over = one.image
+    pixels, angles = over.errors_px[np.isfinite(over.errors_px)], over.angles_deg[np.isfinite(over.angles_deg)]
+    turned = f", {over.turn_deg:.4f} deg of turn taken out" if over.turn_deg else ""
+    title = f"{one.name}, phi {over.phi_px[0]:.3f} -> {over.phi_px[1]:.3f} px{turned}"
+    yield Section("camera", [title], {"cameras": {one.name: {**vars(over), **_tested(one)}}})
+    lines = [
+        f"{np.mean(pixels):.3f} px on average, {np.max(pixels):.3f} px at most",
+        f"{np.mean(angles):.4f} deg on average, {np.max(angles):.4f} deg at most, between directions",
+        _explained(one),
+    ]
+    yield Section("image", lines)
+    yield _table("px at y \\ x", over.errors_px, over.x_px, over.y_px, "{:.0f} px")
+
+
+def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
+    table_size = 9, 7
+    from ceres_cal.report.maps import grid_table
+
+    table = grid_table(head, values, x, y, place, table_size, partial(fixed, places=2))
+    return Section("", table.lines(), pieces=(table,))
+
+
+def _tested(one: Agreement) -> dict[str, Any]:
+    return {"probability": one.probability, "explained_by_uncertainty": one.holds}
+
+
+def _explained(one: Agreement) -> str:
+    return {
+        True: f"explained by their uncertainties (probability {one.probability:.2g})",
+        False: f"more than their uncertainties explain (probability {one.probability:.1g})",
+        None: "no statement on uncertainty: one of the calibrations does not have it",
+    }[one.holds]
