@@ -176,7 +176,7 @@ class Candidate(Frozen):
 MOST_ROUNDS = 8  # of a robust solve
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
-KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
+_KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
 
 
 class FewGroupsError(DegenerateError):
@@ -271,18 +271,18 @@ class InlierRows(Frozen):
     def reached(self, candidate: Candidate) -> Estimate | None:
         """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
         points, curves = self.in_sigmas(candidate.estimate)
-        if np.sum(points**2) + curves @ curves <= KEPT * candidate.least:
+        if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
             return candidate.estimate
         options = candidate.form.of(self.options, max_iterations=_MOST_STEPS)
         problem = self._problem(options, candidate.estimate)
         solution = solve(problem, candidate.estimate, precision=_PRECISION)
-        return solution.estimate if 2.0 * solution.cost <= KEPT * candidate.least else None
+        return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
 
-    def solved_near(self, candidate: Candidate, kept: float = np.inf) -> Estimate:
+    def solved_near(self, candidate: Candidate, *, as_promised: bool = False) -> Estimate:
         """Where a lens is at its best, solved for from where the normal equations have it.
 
         Args:
-            kept: times the squares that these promise; what leaves more is no answer.
+            as_promised: whether what leaves more than these promise is no answer.
 
         Raises:
             CalibrationError: it cannot be solved for.
@@ -295,7 +295,7 @@ class InlierRows(Frozen):
         solution = solve(problem, near, precision=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
-        if 2.0 * solution.cost > kept * candidate.least:
+        if as_promised and 2.0 * solution.cost > _KEPT * candidate.least:
             raise DegenerateError("is not at its best where normal equations have it")
         return solution.estimate
 
