@@ -138,7 +138,9 @@ def test_a_stated_length_that_everything_else_contradicts_is_named() -> None:
 
 
 def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
-    """Lines aside by 4 mm of a field 12 mm longer and 9 mm narrower: errors are 3.0 of what is stated by its drawing, .58 so."""
+    """Lines aside by 4 mm of a field 12 mm longer and 9 mm narrower: errors are 3.0 of what is stated by its drawing,
+    .58 so.
+    """
     rng = np.random.default_rng(0)
     painted = ssl_field("B", field_length_m=9.012, field_width_m=5.991)
     straight = {name: line for name, line in painted.curves.items() if isinstance(line, Segment)}
