@@ -1,4 +1,4 @@
-"""Principal points that move from view to view: found by themselves, named, and what is stated holds beside them."""
+"""Principal points that move from view to view, and a rolling shutter: found, named, and what is stated holds."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.observations import Observations
-from ceres_cal.robust.unsteady import KIND
+from ceres_cal.robust.unsteady import MOVES, ROLLING
 
 VIEWS, MOVED_PX = 14, 12.0
 
@@ -22,6 +22,15 @@ def shifted(seed: int, sigma_px: float) -> Observations:
     points = observations.points
     moved = np.random.default_rng(seed).normal(0.0, sigma_px, (len(observations.views), 2))
     return replace(observations, points=replace(points, pixels=points.pixels + moved[points.view]))
+
+
+def rolling(seed: int, sigma_px: float) -> Observations:
+    """Views that move by so much, anew in each, while their rows are read out from the first to the last."""
+    _, observations = observed(Board(views=VIEWS), seed)
+    points, (_, height) = observations.points, observations.cameras["camera"]
+    moved = np.random.default_rng(100 + seed).normal(0.0, sigma_px, (len(observations.views), 2))[points.view]
+    pixels = points.pixels + moved * (points.pixels[:, 1:] / height - 0.5)
+    return replace(observations, points=replace(points, pixels=pixels))
 
 
 def phi_off(calibration: Calibration) -> float:
@@ -38,12 +47,12 @@ def moving() -> list[tuple[Observations, Calibration]]:
 def test_a_steady_camera_is_left_alone() -> None:
     for seed in range(4):
         calibration = calibrate(shifted(seed, 0.0))
-        assert not [one for one in calibration.effects if one.kind == KIND]  # none of 40
+        assert not {one.kind for one in calibration.effects} & {MOVES, ROLLING}  # none of 40
 
 
 def test_principal_points_that_move_are_found_and_named(moving: list[tuple[Observations, Calibration]]) -> None:
     for _, calibration in moving:
-        (found,) = [one for one in calibration.effects if one.kind == KIND]
+        (found,) = [one for one in calibration.effects if one.kind == MOVES]
         assert found.subject == "camera"
         assert 0.5 < found.sigma / MOVED_PX < 1.6  # 0.78 to 1.01 measured; 11 of 12 scenes are found
         assert any("principal point moves" in warning for warning in calibration.warnings)
@@ -67,3 +76,12 @@ def test_a_saved_calibration_is_diagnosed_beside_them(
     assert not [one for one in diagnosis.findings if one.is_model_error]
     (noise,) = diagnosis.noise
     assert noise.sigma_px == pytest.approx(0.3, rel=0.1)  # the simulation's: 0.292 measured
+
+
+def test_a_rolling_shutter_is_found_and_named() -> None:
+    for seed in (1, 4):
+        calibration = calibrate(rolling(seed, 30.0))
+        (found,) = [one for one in calibration.effects if one.kind == ROLLING]  # 7 of 8 scenes are, one as a lens's
+        assert "rolling shutter" in found.sentence
+        assert calibration.fit.point_scale < 1.2  # of the noise alone: 0.98 measured; 2.1 before it is taken off
+        assert abs(phi_off(calibration)) < 3.5  # 2.0 measured; 2.7 and 3.8 before, of three times the error

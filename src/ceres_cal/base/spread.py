@@ -15,7 +15,7 @@ from ceres_cal.base.arrays import Array, Mask
 NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
 1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
-_REGULAR = 1e6  # the inverse of such an eigenvalue; plain inverses are good to 1e-9 there
+_REGULAR = 1e8  # the inverse of such an eigenvalue; plain inverses are good to 1e-7 there
 
 
 def _nothing(count: int) -> float:

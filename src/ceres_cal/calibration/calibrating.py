@@ -182,7 +182,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         if chosen.choice.chosen != before.choice.chosen:
             seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     said = []
-    while other := chosen.instead(*seen.came_out(observations).outlier_masks(observations)):
+    while other := chosen.instead(*seen.outlier_masks(observations)):
         found = attempt(
             partial(seen_with, other)
         )  # reads: "another lens explains observations that were taken out, ..."

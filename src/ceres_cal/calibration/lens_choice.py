@@ -9,7 +9,6 @@ lens predict the others no better: a criterion that counts observations would ta
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.frozen import cached_property, replace
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
@@ -46,8 +45,7 @@ _EXPLAINED = "takes out observations that another lens explains"
 _VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Chosen:
+class Chosen(Frozen):
     """The lens that was chosen: options with it, where to start from, and what it was compared with.
 
     Attributes:
@@ -102,8 +100,7 @@ class Chosen:
         return None if self.among is None else self.among.instead(points, curves)
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Frozen):
     """The lenses that were compared, and the one that was chosen.
 
     Attributes:
@@ -152,7 +149,8 @@ class Comparison:
         for one, likely in zip(self.tried, self.probabilities, strict=True):
             if one is self.chosen or likely < least_probability or one.form.blank.roughness or one.fault:
                 continue
-            near = attempt(partial(self.seen.solved_near, one))  # quiet: what cannot be solved for says nothing
+            # quiet: what cannot be solved for, or ends in another minimum, says nothing
+            near = attempt(partial(self.seen.solved_near, one, as_promised=True))
             if not isinstance(near, CalibrationError):
                 found = replace(found, others=(*found.others, near), weights=(*found.weights, likely))
         # What they say by chance is less by as much as there are more observations than took part.

@@ -6,7 +6,6 @@ Which of several lenses is the simplest that is as good as the best.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import replace
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.problem.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
 from ceres_cal.scene.lens import LENSES, Lens, make_lens
 
@@ -80,8 +79,7 @@ def is_usual(label: str) -> bool:
     return not label.startswith("radial ") or label in (PAPER, "radial 3")
 
 
-@dataclass(frozen=True)
-class Form:
+class Form(Frozen, eq=True):
     """A lens to be tried: see `Options`.
 
     Attributes:

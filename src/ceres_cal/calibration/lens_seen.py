@@ -6,13 +6,12 @@ Each kind of lens near its best, and what follows for each of its lenses.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.frozen import cached_property, replace
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
@@ -35,8 +34,7 @@ _REFUTED = 0.003
 _UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
 
 
-@dataclass(frozen=True, eq=False)
-class Kind:
+class Kind(Frozen):
     """A kind of lens near its best, and what follows for each of its lenses.
 
     Attributes:
@@ -106,8 +104,7 @@ class Kind:
         return self.noise + max(0.0, more) * groups / (groups + _UNSEEN_GROUPS)
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
+class Candidate(Frozen):
     """A lens and its errors of prediction.
 
     Attributes:
@@ -205,8 +202,7 @@ def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, Le
     return replace(estimate, cameras=cameras)
 
 
-@dataclass(frozen=True, eq=False)
-class InlierRows:
+class InlierRows(Frozen):
     """The inliers of a solve.
 
     Attributes:
@@ -282,19 +278,25 @@ class InlierRows:
         solution = solve(problem, candidate.estimate, precision=_PRECISION)
         return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
 
-    def solved_near(self, candidate: Candidate) -> Estimate:
+    def solved_near(self, candidate: Candidate, *, as_promised: bool = False) -> Estimate:
         """Where a lens is at its best, solved for from where the normal equations have it.
+
+        Args:
+            as_promised: whether what leaves more than these promise is no answer.
 
         Raises:
             CalibrationError: it cannot be solved for.
         """
-        posed = (
-            1e-6  # share of a placement's cost: from one that is taken for less, whatever the solve does is rejected
-        )
+        # Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected;
+        # and of all, where the next step is of a thousandth of a standard deviation.
+        at_best = 1e-6
         problem = self._problem(candidate.form.of(self.options), candidate.estimate)
-        solution = solve(problem, with_placements_at_best(problem, candidate.estimate, posed))
+        near = with_placements_at_best(problem, candidate.estimate, at_best)
+        solution = solve(problem, near, precision=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
+        if as_promised and 2.0 * solution.cost > _KEPT * candidate.least:
+            raise DegenerateError("is not at its best where normal equations have it")
         return solution.estimate
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import attempt
-from ceres_cal.base.frozen import replace
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import meanwhile
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
@@ -53,8 +52,7 @@ if TYPE_CHECKING:
     from ceres_cal.robust.competing import Explanation
 
 
-@dataclass(frozen=True)
-class Again:
+class Again(Frozen, eq=True):
     """How a calibration is taken up again after an earlier one.
 
     Attributes:
@@ -68,8 +66,7 @@ class Again:
     assessed: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Watched:
+class Watched(Frozen):
     """Who is told of the solves, and what solves for all observations where these are a part.
 
     Attributes:
@@ -84,8 +81,10 @@ class Watched:
     chosen: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Explained:
+_UNWATCHED = Watched()
+
+
+class Explained(Frozen):
     """A solution, and what explains the observations that it does not fit.
 
     Attributes:
@@ -109,6 +108,13 @@ class Explained:
         """Whether the lens leaves the same in views of different placements."""
         placed = of_placements(self.end.problem.sights)
         return bool(len(placed)) and LeftOver.of_end(self.end, placed).asks_for_more
+
+    def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """See `Calibration.outlier_masks`."""
+        inliers = self.end.inliers
+        if inliers.rows.all():
+            return ~inliers.points, ~inliers.curves
+        return self.came_out(observations).outlier_masks(observations)
 
     def came_out(self, observations: Observations) -> Calibration:
         """The calibration, not assessed."""
@@ -148,7 +154,7 @@ def solved_from(
     observations: Observations,
     problem: Problem,
     again: Again | None = None,
-    watched: Watched = Watched(),
+    watched: Watched = _UNWATCHED,
     built: Built = AS_DRAWN,
 ) -> Calibration:
     """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.

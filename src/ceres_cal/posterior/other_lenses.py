@@ -47,9 +47,7 @@ _PLACES = 12  # along each side of the picture
 # followed as closely, what lenses with another phi show there ruins the floor; not at all, one map in ten was 2.5
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
-# Of the weights. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
-# a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
-_COUNTED = 0.5
+_COUNTED = 1.0  # of the weights
 
 
 class OtherLenses(Frozen):
