@@ -126,7 +126,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.mixture", "_BOUNDED _SHRINKING", "verdicts"),
     *_of("posterior.uncertainty", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
     *_of("posterior.assess", "_MOST_DOUBT", "verdicts"),
-    *_of("posterior.other_lenses", "_PARTS _COUNTED", "verdicts"),
+    *_of("posterior.other_lenses", "_PARTS", "verdicts"),
     *_of("posterior.reading", "_LARGER", "verdicts"),
     *_of("posterior.mixture", "_FLAT", "verdicts"),
     *_of("posterior.uncertainty", "_LEARNT", "verdicts"),

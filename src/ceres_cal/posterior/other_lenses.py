@@ -47,7 +47,6 @@ _PLACES = 12  # along each side of the picture
 # followed as closely, what lenses with another phi show there ruins the floor; not at all, one map in ten was 2.5
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
-_COUNTED = 1.0  # of the weights
 
 
 class OtherLenses(Frozen):
@@ -103,7 +102,7 @@ class OtherLenses(Frozen):
 def counted(weights: Sequence[float]) -> Array:
     """(L,) probabilities of other lenses as far as they count, together less than all."""
     most = 0.8  # of all of them together
-    each = _COUNTED * np.asarray(weights, dtype=float)
+    each = np.asarray(weights, dtype=float)
     return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 
