@@ -226,17 +226,14 @@ def _made_steady(first: Explained, observations: Observations, problem: Problem,
     It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
     it is hidden by how their target is built.
     """
-    most_rounds = 4
+    most_rounds = 6
     seen, unsteady = first, find_unsteady(first.problem, observations, first.end, None)
     for _ in range(most_rounds):
         if unsteady is None:  # or what seemed to move was what the lens or the target left
             return None
         stated = replace(seen.end.solution.estimate, structure=first.start.estimate.structure)
         start = replace(first.start, estimate=stated, is_near=True)
-        longer = len(seen.problem.options.terms) > len(problem.options.terms)  # which it stays
-        named = problem_of(observations, problem.sights, (seen.problem if longer else problem).options, stated)
-        steady = unsteady.taken_off(named, len(observations.points))
-        steady = replace(steady, smoothness=seen.end.problem.smoothness)
+        steady = unsteady.taken_off(problem, len(observations.points))
         solved = _solved(start, observations, steady, None, watched, AS_DRAWN)
         seen = replace(_explained(solved, observations, steady.sights, None, watched, AS_DRAWN), unsteady=unsteady)
         before, unsteady = unsteady, find_unsteady(seen.problem, observations, seen.end, unsteady)

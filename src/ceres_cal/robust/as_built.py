@@ -83,7 +83,6 @@ def solve_as_built(
 
     def solved(there: Built) -> RobustSolution:
         held = taking_part(_held(problem, there, observations), observations, explanations)
-        held = replace(held, smoothness=end.problem.smoothness)
         return solve_robustly(held, observations, replace(end.solution.estimate, structure=stated), is_near=True)
 
     def freed(there: Built) -> Structure:
@@ -110,7 +109,7 @@ def solve_as_built(
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
     estimate = replace(end.solution.estimate, structure=structure)
-    part = replace(taking_part(problem, observations, explanations), smoothness=end.problem.smoothness)
+    part = taking_part(problem, observations, explanations)
     if {view.target for view in observations.views if view.placement is None} & {one.target for one in every}:
         end = solve_robustly(part, observations, estimate, is_near=True)
     else:
