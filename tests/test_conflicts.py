@@ -81,8 +81,8 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
     assert conflict.sigmas == pytest.approx((conflict.seen - 3.0) / np.hypot(0.005, conflict.seen_sd), rel=0.15)
     assert conflict.words in wrong().warnings
     assert conflict.words == (
-        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.969 ± 0.062 m, "
-        "14 sigmas apart: correct or remove it"
+        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.969 ± 0.056 m, "
+        "15 sigmas apart: correct or remove it"
     )
 
 
@@ -242,7 +242,7 @@ def test_a_height_measured_after_a_move_is_tested() -> None:
 def test_a_height_that_no_calibration_comes_out_of_is_refused() -> None:
     """The height is blamed, not the labels."""
     with pytest.raises(
-        SolutionError, match=r"the stated height of station 'overhead', 150.*say 3.970 ± 0.059 m.*sigmas apart"
+        SolutionError, match=r"the stated height of station 'overhead', 150.*say 3.970 ± 0.053 m.*sigmas apart"
     ):
         calibrate(seen(), under(height(150.0, 5e-6 * 150.0)))
 

@@ -141,6 +141,24 @@ def test_a_tenth_of_the_stated_sigma_is_the_same_data() -> None:
     assert second.sd == pytest.approx(first.sd, rel=1e-3)
 
 
+def test_what_was_stated_and_does_not_scatter_may_be_shared() -> None:
+    """One picture, lines stated 2.5 times as uncertain as they scatter: as likely as not that is an error they share.
+    Where all have one sigma it is only a unit.
+    """
+    one = half_a_field(partial(along_lines, length_m=1e-3))
+    count = len(one.curves)
+    each = np.exp(np.random.default_rng(1).uniform(-0.05, 0.05, count))  # of each by itself, as detection states it
+
+    def sd(stated: Array) -> Array:
+        curves = replace(one.curves, sigma_px=stated * one.curves.sigma_px)
+        return calibrate(replace(one, curves=curves), HALF.options).uncertainty.posterior.sd
+
+    assert 1.5 < np.median(sd(2.5 * each) / sd(each)) < 2.3  # 1.98 measured
+    assert (
+        np.median(sd(np.full(count, 2.5)) / sd(np.ones(count))) < 1.05
+    )  # 0.67: four points borrow from the lines' scale
+
+
 # ---- who reads it ---------------------------------------------------------------------------------------------------
 
 

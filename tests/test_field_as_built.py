@@ -19,6 +19,8 @@ from ceres_cal.detect.lines import Lines, measure
 from ceres_cal.detect.photographs import Auto, Clicks, FieldDetections, FieldOptions, detect_field
 from ceres_cal.detect.photographs.as_built import FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.clicks import unknown_optics
+from ceres_cal.detect.photographs.field import _observations
+from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.matching import StrokeMap
 from ceres_cal.detect.photographs.refit import observations_of
 from ceres_cal.detect.photographs.search import search
@@ -43,18 +45,22 @@ CAMERA = Camera(
 )
 
 
-def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> FieldAsBuilt:
-    """What lines that are painted so tell of the field that is asked for."""
+def measured(painted: Target, noise_px: float = 0.1) -> Lines:
+    """Lines that are painted so, as they would be measured."""
     course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)
     offset = np.random.default_rng(3).normal(0.0, noise_px, len(course))
     every = np.ones(len(course), dtype=bool)
-    lines = Lines(course, every, offset, np.full(len(course), noise_px), np.full(len(course), 50.0), 0.8, 1.0)
-    return as_built(lines, CAMERA, asked, unknown_optics(CAMERA, None).priors)
+    return Lines(course, every, offset, np.full(len(course), noise_px), np.full(len(course), 50.0), 0.8, 1.0)
 
 
-def moved(aside_m: dict[str, tuple[float, float]]) -> Target:
+def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> FieldAsBuilt:
+    """What they tell of the field that is asked for."""
+    return as_built(measured(painted, noise_px), CAMERA, asked, unknown_optics(CAMERA, None).priors)
+
+
+def moved(aside_m: dict[str, tuple[float, float]], field: Target = FIELD) -> Target:
     """The field with some of its lines elsewhere."""
-    curves = dict(FIELD.curves)
+    curves = dict(field.curves)
     for name, (x, y) in aside_m.items():
         line = curves[name]
         assert isinstance(line, Segment)
@@ -116,6 +122,48 @@ def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None
     offsets = dict(zip(calibration.estimate.structure.names, calibration.estimate.structure.values, strict=True))
     for name, offset in zip(aside, (-0.03, -0.03, 0.02), strict=True):
         assert offsets[f"field/{name}"] == pytest.approx(offset, abs=0.003)
+
+
+def test_a_stated_length_that_everything_else_contradicts_is_named() -> None:
+    """The whole field 1 % larger than asked for, its lengths stated to 2 cm: areas and circle say how large it is."""
+    lines = measured(ssl_field("B", field_length_m=9.09, field_width_m=6.06))
+    seen = observations_of(FIELD, CAMERA.image_size, lines.course.curve, lines.pixels, lines.sigma_px)
+    lengths = {"field_length_m": 9.0, "field_width_m": 6.0}
+    priors = tuple(Prior("target", "field", name, (drawn,), (0.02,)) for name, drawn in lengths.items())
+    calibration = calibrate(replace(seen, priors=priors), Options(lens="radial", powers=(2, 3)))
+    assert len(calibration.conflicts) == 1
+    assert calibration.conflicts[0].words.startswith("the stated field_length_m of target 'field', 9.00 ± 0.02 m: ")
+    assert any(words.startswith("the stated field_width_m") for words in calibration.warnings)
+    assert calibration.estimate.structure.dimensions["field/field_length_m"] == pytest.approx(9.09, abs=0.007)  # 9.0878
+
+
+def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
+    """Lines aside by 4 mm of a field 12 mm longer and 9 mm narrower: errors are 3.0 of what is stated by its drawing,
+    .58 so.
+    """
+    rng = np.random.default_rng(0)
+    painted = ssl_field("B", field_length_m=9.012, field_width_m=5.991)
+    straight = {name: line for name, line in painted.curves.items() if isinstance(line, Segment)}
+    is_along = {name: line.start[0] != line.end[0] for name, line in straight.items()}
+    lines = measured(
+        moved(
+            {
+                n: (0.0, rng.normal(0.0, 0.004)) if along else (rng.normal(0.0, 0.004), 0.0)
+                for n, along in is_along.items()
+            },
+            painted,
+        )
+    )
+    built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA, None).priors)
+    assert built.scatter_m > 0.0 and not built.is_other
+    followed = Followed(CAMERA, FIELD, FIELD.curve_names, (), lines, 0.0, FIELD.curve_names, built)
+    seen = _observations("0001", followed, FIELD, FieldOptions(points=False))
+    pixels, over = CAMERA.project(FIELD.point_array), []
+    for priors in (seen.priors, tuple(one for one in seen.priors if one.curve)):
+        calibration = calibrate(replace(seen, priors=priors), Options(lens="radial", powers=(2, 3)))
+        off = np.linalg.norm(calibration.station().locate(pixels) - FIELD.point_array[:, :2], axis=1)
+        over.append(float(np.sqrt(np.mean(off**2) / np.mean(calibration.uncertainty.located(pixels).sd_m ** 2))))
+    assert over[0] < 1.6 < over[1]
 
 
 def test_an_offset_is_no_length() -> None:

@@ -351,9 +351,10 @@ def test_command(tmp_path: Path, shot: script.Shot, capsys: pytest.CaptureFixtur
     detect = ["detect", "field", path, "-o", out]
     assert main([*detect, "--target", "ssl-b", "--start", str(corners), "--camera", "overhead"]) == 0
     assert "1 of 1 images show the field" in capsys.readouterr().out
-    assert main(["calibrate", out, "-o", str(tmp_path / "calibration.json"), "--quiet"]) == 0
+    calibrated = str(tmp_path / "calibration.json")
+    assert main(["calibrate", out, "--lens", shot.camera.lens.kind, "-o", calibrated, "--quiet"]) == 0
     capsys.readouterr()
-    assert main([*detect, "--start", str(tmp_path / "calibration.json"), "--json", "--edges"]) == 0
+    assert main([*detect, "--start", calibrated, "--json", "--edges"]) == 0
     answer = json.loads(capsys.readouterr().out)
     observations = Observations.load(out)
     assert answer["curves"] == len(observations.curves) and observations.views[0].camera == "overhead"

@@ -79,9 +79,9 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     said = capsys.readouterr().out.splitlines()
     assert said[0] == f"toy       2 lines, written to {out}"
     assert said[1:] == [
-        "error     overhead: 0.1 mm rms, 0.2 mm at most, on the floor",
-        "error     overhead: 0.3 mm rms, 0.4 mm at most, at 150 mm",
-        "error     overhead: 0.01 px rms, 0.02 px at most, over the image",
+        "off       overhead: 0.1 mm rms, 0.2 mm at most, on the floor",
+        "off       overhead: 0.3 mm rms, 0.4 mm at most, at 150 mm",
+        "off       overhead: 0.01 px rms, 0.02 px at most, over the image",
         "warning   toys break",
     ]
     assert out.read_text() == f"hello\noverhead {calibrated().station().phi:.2f}"

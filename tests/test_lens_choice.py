@@ -275,6 +275,16 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
     assert every is not None and every.others and few is not None and not few.others
 
 
+def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solve that ran into another minimum is not the lens that predicts as well; the chosen one is there."""
+    observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
+    start = initialise(observations, gather_sights(observations), options)
+    chosen = choose_lens(observations, Options(), start)
+    monkeypatch.setattr(seen, "_KEPT", 0.0)
+    few = chosen.others
+    assert few is not None and not few.others and not few.failed
+
+
 def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:
     same = np.full(12, 10.0)
     assert decide(["brown k1 k2", "kannala-brandt k1"], [2, 1], [same, same])[1] == 1

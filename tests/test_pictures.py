@@ -25,6 +25,7 @@ from ceres_cal.detect.photographs import FieldDetections
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.parameters import Station as Posed
 from ceres_cal.problem.structure import Tolerance, make_structure
+from ceres_cal.report.in_photographs import first_of_each
 from ceres_cal.report.pictures.frames import (
     Frame,
     frame_by_name,
@@ -336,6 +337,17 @@ def true_estimate(shot: script.Shot) -> Estimate:
     station = Posed("overhead", shot.camera.cam_from_world)
     lens_only = shot.camera.at(Pose.identity())
     return Estimate({"overhead": lens_only}, {"overhead": station}, {}, make_structure({"field": shot.target}, {}))
+
+
+def test_the_field_is_shown_before_boards() -> None:
+    board, field = (("board", "1"),), (("field", None), ("board", "2"))
+    frames = [
+        Frame("1", "left", board),
+        Frame("1", "right", board),
+        Frame("2", "left", field),
+        Frame("3", "left", field),
+    ]
+    assert first_of_each(frames) == {"left": frames[2], "right": frames[1]}
 
 
 def test_photographs_by_frame() -> None:

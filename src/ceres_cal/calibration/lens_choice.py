@@ -149,7 +149,8 @@ class Comparison(Frozen):
         for one, likely in zip(self.tried, self.probabilities, strict=True):
             if one is self.chosen or likely < least_probability or one.form.blank.roughness or one.fault:
                 continue
-            near = attempt(partial(self.seen.solved_near, one))  # quiet: what cannot be solved for says nothing
+            # quiet: what cannot be solved for, or ends in another minimum, says nothing
+            near = attempt(partial(self.seen.solved_near, one, as_promised=True))
             if not isinstance(near, CalibrationError):
                 found = replace(found, others=(*found.others, near), weights=(*found.weights, likely))
         # What they say by chance is less by as much as there are more observations than took part.

@@ -278,8 +278,11 @@ class InlierRows(Frozen):
         solution = solve(problem, candidate.estimate, precision=_PRECISION)
         return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
 
-    def solved_near(self, candidate: Candidate) -> Estimate:
+    def solved_near(self, candidate: Candidate, *, as_promised: bool = False) -> Estimate:
         """Where a lens is at its best, solved for from where the normal equations have it.
+
+        Args:
+            as_promised: whether what leaves more than these promise is no answer.
 
         Raises:
             CalibrationError: it cannot be solved for.
@@ -292,6 +295,8 @@ class InlierRows(Frozen):
         solution = solve(problem, near, precision=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
+        if as_promised and 2.0 * solution.cost > _KEPT * candidate.least:
+            raise DegenerateError("is not at its best where normal equations have it")
         return solution.estimate
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import math
-import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -89,14 +88,10 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
     Raises:
         InputError: the plan cannot be read, or a row is wrong usage of its command; it says which.
     """
-    from ceres_cal.cli.jobs import read_plan
+    from ceres_cal.cli.jobs import read_plan, words_of
 
     base = plan if plan.is_dir() else plan.parent
-    try:
-        of_all = shlex.split(options)
-    except ValueError as error:
-        raise InputError(f"--options {options!r}: {error}") from None
-    jobs = []
+    of_all, jobs = words_of(options, "--options"), []
     for row in read_plan(plan):
         more = of_all if row.command == "calibrate" else []
         try:

@@ -138,7 +138,6 @@ def _run(args: CalibrateArguments) -> Document:
     with progress_bar(args) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
         from ceres_cal.diagnostics.labels import mended, renamings
-        from ceres_cal.report.quality import quality_of
 
         workers = {} if client is None else {"client": client}
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
@@ -148,11 +147,7 @@ def _run(args: CalibrateArguments) -> Document:
             calibration = calibrate(observations, options, _solve_progress(bar), **workers)
     told = (f"{one.words}: {'renamed' if args.mend_labels else 'is it (--mend-labels)?'}" for one in wrong)
     calibration = replace(calibration, warnings=(*calibration.warnings, *told))
-    from ceres_cal.report.summary import calibration_sections
-
-    page, unmade = files.report_page(args, calibration, observations, photographs)
-    answer = tuple(calibration_sections(quality_of(calibration, observations), args.observations))
-    return Document((*answer, unmade, files.write_results(args, calibration.save, page)), 1 if unmade.data else 0)
+    return files.calibrated(args, calibration, observations, photographs, args.observations)
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:

@@ -16,7 +16,7 @@ from ceres_cal.base.images import image_files
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import ReportArguments, parse_board, parse_priors
 from ceres_cal.cli.terminal import progress_bar
-from ceres_cal.report.document import Section
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration, LensChoice
@@ -284,3 +284,23 @@ def report_page(
     with progress_bar(args) as bar:
         make = partial(make_report, calibration, observations, diagnosis, choice, photographs, bar.update)
         return attempted("report", make)
+
+
+def calibrated(
+    args: ReportArguments,
+    calibration: Calibration,
+    observations: Observations,
+    photographs: FramePhotographs | None,
+    names: Sequence[str],
+    *before: Section,
+) -> Document:
+    """What was calibrated from observations of these names, once it and its report are written; `before`: what is said
+    first.
+    """
+    from ceres_cal.report.quality import quality_of
+    from ceres_cal.report.summary import calibration_sections
+
+    page, unmade = report_page(args, calibration, observations, photographs)
+    answer = calibration_sections(quality_of(calibration, observations), names)
+    written = write_results(args, calibration.save, page)
+    return Document((*before, *answer, unmade, written), 1 if unmade.data else 0)

@@ -123,7 +123,7 @@ def _losses(exported: Exported) -> Iterator[Section]:
     shown = [(loss.station, loss.image_px) for loss in every if loss.image_px is not None]
     errors_px = [{"station": name, "rms_px": rms, "worst_px": worst} for name, (rms, worst) in shown]
     yield Section(data={"errors": errors, "errors_px": errors_px, "warnings": list(exported.warnings)})
-    yield from (Section("error", [text]) for loss in every for text in loss_words(loss))
+    yield from (Section("off", [text]) for loss in every for text in loss_words(loss))
     yield from (Section("warning", [text]) for text in exported.warnings)
 
 

@@ -255,14 +255,19 @@ def _of_table(path: Path) -> Iterator[Planned]:
     read = {".jsonl": _json_lines, ".csv": _csv, ".toml": _toml}[path.suffix]
     for where, data in read(text, str(path)):
         if isinstance(data, dict) and isinstance(data.get("arguments"), str):
-            try:
-                data["arguments"] = shlex.split(data["arguments"])
-            except ValueError as error:
-                raise InputError(f"{where}: arguments {data['arguments']!r}: {error}") from None
+            data["arguments"] = words_of(data["arguments"], f"{where}: arguments")
         row = convert(data, Planned, where)
         if not _NAME.fullmatch(row.name):
             raise InputError(f"{where}: a job is called {row.name!r}: files have its name: letters, digits, - and _")
         yield row
+
+
+def words_of(typed: str, where: str) -> list[str]:
+    """Arguments as a shell takes them apart."""
+    try:
+        return shlex.split(typed)
+    except ValueError as error:
+        raise InputError(f"{where} {typed!r}: {error}") from None
 
 
 def _json_lines(text: str, where: str) -> Iterator[tuple[str, Any]]:

@@ -57,7 +57,6 @@ def _run(args: RefitArguments) -> Document:
     assert observations is not None
     from ceres_cal.moves.refit_plan import RefitOptions
     from ceres_cal.moves.refits import movements, refit
-    from ceres_cal.report.quality import quality_of
 
     photographs = files.report_photographs(args, observations, calibration, images)
     result = refit(
@@ -67,17 +66,12 @@ def _run(args: RefitArguments) -> Document:
         moved=args.moved or None,
         options=RefitOptions(args.hold_others, args.labels, priors),
     )
-    from ceres_cal.report.summary import calibration_sections
-
-    page, unmade = files.report_page(args, result, observations, photographs)
-    answer = tuple(calibration_sections(quality_of(result, observations), args.inputs))
     about = result.refitted
     assert about is not None
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(calibration, result).items()}
     explained = {"what": about.what, "explanation": about.explanation, "moved": moves}
     first = Section("refit", about.explanation.split("; "), explained)
-    sections = (first, shown(detections), *answer, unmade, files.write_results(args, result.save, page))
-    return Document(sections, 1 if unmade.data else 0)
+    return files.calibrated(args, result, observations, photographs, args.inputs, first, shown(detections))
 
 
 def _priors(args: RefitArguments, known: Calibration | Observations) -> tuple[Prior, ...]:

@@ -206,15 +206,17 @@ class SparseColumns(Frozen):
         """(E,) what amounts (Q,) do to the equations."""
         return np.asarray(np.sum(self.values * np.append(amounts, 0.0)[self.slots], axis=1))
 
-    def in_private(self, model: Linearised) -> Array:
-        """(6, S, Q) what the private placement of each sight takes of them."""
-        bounds, sight = model.equations.bounds, model.equations.sight
+    def in_private(self, model: Linearised, part: Indices | None = None) -> Array:
+        """(6, S, Q) what the private placement of each sight takes of them, or of parts (E,) of sights."""
+        part = model.equations.sight if part is None else part
+        parts = int(part.max()) + 1
         if not model.of_private.any():
-            return np.zeros((6, len(bounds) - 1, self.size))
-        if (whole := self._matrix) is not None:
-            parts = list(map(slice, bounds[:-1], bounds[1:]))
-            return np.stack([model.private[part].T @ whole[part] for part in parts], axis=1)
-        return np.array([self.gathered(column, sight, len(bounds) - 1) for column in model.private.T])
+            return np.zeros((6, parts, self.size))
+        bounds = model.equations.bounds
+        if part is model.equations.sight and (whole := self._matrix) is not None:
+            rows = list(map(slice, bounds[:-1], bounds[1:]))
+            return np.stack([model.private[own].T @ whole[own] for own in rows], axis=1)
+        return np.array([self.gathered(column, part, parts) for column in model.private.T])
 
     def in_shared(self, model: Linearised) -> Array:
         """(P, Q) what the shared numbers take of them."""

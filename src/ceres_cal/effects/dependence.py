@@ -284,6 +284,8 @@ def measure_scatter(
     prior = model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root
     groups = GroupNormals.of(model, group, prior)
     scores, dependence = correlated(model, group, groups.normal)
+    if len(groups.counts) < FEWEST_GROUPS:
+        scores += _stated_together(model, group, problem.weighting.scales)
     whole = _whole(groups, scores)
     lasting = any(kind.lasting for kind in dependence.correlations) and go_over_groups(model.equations, group)
     enough = len(groups.counts) >= FEWEST_GROUPS and not lasting
@@ -292,6 +294,21 @@ def measure_scatter(
         inverse = dependence.inverse_freedom + between.probability / between.degrees_of_freedom
         dependence = replace(dependence, between=between, inverse_freedom=inverse)
     return Scatter(model.root, whole, dependence)
+
+
+def _stated_together(model: Linearised, group: Indices, scales: tuple[float, float]) -> Array:
+    """(G, P, P) what is added to the covariance of each group's score for what clearly scatters less than was stated of
+    each observation: as likely as not, the rest is what neighbours err by alike, which no residual shows.
+    """
+    likely, by_chance, alike = 0.5, 1.0, 1e-3  # by_chance: standard errors of a scale. alike: sigmas, stated for all
+    scores = np.zeros((int(group.max()) + 1, *2 * (model.columns.shape[1] - 7,)))
+    for is_curve, scale in zip((False, True), scales, strict=True):
+        rows = np.flatnonzero((model.equations.is_curve == is_curve) & model.used)
+        scale *= 1.0 + by_chance / np.sqrt(2.0 * max(len(rows), 1))
+        if scale < 1.0 and len(rows) and np.ptp(model.weight[rows]) > alike * np.max(model.weight[rows]):
+            columns = model.columns[rows, 6:-1]
+            np.add.at(scores, group[rows], likely * (scale**-2.0 - 1.0) * columns[:, :, None] * columns[:, None, :])
+    return scores
 
 
 def _whole(groups: GroupNormals, scores: Array) -> Array:

@@ -238,8 +238,8 @@ class RepeatedAmounts(Frozen):
     """What the residuals say of Q amounts that are the same in all views, everything else free at its best.
 
     Attributes:
-        score: (Q,) u. information: (Q, Q) V. scores, informations: (S, Q) those of each sight by itself, the scores of
-            what the best offsets leave.
+        score: (Q,) u. information: (Q, Q) V. scores, informations: (S, Q) those of each sight by itself, or of each
+            strand where there are few sights: the scores of what the best offsets leave.
         rest: squared residuals that the best offsets leave. spare: equations left over for these.
         in_shared: (P, Q) what the shared directions take of them.
     """
@@ -253,9 +253,14 @@ class RepeatedAmounts(Frozen):
     in_shared: Array
 
     @classmethod
-    def of(cls, model: Linearised, columns: SparseColumns) -> RepeatedAmounts:
-        """By their columns over a model's equations."""
-        sight, sights = model.equations.sight, len(model.equations.bounds) - 1
+    def of(cls, model: Linearised, columns: SparseColumns, part: Indices | None = None) -> RepeatedAmounts:
+        """By their columns over a model's equations.
+
+        Args:
+            part: (E,) whose errors go together; else the sights.
+        """
+        part = model.equations.sight if part is None else part
+        parts = int(part.max()) + 1
         information, score, in_shared = columns.left_of(model)
         ridge = _DETERMINED * float(np.max(np.diagonal(information))) * np.eye(columns.size)
         inverse = np.linalg.inv(information + ridge)
@@ -265,8 +270,8 @@ class RepeatedAmounts(Frozen):
         return cls(
             score,
             information,
-            columns.gathered(left, sight, sights),
-            columns.gathered(columns.values, sight, sights) - np.sum(columns.in_private(model) ** 2, axis=0),
+            columns.gathered(left, part, parts),
+            columns.gathered(columns.values, part, parts) - np.sum(columns.in_private(model, part) ** 2, axis=0),
             max(float(left @ left), least),
             spare,
             in_shared,

@@ -42,7 +42,7 @@ class Strand(Frozen):
 
 def strands_of(equations: Equations, owner: Indices, rows: Indices) -> Iterator[Strand]:
     """The curves, and the image axes of points, of each owner (E,), a view or a sight, among some rows."""
-    name = _names_of(equations, owner)[rows]
+    name = strand_names(equations, owner)[rows]
     order = np.argsort(name, kind="stable")
     ends = np.flatnonzero(np.diff(name[order], append=-1)) + 1
     start = 0
@@ -55,8 +55,8 @@ def strands_of(equations: Equations, owner: Indices, rows: Indices) -> Iterator[
         yield Strand(own, places)
 
 
-def _names_of(equations: Equations, owner: Indices) -> Indices:
-    """(E,) number of the strand that each equation is of."""
+def strand_names(equations: Equations, owner: Indices) -> Indices:
+    """(E,) number of the strand of an owner (E,) that each equation is of."""
     axis = (equations.direction[:, 1] > 0.5).astype(np.int64)
     what = np.where(equations.is_curve, equations.feature + 2, axis)
     return np.asarray(owner * (what.max() + 1) + what)
@@ -64,7 +64,7 @@ def _names_of(equations: Equations, owner: Indices) -> Indices:
 
 def go_over_groups(equations: Equations, group: Indices) -> bool:
     """Whether some strand of a sight goes over several groups (E,)."""
-    names = _names_of(equations, equations.sight)
+    names = strand_names(equations, equations.sight)
     return len(distinct(names * (int(group.max()) + 1) + group)) > len(distinct(names))
 
 

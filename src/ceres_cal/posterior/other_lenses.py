@@ -47,9 +47,6 @@ _PLACES = 12  # along each side of the picture
 # followed as closely, what lenses with another phi show there ruins the floor; not at all, one map in ten was 2.5
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
-# Of the weights. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
-# a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
-_COUNTED = 0.5
 
 
 class OtherLenses(Frozen):
@@ -105,7 +102,7 @@ class OtherLenses(Frozen):
 def counted(weights: Sequence[float]) -> Array:
     """(L,) probabilities of other lenses as far as they count, together less than all."""
     most = 0.8  # of all of them together
-    each = _COUNTED * np.asarray(weights, dtype=float)
+    each = np.asarray(weights, dtype=float)
     return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 

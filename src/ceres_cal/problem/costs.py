@@ -98,32 +98,52 @@ NORMAL_NS = 60.0
 _LEFT_TO_THE_COMPLEMENT = 1e-2
 
 
-class SightCost(CachedCost):
-    """The compressed block of one sight (design, section 6).
+class _SightsCost(CachedCost):
+    """What sights of one camera cost.
 
     Attributes:
         slots: which of its camera (0), station (1), placement (2) and structure (3) the solver hands over; the others
             are held.
     """
 
-    def __init__(self, run: Run, sight: Sights, problem: Problem, estimate: Estimate) -> None:
+    slots: list[int]
+
+    def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
-        self._sight, self._structure = sight, estimate.structure
-        key, layout, weighting = sight.key, problem.layout, problem.weighting
-        free, count, offsets = layout.free[key.camera], len(self._structure.values), len(self._structure.offsets)
-        feet = starting_feet(sight, estimate, problem.feet)
-        self._optics, self._unknowns = camera_optics(estimate.cameras[key.camera]), kernels.Unknowns(free, offsets)
-        self._points = point_columns(sight, estimate.structure, weighting.point_scale)
-        self._curves = curve_columns(sight, estimate.structure, feet, weighting.curve_scale)
+        self.camera: str = sights.keys[0].camera
+        self._sights, self._structure, weighting = sights, estimate.structure, problem.weighting
+        feet = starting_feet(sights, estimate, problem.feet)
+        self._optics = camera_optics(estimate.cameras[self.camera])
+        self._unknowns = kernels.Unknowns(problem.layout.free[self.camera], len(self._structure.offsets))
+        self._points = point_columns(sights, self._structure, weighting.point_scale)
+        self._curves = curve_columns(sights, self._structure, feet, weighting.curve_scale)
         self._loss = kernel_loss(weighting)
+
+    def _take(self, sizes: Sequence[int], is_free: Sequence[bool], residuals: int) -> None:
+        """Tell Ceres of the slots that are free, of so many numbers each, and of the residuals."""
+        self.slots = [slot for slot in range(len(sizes)) if is_free[slot]]
+        self.set_num_residuals(residuals)
+        self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
+
+    def _as_built(self, structure: Structure) -> tuple[kernels.PointColumns, kernels.CurveColumns]:
+        """The columns with points and tracks where the structure has them."""
+        if not len(structure.values):
+            return self._points, self._curves
+        points, tracks = structure.points(self._sights), structure.tracks(self._sights)
+        return self._points._replace(places=points), self._curves._replace(tracks=tracks)
+
+
+class SightCost(_SightsCost):
+    """The compressed block of one sight (design, section 6)."""
+
+    def __init__(self, run: Run, sight: Sights, problem: Problem, estimate: Estimate) -> None:
+        super().__init__(run, sight, problem, estimate)
+        key, layout, free, count = sight.key, problem.layout, self._unknowns.free, len(self._structure.values)
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
         if key.placement is not None:
             self._poses[1] = estimate.placements[key.placement].log()
-        sizes = (len(free), 6, 6, count)
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
-        self.slots: list[int] = [slot for slot in range(4) if is_free[slot]]
-        self.set_num_residuals(len(free) + offsets + 7)
-        self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
+        self._take((len(free), 6, 6, count), is_free, len(free) + self._unknowns.structure + 7)
 
     def block(self, parameters: Sequence[Array]) -> Array | None:
         """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
@@ -140,7 +160,7 @@ class SightCost(CachedCost):
             size = self._unknowns.structure if slot == structure else len(parameters[place])
             numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * size)
         residuals = np.empty(rows)
-        points, curves = as_built(self._points, self._curves, self._sight, self._structure.with_values(numbers[3]))
+        points, curves = self._as_built(self._structure.with_values(numbers[structure]))
         answered = kernels.evaluate_block(
             self._optics, self._unknowns, points, curves, self._loss, kernels.Blocks(*numbers), residuals,
             kernels.Blocks(*jacobians),
@@ -162,15 +182,6 @@ def robust_weights(weighting: Weighting, squared: Array) -> Array:
     return weights
 
 
-def as_built(
-    points: kernels.PointColumns, curves: kernels.CurveColumns, sights: Sights, structure: Structure
-) -> tuple[kernels.PointColumns, kernels.CurveColumns]:
-    """The columns with points and tracks where the structure has them."""
-    if not len(structure.values):
-        return points, curves
-    return points._replace(places=structure.points(sights)), curves._replace(tracks=structure.tracks(sights))
-
-
 class _Evaluation(Frozen):
     """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`)."""
 
@@ -181,24 +192,14 @@ class _Evaluation(Frozen):
     gains: Array
 
 
-class EliminatedCost(CachedCost):
+class EliminatedCost(_SightsCost):
     """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
 
     def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
-        super().__init__(run)
-        self.camera: str = sights.keys[0].camera
-        weighting = problem.weighting
-        self._sights, self._structure = sights, estimate.structure
-        free, count = problem.layout.free[self.camera], len(self._structure.values)
-        feet = starting_feet(sights, estimate, problem.feet)
-        self._optics = camera_optics(estimate.cameras[self.camera])
-        self._unknowns = kernels.Unknowns(free, len(self._structure.offsets))
-        self._points = point_columns(sights, estimate.structure, weighting.point_scale)
-        self._curves = curve_columns(sights, estimate.structure, feet, weighting.curve_scale)
-        self._loss = kernel_loss(weighting)
-        sizes = (len(free), count)
-        self._size = sum(sizes)
-        start = np.concatenate([self._optics.intrinsics[free], estimate.structure.values])
+        super().__init__(run, sights, problem, estimate)
+        free, count = self._unknowns.free, len(self._structure.values)
+        self._size = len(free) + count
+        start = np.concatenate([self._optics.intrinsics[free], self._structure.values])
         # The kernels speak of offsets alone; (size + 1, size + 1) but for that.
         self._chain, lead = self._structure.chain(len(free), 1), len(free) + self._unknowns.structure
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
@@ -207,9 +208,7 @@ class EliminatedCost(CachedCost):
         self._last = self._accepted
         self._smooth = _smoothness(problem, estimate, self.camera, self._size)
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
-        self.slots: list[int] = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
-        self.set_num_residuals(self._size + 1)
-        self.set_parameter_block_sizes([size for size in sizes if size])
+        self._take((len(free), 0, 0, count), (len(free) > 0, False, False, count > 0), self._size + 1)
 
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
@@ -256,8 +255,7 @@ class EliminatedCost(CachedCost):
         intrinsics = self._optics.intrinsics.copy()
         intrinsics[free] = at[: len(free)]
         optics = self._optics._replace(intrinsics=intrinsics)
-        built = self._structure.with_values(at[len(free) :])
-        points, curves = as_built(self._points, self._curves, self._sights, built)
+        points, curves = self._as_built(self._structure.with_values(at[len(free) :]))
         change, size, chain = at - self._accepted.at, self._accepted.gains.shape[2] + 1, self._chain
         change = change if chain is None else chain[:-1, :-1] @ change
         poses, gains, costs = self._accepted.poses.copy(), self._accepted.gains.copy(), np.empty(len(self._sights))

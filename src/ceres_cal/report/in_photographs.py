@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -21,7 +21,8 @@ _READING = (
 
 
 def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter:
-    """The chapter: of each station its first frame, then those with the largest residuals, at most four.
+    """The chapter: of each station its first frame, of a field where it saw one, then those with the largest residuals,
+    at most four.
 
     Raises:
         InputError: an image cannot be read, or has not the size of its camera.
@@ -34,7 +35,8 @@ def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter
     if without:
         notes.append(Text(f"No photograph of {counted(len(without), 'frame')}: {first_of(without, 8)}.", "note"))
     if len(frames) > len(chosen):
-        shown = f"{len(chosen)} of {len(frames)} photographs: the first of each station, then the largest residuals"
+        which = "the first of each station, of a field if it saw one, then the largest residuals"
+        shown = f"{len(chosen)} of {len(frames)} photographs: {which}"
         notes.append(Text(f"{shown}; `ceres-cal undistort --overlay` draws any other.", "note"))
     pictures = tuple(_picture(material, photographs, frame, number) for number, frame in enumerate(chosen))
     more = (Folded("More photographs", (Gallery(pictures[1:]),)),) if len(pictures) > 1 else ()
@@ -42,10 +44,16 @@ def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter
 
 
 def _chosen(material: Material, frames: list[Frame]) -> list[Frame]:
-    first = {frame.station: frame for frame in reversed(frames)}
+    first = first_of_each(frames)
     size = {frame: _rms_px(material, frame) for frame in frames}
     order = sorted(frames, key=lambda frame: (first[frame.station] is not frame, -size[frame]))
     return order[:MOST_PHOTOGRAPHS]
+
+
+def first_of_each(frames: Iterable[Frame]) -> dict[str, Frame]:
+    """By station: the first frame that shows the world, or of boards alone where none does."""
+    world_first = sorted(frames, key=lambda frame: all(placement is not None for _, placement in frame.shown))
+    return {frame.station: frame for frame in reversed(world_first)}
 
 
 def _rms_px(material: Material, frame: Frame) -> float:

@@ -20,6 +20,7 @@ from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.score_tests import ScoreTest
+from ceres_cal.effects.strands import strand_names
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
@@ -30,6 +31,7 @@ from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.residuals import write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
+_FEWEST_SIGHTS = 3  # that tell an effect from a lens that leaves something
 _MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
 
 
@@ -134,13 +136,17 @@ class _Amounts(Frozen):
                     groups.append(_EffectGroup(effect, columns, number, own))
                 size += parts[-1].size
         every = SparseColumns.side_by_side(parts, len(equations))
-        repeated = RepeatedAmounts.of(model, every)
+        # Of few views, curves tell by how much errors that go together displace; not what a lens is that is wrong.
+        few = len(problem.sights) < _FEWEST_SIGHTS
+        repeated = RepeatedAmounts.of(model, every, strand_names(equations, equations.sight) if few else None)
         numbers = {number: group.own for number, group in enumerate(groups)}
         each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
         priors = {number: prior for number, prior in each if prior is not None}
         sizes = repeated.sizes(numbers, priors)
         taken = -model.root @ repeated.in_shared
-        return cls(case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers], solves)
+        return cls(
+            case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers], solves and not few
+        )
 
     @cached_property
     def likely(self) -> list[int]:
