@@ -99,7 +99,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.robust", "AT_REST_AGAIN", "refit"),
     *_of("problem.noise", "_LEAST_SPARE _BORROWED", "calibrate"),
     *_of("problem.noise", "USUAL_EQUATIONS", "refit"),
-    *_of("robust.conflicts", "_SUSPICIOUS _WORTH_A_SOLVE _RIVAL", "calibrate"),
+    *_of("robust.conflicts", "_SUSPICIOUS _RIVAL", "calibrate"),
     *_of("robust.stated", "LEVEL", "calibrate"),
     *_of("robust.usable", "_BELOW", "calibrate"),
     *_of("scene.targets.target", "HANDY_M", "calibrate"),

@@ -221,24 +221,27 @@ def known_of(seen: Explained, observations: Observations, again: Again | None, w
 
 
 def _made_steady(first: Explained, observations: Observations, problem: Problem, watched: Watched) -> Explained | None:
-    """With what moves the principal points of single views taken off, found again until it stays; None where none do.
+    """With what displaces single views taken off, and again as it is found then; None where nothing does.
 
     It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
-    it is hidden by how their target is built.
+    it is hidden by how their target is built. The lens stays as long as it was: one that grew beside what was taken off
+    predicted other views of a stabilised camera worse by a seventh, and a rolling shutter's halves took a minute each.
+    At rest the predictions follow the noise: halves differ by 1.7 of what is stated where they do by 1.4 after twice.
     """
-    most_rounds = 6
-    seen, unsteady = first, find_unsteady(first.problem, observations, first.end, None)
-    for _ in range(most_rounds):
+    twice = 2
+    seen, unsteady = first, None
+    for _ in range(twice):
+        unsteady = find_unsteady(seen.problem, observations, seen.end, unsteady)
         if unsteady is None:  # or what seemed to move was what the lens or the target left
             return None
-        stated = replace(seen.end.solution.estimate, structure=first.start.estimate.structure)
-        start = replace(first.start, estimate=stated, is_near=True)
-        steady = unsteady.taken_off(problem, len(observations.points))
-        solved = _solved(start, observations, steady, None, watched, AS_DRAWN)
+        start = replace(seen.end.solution.estimate, structure=first.start.estimate.structure)
+        named = first.problem.options
+        options = replace(problem.options, powers=named.powers, terms=named.terms)
+        again = problem_of(observations, problem.sights, options, start)
+        steady = unsteady.taken_off(again, len(observations.points))
+        end = solve_robustly(steady, observations, start, None, watched.progress, is_near=True)
+        solved = Explained(steady, replace(first.start, estimate=start, is_near=True), end, ())
         seen = replace(_explained(solved, observations, steady.sights, None, watched, AS_DRAWN), unsteady=unsteady)
-        before, unsteady = unsteady, find_unsteady(seen.problem, observations, seen.end, unsteady)
-        if unsteady is not None and unsteady.stays(before):
-            break
     return seen
 
 

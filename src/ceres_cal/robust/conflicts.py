@@ -172,10 +172,9 @@ def log_probability(squared: float, rest: Rest) -> float:
     return float(log_f_tail(squared / rank, rank, max(rest.freedom, 1.0)))
 
 
-# Probabilities of a linear picture from which on other groups are judged without a statement, 2.2 sigma, where one in
-# twenty is wrong; and a solve without it decides. That picture stands where a wrong statement has bent everything: of
-# heights 5 % wrong at 20 deg, contradicted at 2 to 3 sigma by the true lens, three of twenty were above 0.028.
-_SUSPICIOUS, _WORTH_A_SOLVE = 0.028, 0.2
+# Probability of a linear picture from which on other groups are judged without a statement: 2.2 sigma, where one in
+# twenty is wrong.
+_SUSPICIOUS = 0.028
 _RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
@@ -328,10 +327,14 @@ class _ForwardSelection:
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
+        # Probability of the linear picture from which on a solve decides. It stands where a wrong statement has bent
+        # everything: of heights 5 % wrong at 20 deg, which the true lens contradicts at 2 to 3 sigma, three of twenty
+        # were above 0.028.
+        worth_a_solve = 0.2
         doubtful = 0.05  # probability that a statement is wrong, from which on both explanations are named
         tests = [worst_test(one, linear_rest(one, self.end)) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
-        if number < 0 or tests[number].log_p > np.log(_WORTH_A_SOLVE):
+        if number < 0 or tests[number].log_p > np.log(worth_a_solve):
             return False
         suspect, test = self.left.pop(number), tests.pop(number)
         rivals = [

@@ -21,10 +21,6 @@ from ceres_cal.problem.quantities import from_placement
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of
 
-# Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it tells more than
-# three quarters of what predicts it, and then nobody knows which of the two is wrong.
-_DOUBTFUL = 0.5
-
 
 class Fitted(Frozen):
     """An estimate of some observations, and what these say there.
@@ -44,7 +40,10 @@ class Fitted(Frozen):
 
 def by_deleted_residuals(inliers: Inliers, fitted: Fitted) -> Inliers:
     """The inliers by deleted residuals, where the residuals alone, by which these are, leave it in doubt."""
-    doubtful = np.isfinite(inliers.sigmas) & (inliers.sigmas > _DOUBTFUL * inliers.bound)
+    # Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it tells more
+    # than three quarters of what predicts it, and then nobody knows which of the two is wrong.
+    doubted = 0.5
+    doubtful = np.isfinite(inliers.sigmas) & (inliers.sigmas > doubted * inliers.bound)
     if not np.any(doubtful):
         return inliers
     rows = inliers.rows
