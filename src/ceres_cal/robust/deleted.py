@@ -40,9 +40,9 @@ class Fitted(Frozen):
 
 def by_deleted_residuals(inliers: Inliers, fitted: Fitted) -> Inliers:
     """The inliers by deleted residuals, where the residuals alone, by which these are, leave it in doubt."""
-    # Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it tells more
-    # than three quarters of what predicts it, and then nobody knows which of the two is wrong.
-    doubted = 0.5
+    # Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it says more of
+    # its place than all others, and then nobody knows which of the two is wrong.
+    doubted = 0.5**0.5
     doubtful = np.isfinite(inliers.sigmas) & (inliers.sigmas > doubted * inliers.bound)
     if not np.any(doubtful):
         return inliers
