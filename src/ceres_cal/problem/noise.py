@@ -90,10 +90,6 @@ class Inliers(Frozen):
         """Whether the same observations take part."""
         return np.array_equal(self.points, other.points) and np.array_equal(self.curves, other.curves)
 
-    def with_rows_of(self, other: Inliers) -> Inliers:
-        """The same with the rows that others have."""
-        return replace(self, points=other.points, curves=other.curves)
-
     @classmethod
     def by_noise(cls, points: Array, curves: Array, noise: NoiseScales) -> Inliers:
         """Of these lengths at a noise."""

@@ -314,7 +314,7 @@ class _RowRounds(Rounds[RobustSolution]):
         there = residuals(self._observations, self._problem.sights, solution.estimate, before.feet)
         anew = self._judge(solution, there)
         if inliers is not None and anew.same_as(inliers, self.no_change):
-            anew = anew.with_rows_of(inliers)
+            anew = anew.with_rows(inliers.rows)
         return self._with(anew, solution, there, rounds)
 
     def _judge(self, solution: Solution, there: Residuals) -> Inliers:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -38,6 +39,16 @@ from ceres_cal.robust.robust import RobustSolution
 
 MOVES, ROLLING = "principal point moves", "rolling shutter"
 _KINDS = (MOVES, ROLLING)
+_MOVES_WORDS = (
+    "its principal point moves by {px} px from view to view, as where a lens or pictures are stabilised (most "
+    "displaced are corners of {named}). The point that is stated is the average; in a single picture it may be as far "
+    "from there. Switch stabilisation off"
+)
+_ROLLING_WORDS = (
+    "its pictures are bent by {px} px rms, each in its own way, as where rows are read out one after the other "
+    "(rolling shutter) while the camera or the target moves (most in {named}). It was solved for in each; a place in "
+    "a single picture may be as far off. Hold both still"
+)
 # What a view's coefficients are, in their order, how many, and what is expected of them; those of all views come last.
 _CENTRE_OF_VIEW, _READ_OUT = "principal point", "read-out"
 _MODES = {_CENTRE_OF_VIEW: (2, CENTRE_MOVES), _READ_OUT: (6, SMOOTH_ERRORS), "smooth": (10, SMOOTH_ERRORS)}
@@ -54,7 +65,7 @@ Sizes = Mapping[str, float]
 
 
 class Unsteady(Frozen):
-    """By how much the views of cameras whose principal point moves are displaced.
+    """By how much views are displaced, of cameras whose principal point moves or whose shutter rolls.
 
     Attributes:
         sizes: camera -> sigmas. displacement: (N + M, 2) px by which the observations are moved. taken_up: equations
@@ -86,19 +97,17 @@ class Unsteady(Frozen):
         worst = sorted(own, key=lambda number: -float(rms[number]))
         named = first_of([f"{observations.views[n].frame!r}, {two_digits(rms[n])} px" for n in worst], 3)
         sizes = self.sizes[camera]
-        moves = sizes.get(_CENTRE_OF_VIEW, 0.0) > _LEAST_PX
-        sigma_px = sizes[_CENTRE_OF_VIEW] if moves else float(np.sqrt(np.mean(rms[own] ** 2)))
-        sentence = (
-            f"camera {camera!r}: its principal point moves by {two_digits(sigma_px)} px from view to view, as where a "
-            f"lens or pictures are stabilised (most displaced are corners of {named}). The point that is stated is the "
-            "average; in a single picture it may be as far from there. Switch stabilisation off"
-            if moves
-            else f"camera {camera!r}: its pictures are bent by {two_digits(sigma_px)} px rms, each in its own way, as "
-            "where rows are read out one after the other (rolling shutter) while the camera or the target moves (most "
-            f"in {named}). It was solved for in each; a place in a single picture may be as far off. Hold both still"
-        )
         every = tuple(Amount(kind, float(sigma), 0.0, "px") for kind, sigma in sizes.items())
-        return EffectEstimate(MOVES if moves else ROLLING, camera, None, float(sigma_px), 1.0, sentence, every)
+        if _centre_moves(sizes):
+            kind, size_px, words = MOVES, sizes[_CENTRE_OF_VIEW], _MOVES_WORDS
+        else:
+            kind, size_px, words = ROLLING, float(np.sqrt(np.mean(rms[own] ** 2))), _ROLLING_WORDS
+        sentence = f"camera {camera!r}: {words.format(px=two_digits(size_px), named=named)}"
+        return EffectEstimate(kind, camera, None, float(size_px), 1.0, sentence, every)
+
+
+def _centre_moves(sizes: Sizes) -> bool:
+    return sizes.get(_CENTRE_OF_VIEW, 0.0) > _LEAST_PX
 
 
 def find_unsteady(
@@ -193,14 +202,8 @@ def _seem_displaced(model: Linearised) -> bool:
     """Whether views may be displaced, at a glance: half of all squares go with their read-out, or their principal
     points seem to move.
     """
-    modes = _modes(model.equations)[:, _OF_MODE == _READ_OUT] * model.weight[:, None]
-    beyond = np.where(model.used[:, None], model.beyond_private(modes), 0.0)
-    parts = [
-        slice(start, stop) for start, stop in zip(model.equations.bounds, model.equations.bounds[1:], strict=False)
-    ]
-    told = np.array([beyond[part].T @ beyond[part] for part in parts])
-    scores = np.array([beyond[part].T @ model.placed_score[part] for part in parts])
-    taken = np.sum(scores * np.einsum("vij,vj->vi", np.linalg.pinv(told, _TOLD, hermitian=True), scores))
+    told, score = _of_views(model, _modes(model.equations)[:, _OF_MODE == _READ_OUT])
+    taken = np.sum(score * np.einsum("vij,vj->vi", np.linalg.pinv(told, _TOLD, hermitian=True), score))
     return bool(2.0 * taken > np.sum(model.placed_score**2)) or _seems_to_move(model)
 
 
@@ -210,11 +213,8 @@ def _seems_to_move(model: Linearised) -> bool:
     Beside what else displaces views they move by less. Where they moved once, from some view on, pictures of two
     cameras were joined, or the lens was touched: that is told by `diagnose`, and not solved for.
     """
-    columns = model.equations.intrinsics[:, _CENTRE] * model.weight[:, None]
-    beyond = np.where(model.used[:, None], model.beyond_private(columns), 0.0)
-    starts = model.equations.bounds[:-1]
-    told = np.maximum(np.add.reduceat(beyond**2, starts), 1e-300)
-    score = np.add.reduceat(beyond * model.placed_score[:, None], starts)
+    whole_told, score = _of_views(model, model.equations.intrinsics[:, _CENTRE])
+    told = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2), 1e-300)
     least, once = (0.75 * _LEAST_PX) ** 2 * np.sum(told), 0.25  # share of the variance that one step leaves
 
     def about_mean(views: slice) -> float:
@@ -222,8 +222,16 @@ def _seems_to_move(model: Linearised) -> bool:
         return float(np.sum((score[views] - told[views] * mean) ** 2 / told[views] - 1.0))
 
     whole = about_mean(slice(0, None))
-    steps = (about_mean(slice(0, at)) + about_mean(slice(at, None)) for at in range(1, len(starts)))
+    steps = (about_mean(slice(0, at)) + about_mean(slice(at, None)) for at in range(1, len(score)))
     return whole > least and min(steps) > once * whole
+
+
+def _of_views(model: Linearised, columns: Array) -> tuple[Array, Array]:
+    """What each view says by itself of coefficients, columns (E, Q), px per px: information (V, Q, Q), score (V, Q)."""
+    beyond = np.where(model.used[:, None], model.beyond_private(columns * model.weight[:, None]), 0.0)
+    both, bounds = np.column_stack([beyond, model.placed_score]), model.equations.bounds
+    sums = np.array([beyond[start:stop].T @ both[start:stop] for start, stop in pairwise(bounds)])
+    return sums[:, :, :-1], sums[:, :, -1]
 
 
 def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
@@ -264,7 +272,7 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     }
     others = repeated.rest + sum(own for kind, own in squares.items() if kind not in (_IMAGE, _READ_OUT))
     rolling = views >= enough_views and squares.get(_READ_OUT, 0.0) > says_most * others
-    return (found if rolling or found.get(_CENTRE_OF_VIEW, 0.0) > _LEAST_PX else {}), repeated.noise
+    return (found if rolling or _centre_moves(found) else {}), repeated.noise
 
 
 def _predicted(
@@ -283,7 +291,7 @@ def _predicted(
     modes, shared = _modes(equations), model.shared.shape[1]
     beyond = np.where(model.used[:, None], model.beyond_private(modes * model.weight[:, None]), 0.0)
     both = np.column_stack([beyond, model.shared * np.sqrt(noise), model.placed_score])
-    parts = zip(equations.bounds, equations.bounds[1:], strict=False)
+    parts = pairwise(equations.bounds)
     sums = np.array([beyond[start:stop].T @ both[start:stop] for start, stop in parts]) / noise
     width = modes.shape[1]
     told, common, slope = sums[:, :, :width], sums[:, :, width:-1], sums[:, :, -1:]
