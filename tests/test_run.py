@@ -118,4 +118,6 @@ def test_what_is_no_video(tmp_path: Path) -> None:
 def test_a_plan_names_the_first_of_many_photographs() -> None:
     many = " ".join(f"{number}.jpg" for number in range(9))
     assert _short(f"ceres-cal detect board {many} --rows 6") == "ceres-cal detect board 0.jpg ... --rows 6"
+    shown = " ".join(f"--images {number}.jpg" for number in range(9))
+    assert _short(f"ceres-cal calibrate x.json {shown}") == "ceres-cal calibrate x.json --images 0.jpg ..."
     assert _short("ceres-cal detect field 0.jpg 1.jpg -o x") == "ceres-cal detect field 0.jpg 1.jpg -o x"

@@ -178,7 +178,9 @@ def _exported(args: RunArguments, form: str, goal: str) -> _Step:
 
 
 def _sections(args: RunArguments, images: Sequence[Path], steps: Sequence[_Step], level: str) -> Iterator[Section]:
-    yield Section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])
+    more = ", ..." if len(args.images) > _MOST_NAMES else ""
+    named = ", ".join(args.images[:_MOST_NAMES])
+    yield Section("read", [f"{plural(len(images), 'photograph')} in {named}{more}"])
     for number, step in enumerate(steps, start=1):
         yield _BLANK
         yield Section(f"step {number}", [_short(step.command)])
@@ -195,11 +197,12 @@ def _made(args: RunArguments, steps: Sequence[_Step]) -> set[str]:
 
 
 def _short(command: str) -> str:
-    """A command with the first of its photographs only."""
+    """A command with the first of its photographs only, and of the options that name the others."""
     words = shlex.split(command)
-    images = [word for word in words if Path(word).suffix.lower() in IMAGE_ENDINGS]
-    if len(images) <= _MOST_NAMES:
+    places = [place for place, word in enumerate(words) if Path(word).suffix.lower() in IMAGE_ENDINGS]
+    if len(places) <= _MOST_NAMES:
         return command
-    kept = [word for word in words if word not in images[1:]]
-    place = kept.index(images[0])
-    return f"{shlex.join(kept[: place + 1])} ... {shlex.join(kept[place + 1 :])}"
+    first, *others = places
+    gone = {*others, *(place - 1 for place in others if words[place - 1] == "--images")}
+    after = [word for place, word in enumerate(words) if place > first and place not in gone]
+    return " ".join(filter(None, (shlex.join(words[: first + 1]), "...", shlex.join(after))))

@@ -46,8 +46,8 @@ _MOVES_WORDS = (
 )
 _ROLLING_WORDS = (
     "its pictures are bent by {px} px rms, each in its own way, as where rows are read out one after the other "
-    "(rolling shutter) while the camera or the target moves (most in {named}). It was solved for in each; a place in "
-    "a single picture may be as far off. Hold both still"
+    "(rolling shutter) while the camera or the target moves (most in {named}). A place in a single picture may be as "
+    "far off. Hold both still"
 )
 # What a view's coefficients are, in their order, how many, and what is expected of them; those of all views come last.
 _CENTRE_OF_VIEW, _READ_OUT = "principal point", "read-out"
