@@ -75,7 +75,7 @@ class PriorCost(CachedCost):
         self.set_num_residuals(len(self._root))
         self.set_parameter_block_sizes([part.size for part in self._parts])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
         off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
         for part, block in blocks:
             off[part.columns] += part.values(block)
