@@ -82,7 +82,7 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 
 DECIDING: tuple[Constant, ...] = (
     *_of("problem.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
-    *_of("problem.ranges", "PHI_RANGE _BUILT _REDRAWN", "calibrate"),
+    *_of("problem.quantities", "PHI_RANGE _BUILT _REDRAWN", "calibrate"),
     *_of("observations.validation", "_SIGMA_RATIO _FAR", "calibrate"),
     *_of("robust.usable", "_OFF_CENTRE", "calibrate"),
     *_of("robust.usable", "_NO_FIT", "calibrate"),
@@ -127,11 +127,11 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.uncertainty", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
     *_of("posterior.assess", "_MOST_DOUBT", "verdicts"),
     *_of("posterior.other_lenses", "_PARTS", "verdicts"),
-    *_of("posterior.reading", "_LARGER", "verdicts"),
+    *_of("posterior.maps", "_LARGER", "verdicts"),
     *_of("posterior.mixture", "_FLAT", "verdicts"),
     *_of("posterior.uncertainty", "_LEARNT", "verdicts"),
     *_of("posterior.bent", "BENDING", "verdicts"),
-    *_of("effects.likelihood", "_LOUD _MATTERS", "verdicts"),
+    *_of("effects.strands", "_LOUD _MATTERS", "verdicts"),
     *_of("problem.noise", "_TAIL", "calibrate"),
     *_of("problem.priors", "_USUAL_ASPECT _USUAL_DECENTRING", "calibrate", "verdicts"),
     *_of("robust.as_built", "_UNMEASURED", "calibrate"),

@@ -13,8 +13,7 @@ from ceres_cal.problem.noise import Inliers, NoiseScales, relative_lengths
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.robust.deleted import Fitted, by_deleted_residuals, deleted_lengths
-from ceres_cal.robust.robust import solve_robustly
+from ceres_cal.robust.robust import Fitted, by_deleted_residuals, deleted_lengths, solve_robustly
 from ceres_cal.simulate import Disturbance, simulate
 
 NOISE_PX = 0.3

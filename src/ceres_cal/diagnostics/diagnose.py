@@ -20,10 +20,9 @@ from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.effects.columns import EffectSums, least_absolute
 from ceres_cal.effects.effect import Finding
-from ceres_cal.effects.joint import JointStep, joint_step
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
 from ceres_cal.effects.score_tests import select
-from ceres_cal.effects.table import EFFECTS, columns_of_all
+from ceres_cal.effects.table import EFFECTS, JointStep, columns_of_all, joint_step
 from ceres_cal.effects.table.targets import CurveAside, PointAside
 from ceres_cal.observations import Observations
 from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, judge, relative_lengths

@@ -23,8 +23,7 @@ from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Information, over
 from ceres_cal.problem.parameters import Estimate, unit_px
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import difference, moved
-from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.quantities import PHI_RANGE, difference, moved
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.robust.competing import Explanation
 from ceres_cal.robust.conflicts import Conflicts
