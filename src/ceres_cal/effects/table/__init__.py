@@ -13,9 +13,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.effect import CameraEffect, Case, Effect
-from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.quantities import free_keys
