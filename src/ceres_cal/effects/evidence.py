@@ -214,10 +214,10 @@ def agreement(scores: Array) -> float:
     The derivative of the evidence by a common variance at size zero, without what each group says by itself: products
     of different groups alone, over their standard deviation. A score test (Rao 1948); 0 of one group.
     """
-    total, each = scores.sum(axis=0), scores**2
+    total, each = scores.sum(axis=0), scores * scores
     squares = each.sum(axis=0)
-    variance = 2.0 * float(np.sum(squares**2) - np.sum(each**2))
-    return float(np.sum(total**2 - squares)) / np.sqrt(variance) if variance > 0.0 else 0.0
+    variance = 2.0 * float(squares @ squares - np.einsum("sq,sq->", each, each))
+    return float(total @ total - squares.sum()) / np.sqrt(variance) if variance > 0.0 else 0.0
 
 
 def shifts_by(taken: Array, moment: Array) -> Array:

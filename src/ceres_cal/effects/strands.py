@@ -168,10 +168,6 @@ class StrandFamily(Frozen):
         """The strands of each shape."""
         return [slice(*ends) for ends in pairwise(self.bounds.tolist())]
 
-    def per_strand(self, values: Array) -> Array:
-        """(S, ...) of values (D, ...) of each shape."""
-        return np.repeat(values, np.diff(self.bounds), axis=0)
-
     @cached_property
     def gap(self) -> float:
         """Median distance to the nearest neighbour, m; 0 where no strand has two places."""

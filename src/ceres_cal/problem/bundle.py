@@ -194,12 +194,13 @@ class _Assembly:
 def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     private, sights, layout = problem.private, problem.sights, problem.layout
     blocks = _ParameterBlocks.pack(estimate, layout, private)
-    assembly, posed = _Assembly(blocks, [], []), set[str]()
+    assembly, stated = _Assembly(blocks, [], []), problem.stated_at(estimate)
     for camera in estimate.cameras:
         own = sights.numbers(camera, placements=private)
         if len(own):
-            posed.add(camera)
-            cost = EliminatedCost(run, sights.take(own), problem, estimate)
+            of_camera = [PriorCost(run, prior, estimate, layout) for prior in stated if prior.is_of(camera)]
+            stated = [prior for prior in stated if not prior.is_of(camera)]
+            cost = EliminatedCost(run, sights.take(own), problem, estimate, [one.evaluated for one in of_camera])
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
     for number, key in enumerate(sights.keys):
@@ -212,8 +213,9 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     if problem.elsewhere is not None:
         more = problem.elsewhere.cost(run, problem, estimate)
         assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
+    posed = {cost.camera for cost, _ in assembly.eliminated}
     smooth = (problem.smooth_at(estimate, name) for name in estimate.cameras if name not in posed)
-    for prior in (*problem.stated_at(estimate), *chain.from_iterable(smooth)):
+    for prior in (*stated, *chain.from_iterable(smooth)):
         prior_cost = PriorCost(run, prior, estimate, layout)
         assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
     return assembly

@@ -52,15 +52,18 @@ class CostValue(NamedTuple):
     jacobians: Sequence[Array]
 
 
+Evaluated = Callable[[Array, Sequence[Array]], CostValue]
+"""What answers in a place, whole and by blocks."""
+
 CostFunction: Any = pyceres.CostFunction  # which has no types
 
 
 class CachedCost(CostFunction):
-    """A cost function; what it costs is `_evaluated`: the answer in a place, whole and by blocks; None where an
+    """A cost function; what it costs is `evaluated`: the answer in a place, whole and by blocks; None where an
     observation cannot be projected from there. pyceres' metaclass lets no class with abstract methods join.
     """
 
-    _evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
+    evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
 
     def __init__(self, run: Run) -> None:
         super().__init__()
@@ -73,7 +76,7 @@ class CachedCost(CostFunction):
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or self._known.at.tobytes() != at.tobytes():
-                self._known = self._evaluated(at, parameters)
+                self._known = self.evaluated(at, parameters)
             known = self._known
         if known is None:
             return False
@@ -145,12 +148,12 @@ class SightCost(_SightsCost):
 
     def block(self, parameters: Sequence[Array]) -> Array | None:
         """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
-        known = self._evaluated(kernels.NOTHING, parameters)
+        known = self.evaluated(kernels.NOTHING, parameters)
         if known is None:
             return None
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         structure = 3  # slot
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
@@ -191,9 +194,13 @@ class _Evaluation(Frozen):
 
 
 class EliminatedCost(_SightsCost):
-    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
+    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure; and
+    what is stated of these intrinsics: as blocks of their own Ceres would take as long over that as over all sights.
+    """
 
-    def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
+    def __init__(
+        self, run: Run, sights: Sights, problem: Problem, estimate: Estimate, stated: Sequence[Evaluated] = ()
+    ) -> None:
         super().__init__(run, sights, problem, estimate)
         free, count = self._unknowns.free, len(self._structure.values)
         self._size = len(free) + count
@@ -204,11 +211,11 @@ class EliminatedCost(_SightsCost):
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._last = self._accepted
-        self._smooth = _smoothness(problem, estimate, self.camera, self._size)
+        self._smooth, self._stated = _smoothness(problem, estimate, self.camera, self._size), stated
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self._take((len(free), 0, 0, count), (len(free) > 0, False, False, count > 0), self._size + 1)
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
         if last is None:
             return None
@@ -224,7 +231,7 @@ class EliminatedCost(_SightsCost):
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
             swept = self._swept(at, tolerance, newton)
-            cost = float(np.sum(swept.costs)) + self._add_smoothness(at, swept.reduced)
+            cost = float(np.sum(swept.costs)) + self._add_known(at, swept.reduced)
             if not np.isfinite(cost):
                 return None
             kernels.cholesky(swept.reduced, upper)
@@ -236,16 +243,20 @@ class EliminatedCost(_SightsCost):
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
 
-    def _add_smoothness(self, at: Array, reduced: Array) -> float:
-        """What the lens's roughness costs, once its normal equations are added: as residuals of its own Ceres would
-        take as long over it as over all sights.
-        """
-        if self._smooth is None:
-            return 0.0
-        slope = self._smooth @ at
-        reduced[:-1, :-1] += self._smooth
-        reduced[-1, :-1] += slope
-        return float(at @ slope)
+    def _add_known(self, at: Array, reduced: Array) -> float:
+        """What is stated of the camera and its lens's roughness cost, once their normal equations are added."""
+        cost, numbers = 0.0, at[: len(self._unknowns.free)]
+        if self._smooth is not None:
+            slope = self._smooth @ at
+            reduced[:-1, :-1] += self._smooth
+            reduced[-1, :-1] += slope
+            cost = float(at @ slope)
+        for known in (evaluated(numbers, [numbers]) for evaluated in self._stated):
+            jacobian = known.jacobians[0].reshape(-1, len(numbers))
+            reduced[: len(numbers), : len(numbers)] += jacobian.T @ jacobian
+            reduced[-1, : len(numbers)] += known.residuals @ jacobian
+            cost += float(known.residuals @ known.residuals)
+        return cost
 
     def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
         """Every placement brought to its best in a place, from the last accepted one."""
@@ -360,7 +371,7 @@ class PriorCost(CachedCost):
         self.set_num_residuals(len(self._root))
         self.set_parameter_block_sizes([part.size for part in self._parts])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
         off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
         for part, block in blocks:
             off[part.columns] += part.values(block)

@@ -152,7 +152,8 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
         width, height = camera.image_size
         off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
         own = end.problem.sights.of_camera(name)
-        reach = np.concatenate([own.pixels, own.curve_pixels]).max(axis=0, initial=0.0)
+        seen = own.pixels, own.curve_pixels
+        reach = np.array([max(float(np.max(one[:, k], initial=0.0)) for one in seen) for k in (0, 1)])
         if off_px > _OFF_CENTRE * np.hypot(width, height) or _suits_another(camera, reach, off_px):
             warnings.append(
                 f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image of {width} x "
