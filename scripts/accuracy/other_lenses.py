@@ -64,8 +64,12 @@ def _rational(at: Array) -> Array:
 
 
 def _tilted_sensor(at: Array) -> Array:
-    seen = _brown((-0.2, 0.05, 0.0), (0.0, 0.0), at)
-    return np.asarray(seen / (1.0 + 0.012 * seen[:, :1] - 0.02 * seen[:, 1:]))
+    """A sensor that is turned about the axis's foot by 1.1 and 0.7 degrees, whose rows and columns stay perpendicular:
+    OpenCV's tauX and tauY.
+    """
+    turn = rotation_exp(np.array([0.02, 0.012, 0.0]))
+    seen = np.column_stack([_brown((-0.2, 0.05, 0.0), (0.0, 0.0), at), np.ones(len(at))]) @ turn
+    return np.asarray(turn[2, 2] * seen[:, :2] / seen[:, 2:] - turn[2, :2])
 
 
 def _division(angle: Array) -> Array:

@@ -3,12 +3,6 @@
 The covariance of a strand's residuals is R = s^2 [(1 - a) 1 + a exp(-d / l)]. One set of eigenvectors serves all shares
 a of a length l, and all strands of one shape. Private placements are eliminated, and what all other rows and the priors
 say of the shared numbers is a prior here.
-
-Is there any correlation to look for? Score tests at three lengths, which cost no likelihood.
-
-That of a share a of nothing is r' K r with K = exp(-d / l) - 1, against its expectation -tr(K H) and its variance under
-independent errors, of which the fit took up the part H = U U'. Summed over the strands of one shape first, r r' and H
-serve all lengths.
 """
 
 from __future__ import annotations
@@ -20,50 +14,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.frozen import Frozen
-from ceres_cal.effects.strands import StrandFamily, decay
+from ceres_cal.effects.strands import ASIDE, StrandFamily, decay
+from ceres_cal.kernels import strands_left
 from ceres_cal.observations import joined
 
-ASIDE = 20.0
-"""Times the longest strand: the length of what moves it as a whole."""
-# The likelihood is asked from so many standard deviations of a score test on (one in five of white noise), if the
-# correlation that is likely by it would widen the variance of what is shared by so much.
-_LOUD, _MATTERS = 0.85, 0.08
-
-
-def is_loud(family: StrandFamily) -> bool:
-    """Whether neighbours, nearby rows or whole strands agree more than they do in one of five sets of white noise."""
-    no_noise = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
-    gap, longest, sums = family.gap, family.longest, np.diagonal(family.products)
-    noise = sums[-1] / max(np.count_nonzero(family.filled) - np.sum(sums[:-1]), 1.0)
-    if gap == 0.0 or noise < no_noise:
-        return False
-    residuals, private, shared = (family.squared(s) for s in (slice(-1, None), slice(6), slice(6, -1)))
-    agreement, count = residuals / noise + private + shared, np.diff(family.bounds)
-    for length in (gap, np.sqrt(gap * longest), ASIDE * longest):
-        together = np.exp(-family.distance / length) * (family.distance > 0.0)
-        squares = float(count @ np.sum(together**2, axis=(1, 2)))
-        total = float(np.sum(together * agreement))
-        widening = total / squares * float(np.sum(together * shared) / np.sum(sums[6:-1]))
-        least = 0.2 * squares
-        if widening <= _MATTERS or total <= _LOUD * np.sqrt(least):
-            continue
-        if total > _LOUD * np.sqrt(max(_variance(family, together, squares), least)):
-            return True
-    return False
-
-
-def _variance(family: StrandFamily, together: Array, squares: float) -> float:
-    """Of the score at the matrices (D, M, M), whose squared entries add up to so much over all strands."""
-    taken, along = family.columns[..., :-1], family.applied(together)[..., :-1]
-    inner = np.swapaxes(taken, 1, 2) @ along
-    return float(2.0 * (squares - 2.0 * np.sum(along**2) + np.sum(inner**2)))
-
-
-# To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %. In parts: the next one is left out
-# where the likelihood falls over the one before it to nothing.
-_SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
-
-_Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
+# To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %.
+_SHARES = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.995])
 
 
 class Likelihoods(Frozen):
@@ -92,18 +48,9 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
         may_be_smooth: whether errors without edges are looked for, too.
         squared: sum of the squared shared columns over all rows, of which the families show some.
     """
-    nothing = 6.0  # nats below the best: less than the share of a place that is left out
-    parts = [_independent(families[0], squared)]
-    best = float(parts[0].log[0])
+    parts = [_of_shares(families[0], (0, False, 0.0), np.zeros(1), squared)]
     for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
-        for length in _lengths(family):
-            at, falls = _eigenbasis(family, length, smooth), False
-            for shares in _SHARES:
-                place = number, smooth, length
-                part = (_impossible if falls else _of_shares)(family, at, shares, squared, place)
-                parts.append(part)
-                best = max(best, float(part.log.max()))
-                falls = bool(part.log[-1] < min(best - nothing, part.log[-2]))
+        parts += [_of_shares(family, (number, smooth, length), _SHARES, squared) for length in _lengths(family)]
     return joined(parts)
 
 
@@ -118,74 +65,29 @@ def _lengths(family: StrandFamily) -> list[float]:
     return list(lengths.tolist())
 
 
-_Diagonal = tuple[Array, Array]
-"""A family where its correlation is diagonal: (S, M) eigenvalues, and (S, M, Z) the columns along its eigenvectors."""
+def _of_shares(family: StrandFamily, place: tuple[int, bool, float], shares: Array, squared: float) -> Likelihoods:
+    """The restricted likelihood at one place for some shares (A,).
 
-
-def _eigenbasis(family: StrandFamily, length: float, smooth: bool) -> _Diagonal:
-    """At one length."""
-    values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
-    return family.per_strand(np.maximum(values, 0.0)), family.applied(np.swapaxes(vectors, 1, 2))
-
-
-def _independent(family: StrandFamily, squared: float) -> Likelihoods:
-    """The likelihood of independent errors."""
-    at = family.filled.astype(float), family.columns
-    return _of_shares(family, at, np.zeros(1), squared, (0, False, 0.0))
-
-
-def _of_shares(family: StrandFamily, at: _Diagonal, shares: Array, squared: float, place: _Place) -> Likelihoods:
-    """The restricted likelihood at one place for some shares (A,)."""
-    fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
-    values, columns = at
-    diagonal, white = 1.0 - shares[:, None, None] * (1.0 - values), np.einsum("smz,smz->sm", *[columns[..., 6:-1]] * 2)
-    logs, reduced, taken = _without_private(columns / np.sqrt(diagonal)[..., None], family.group)
-    size, count = columns.shape[2] - 7, int(np.count_nonzero(family.filled))
-    log, variance, freedom = _restricted(family, reduced, count - taken)
-    parts = (1.0 - shares) * white.sum(), shares * np.sum(white * values)
-    few = max(count**2 / float(np.sum(values**2)) - (0 if taken else size), fewest_freedom)
-    inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
-    scale = squared / max(float(white.sum()), 1e-300)  # of all rows to those looked at
-    number, smooth, length_m = (np.full(len(shares), one) for one in place)
-    return Likelihoods(
-        number,
-        smooth,
-        length_m,
-        shares,
-        log - 0.5 * (np.log(diagonal).sum(axis=(1, 2)) + logs),
-        variance,
-        scale * (parts[0] + parts[1]),
-        inverse,
-    )
-
-
-def _impossible(family: StrandFamily, at: _Diagonal, shares: Array, squared: float, place: _Place) -> Likelihoods:
-    """Shares that need not be looked at."""
-    number, smooth, length = (np.full(len(shares), one) for one in place)
-    one = np.ones(len(shares))
-    return Likelihoods(number, smooth, length, shares, -np.inf * one, one, one, one)
-
-
-def _without_private(columns: Array, group: Indices) -> tuple[Array, Array, int]:
-    """The private placement of each view eliminated from products of columns (A, S, M, Z): logarithms of the
-    determinants (A,), what is left over of all (A, P + 1, P + 1), and how many numbers were eliminated.
+    Args:
+        place: number of the family, whether errors have no edges, length; 0 of none.
     """
-    count, size = len(columns), columns.shape[-1] - 6
-    shared = columns[..., 6:].reshape(count, -1, size)
-    rest = np.swapaxes(shared, 1, 2) @ shared
-    views, view = np.unique(group, return_inverse=True)
-    products = (np.swapaxes(columns[..., :6], 2, 3) @ columns).reshape(count, len(view), -1)
-    whole = ((np.arange(len(views))[:, None] == view).astype(float) @ products).reshape(count, -1, 6, 6 + size)
-    own, coupling = whole[..., :6], whole[..., 6:]
-    there = np.diagonal(own, axis1=2, axis2=3) > 1e-9
-    taken = int(np.count_nonzero(there[0]))
-    if not taken:
-        return np.zeros(count), rest, 0
-    own = np.where(there[..., :, None] & there[..., None, :], own, np.eye(6))
-    coupling = np.where(there[..., :, None], coupling, 0.0)
-    eliminated = np.linalg.solve(own, coupling).reshape(count, -1, size)
-    rest -= np.swapaxes(coupling.reshape(count, -1, size), 1, 2) @ eliminated
-    return np.linalg.slogdet(own)[1].sum(axis=1), rest, taken
+    fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
+    size, count, many = family.columns.shape[2] - 7, int(np.count_nonzero(family.filled)), len(shares)
+    values, vectors = np.linalg.eigh(decay(family.distance, place[2] or 1.0, place[1]))
+    values, rows = np.maximum(values, 0.0), np.swapaxes(family.applied(np.swapaxes(vectors, 1, 2)), 0, 1)
+    logs, left = np.zeros(many), np.zeros((many, size + 1, size + 1))
+    taken = strands_left(values, family.bounds, family.group, rows, shares, logs, left)
+    log, variance, freedom = _restricted(family, left, count - taken)
+    sizes = np.add.reduceat(np.einsum("msz,msz->ms", *[rows[..., 6:-1]] * 2), family.bounds[:-1], axis=1)
+    white, together = float(np.sum(sizes)), float(np.sum(values.T * sizes))
+    parts = (1.0 - shares) * white, shares * together
+    squares = float(np.diff(family.bounds) @ np.sum(values**2, axis=1))
+    few = max(count**2 / squares - (0 if taken else size), fewest_freedom)
+    inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
+    scale = squared / max(white, 1e-300)  # of all rows to those looked at
+    number, smooth, length_m = (np.full(many, one) for one in place)
+    trace = scale * (parts[0] + parts[1])
+    return Likelihoods(number, smooth, length_m, shares, log - 0.5 * logs, variance, trace, inverse)
 
 
 def _restricted(family: StrandFamily, reduced: Array, count: int) -> tuple[Array, Array, float]:

@@ -269,3 +269,24 @@ def sight_normals(
     costs = np.empty(last - first)
     core().sight_normals(first, last, optics, unknowns, points, curves, loss, False, poses, units, costs, normals)
     return bool(np.isfinite(costs).all())
+
+
+# ---- errors that go together ----------------------------------------------------------------------------------------
+
+
+def strands_left(
+    values: Array, bounds: Indices, group: Indices, rows: Array, shares: Array, logs: Array, left: Array
+) -> int:
+    """What strands of observations leave where a share a of their variance goes together: of R = (1 - a) 1 + a K.
+
+    Args:
+        values: (D, M) eigenvalues of each shape's K; bounds: (D + 1,) where its strands begin.
+        rows: (M, S, Z) along the eigenvectors: six of private placements, those of what is shared, the residual.
+        group: (S,) whose private placement it is. shares: (A,).
+        logs: (A,) the determinants of all R and of what private placements are known by, added up.
+        left: (A, Z - 6, Z - 6) X^T R^-1 X, private placements eliminated, added up.
+
+    Returns:
+        How many numbers were eliminated.
+    """
+    return int(core().strands_left(values, bounds, group, rows, shares, logs, left))

@@ -1,10 +1,6 @@
-"""Cost functions of the observations, and the numbers of a camera as Ceres moves them.
+"""Cost functions of the observations and of priors.
 
 What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++.
-
-A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
-height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps. In
-coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
 """
 
 from __future__ import annotations
@@ -17,15 +13,17 @@ import numpy as np
 import pyceres
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales, unit_px
+from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
+from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
+from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, logarithmic
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.problem.structure import Structure
-from ceres_cal.scene.camera import Camera
 
 
 @dataclass(eq=False)
@@ -54,15 +52,18 @@ class CostValue(NamedTuple):
     jacobians: Sequence[Array]
 
 
-_CostFunction: Any = pyceres.CostFunction  # which has no types
+Evaluated = Callable[[Array, Sequence[Array]], CostValue]
+"""What answers in a place, whole and by blocks."""
+
+CostFunction: Any = pyceres.CostFunction  # which has no types
 
 
-class CachedCost(_CostFunction):
-    """A cost function; what it costs is `_evaluated`: the answer in a place, whole and by blocks; None where an
+class CachedCost(CostFunction):
+    """A cost function; what it costs is `evaluated`: the answer in a place, whole and by blocks; None where an
     observation cannot be projected from there. pyceres' metaclass lets no class with abstract methods join.
     """
 
-    _evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
+    evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
 
     def __init__(self, run: Run) -> None:
         super().__init__()
@@ -75,7 +76,7 @@ class CachedCost(_CostFunction):
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or self._known.at.tobytes() != at.tobytes():
-                self._known = self._evaluated(at, parameters)
+                self._known = self.evaluated(at, parameters)
             known = self._known
         if known is None:
             return False
@@ -147,12 +148,12 @@ class SightCost(_SightsCost):
 
     def block(self, parameters: Sequence[Array]) -> Array | None:
         """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
-        known = self._evaluated(kernels.NOTHING, parameters)
+        known = self.evaluated(kernels.NOTHING, parameters)
         if known is None:
             return None
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         structure = 3  # slot
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
@@ -193,9 +194,13 @@ class _Evaluation(Frozen):
 
 
 class EliminatedCost(_SightsCost):
-    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
+    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure; and
+    what is stated of these intrinsics: as blocks of their own Ceres would take as long over that as over all sights.
+    """
 
-    def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
+    def __init__(
+        self, run: Run, sights: Sights, problem: Problem, estimate: Estimate, stated: Sequence[Evaluated] = ()
+    ) -> None:
         super().__init__(run, sights, problem, estimate)
         free, count = self._unknowns.free, len(self._structure.values)
         self._size = len(free) + count
@@ -206,11 +211,11 @@ class EliminatedCost(_SightsCost):
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._last = self._accepted
-        self._smooth = _smoothness(problem, estimate, self.camera, self._size)
+        self._smooth, self._stated = _smoothness(problem, estimate, self.camera, self._size), stated
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self._take((len(free), 0, 0, count), (len(free) > 0, False, False, count > 0), self._size + 1)
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
         if last is None:
             return None
@@ -226,7 +231,7 @@ class EliminatedCost(_SightsCost):
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
             swept = self._swept(at, tolerance, newton)
-            cost = float(np.sum(swept.costs)) + self._add_smoothness(at, swept.reduced)
+            cost = float(np.sum(swept.costs)) + self._add_known(at, swept.reduced)
             if not np.isfinite(cost):
                 return None
             kernels.cholesky(swept.reduced, upper)
@@ -238,16 +243,20 @@ class EliminatedCost(_SightsCost):
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
 
-    def _add_smoothness(self, at: Array, reduced: Array) -> float:
-        """What the lens's roughness costs, once its normal equations are added: as residuals of its own Ceres would
-        take as long over it as over all sights.
-        """
-        if self._smooth is None:
-            return 0.0
-        slope = self._smooth @ at
-        reduced[:-1, :-1] += self._smooth
-        reduced[-1, :-1] += slope
-        return float(at @ slope)
+    def _add_known(self, at: Array, reduced: Array) -> float:
+        """What is stated of the camera and its lens's roughness cost, once their normal equations are added."""
+        cost, numbers = 0.0, at[: len(self._unknowns.free)]
+        if self._smooth is not None:
+            slope = self._smooth @ at
+            reduced[:-1, :-1] += self._smooth
+            reduced[-1, :-1] += slope
+            cost = float(at @ slope)
+        for known in (evaluated(numbers, [numbers]) for evaluated in self._stated):
+            jacobian = known.jacobians[0].reshape(-1, len(numbers))
+            reduced[: len(numbers), : len(numbers)] += jacobian.T @ jacobian
+            reduced[-1, : len(numbers)] += known.residuals @ jacobian
+            cost += float(known.residuals @ known.residuals)
+        return cost
 
     def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
         """Every placement brought to its best in a place, from the last accepted one."""
@@ -287,65 +296,6 @@ class EliminatedCost(_SightsCost):
         return self._sights.keys, self._accepted.poses
 
 
-_PHI = 0  # of the intrinsics
-
-
-class Chart:
-    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
-    have made in Python.
-    """
-
-    def __init__(self, camera: Camera, free: Indices) -> None:
-        powers = np.array([0.0] * 4 + [order - 1.0 for order in camera.lens.orders] + [0.0])
-        self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
-
-    def moved(self, numbers: Array) -> Array:
-        """(K,) what Ceres moves, of the free numbers (K,)."""
-        return np.asarray(numbers / self._scales(numbers))
-
-    def numbers(self, moved: Array) -> Array:
-        """(K,) the free numbers again."""
-        return np.asarray(moved * self._scales(moved))
-
-    def chained(self, jacobian: Array, numbers: Array) -> Array:
-        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
-        chained = jacobian * self._scales(numbers)
-        chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
-        return np.asarray(chained)
-
-    def _scales(self, numbers: Array) -> Array:
-        nothing = 1e-30  # phi may be 0 on the way: no camera, which shows nothing
-        return np.asarray((numbers[self._phi] / self._unit or nothing) ** self._powers)
-
-
-def chart_of(camera: Camera, free: Indices) -> Chart | None:
-    """None where the numbers are moved as they are."""
-    return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
-
-
-class ChartedCost(_CostFunction):
-    """A cost function over what Ceres moves, of one over the numbers themselves."""
-
-    def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:
-        super().__init__()
-        self._run, self._cost, self._charts = run, cost, charts
-        self.set_num_residuals(cost.num_residuals())
-        self.set_parameter_block_sizes(cost.parameter_block_sizes())
-
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        with self._run:
-            numbers = [
-                chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
-            ]
-            if not self._cost.Evaluate(numbers, residuals, jacobians):
-                return False
-            for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
-                if chart:
-                    jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
-            return True
-        return False
-
-
 def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> Array | None:
     """(size, size) what is known of a lens's roughness, by the numbers of its camera's block; None of nothing."""
     camera, whole = estimate.cameras[name], None
@@ -356,3 +306,116 @@ def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> A
         whole = np.zeros((size, size)) if whole is None else whole
         whole[np.ix_(at, at)] += scales[:, None] * prior.information.matrix * scales
     return whole
+
+
+# ---- a prior's block: root (x - mean) over every camera, station and structure number that it speaks of ------------
+
+
+class _Linear(NamedTuple):
+    """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
+
+    columns: list[int]
+    slots: list[int]
+    scales: Array
+    size: int
+
+    def values(self, block: Array) -> Array:
+        """(n,) in the units of the keys."""
+        return np.asarray(block[self.slots] * self.scales)
+
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, size) derivatives by the block of root (R, n) times the values."""
+        slopes = np.zeros((len(root), self.size))
+        slopes[:, self.slots] = root * self.scales
+        return slopes
+
+
+class _StationCoordinates(NamedTuple):
+    """A station's position, and its turn from the prior's rotation about its own axes."""
+
+    columns: list[int]
+    rows: list[int]
+    rotation: Array
+    size: int = 6
+
+    def values(self, block: Array) -> Array:
+        """(n,) in the units of the keys."""
+        pose = Pose.exp(block)
+        turn = rotation_log(pose.rotation @ self.rotation.T)
+        return np.concatenate([pose.position, turn])[self.rows]
+
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, 6) derivatives of root (R, n) times the values by the rotation vector and the translation."""
+        inverse, left = rotation_exp(block[:3]).T, left_jacobian(block[:3])
+        slopes = np.zeros((6, 6))
+        slopes[:3] = np.hstack([-inverse @ skew(block[3:]) @ left, -inverse])
+        turn = rotation_log(inverse.T @ self.rotation.T)
+        slopes[3:, :3] = np.linalg.solve(left_jacobian(turn), left)
+        return np.asarray(root @ slopes[self.rows])
+
+
+class PriorCost(CachedCost):
+    """root (x - mean), in standard deviations, of a prior on free numbers alone.
+
+    Attributes:
+        owners: whose blocks the solver hands over, as ("camera" or "station", name), or ("structure", "").
+    """
+
+    def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
+        super().__init__(run)
+        self._is_usual, self._is_log = prior.is_usual, prior.is_log
+        self._root, self._mean = prior.information.root, prior.mean
+        parts = dict(_parts(prior, estimate, layout))
+        self._parts = list(parts.values())
+        self.owners: list[tuple[str, str]] = list(parts)
+        self.set_num_residuals(len(self._root))
+        self.set_parameter_block_sizes([part.size for part in self._parts])
+
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
+        off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
+        for part, block in blocks:
+            off[part.columns] += part.values(block)
+        root = self._root
+        if self._is_log:
+            off, slope = logarithmic(off, self._mean)
+            root = root * slope
+        residuals = self._root @ off
+        if self._is_usual:
+            residuals, slope = _bent(residuals)
+            root = slope[:, None] * root
+        slopes = [part.slopes(block, root[:, part.columns]).reshape(-1) for part, block in blocks]
+        return CostValue(at, residuals, slopes)
+
+
+def _bent(residuals: Array) -> tuple[Array, Array]:
+    """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
+    near = 1e-6  # residuals that Cauchy's loss leaves as they are
+    weight = 1.0 / (1.0 + (residuals / USUAL_BENDS) ** 2)
+    bent = USUAL_BENDS * np.sign(residuals) * np.sqrt(np.log1p((residuals / USUAL_BENDS) ** 2))
+    far = np.abs(residuals) > near
+    return bent, np.where(far, weight * residuals / np.where(far, bent, 1.0), 1.0)
+
+
+def _parts(
+    prior: GaussianPrior, estimate: Estimate, layout: Layout
+) -> Sequence[tuple[tuple[str, str], _Linear | _StationCoordinates]]:
+    """The blocks that a prior depends on, by owner."""
+    parts: list[tuple[tuple[str, str], _Linear | _StationCoordinates]] = []
+    for (kind, owner), columns in columns_by_owner(prior.keys).items():
+        quantities = [prior.keys[column].quantity for column in columns]
+        if kind == "camera":
+            camera, free = estimate.cameras[owner], layout.free[owner].tolist()
+            numbers = [intrinsic_names(camera.lens).index(quantity) for quantity in quantities]
+            slots, scales = [free.index(number) for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
+            parts.append(((kind, owner), _Linear(columns, slots, scales, len(free))))
+        elif kind == "station":
+            rows = [STATION_QUANTITIES.index(quantity) for quantity in quantities]
+            # Without turns among its numbers any rotation will do.
+            rotation = prior.rotations.get(owner, estimate.stations[owner].cam_from_world.rotation)
+            parts.append(((kind, owner), _StationCoordinates(columns, rows, rotation)))
+    structure = [column for column, key in enumerate(prior.keys) if key.is_structure]
+    if structure:
+        names = estimate.structure.names
+        slots = [names.index(prior.keys[column].structure_name) for column in structure]
+        parts.append((("structure", ""), _Linear(structure, slots, np.ones(len(slots)), len(names))))
+    return parts

@@ -250,7 +250,7 @@ class SharedCost(CachedCost):
         self.set_num_residuals(rows)
         self.set_parameter_block_sizes(list(sizes.values()))
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         numbers = {owner: at[columns] for owner, columns in self._columns.items()}
         blocks = self._judged.engine.ask(Share.blocks, self._asked, numbers).of
         if blocks is None:

@@ -74,6 +74,10 @@ class GaussianPrior(Frozen):
             return len(self.information.root)
         return sum(key.quantity == "aspect" for key in self.keys)
 
+    def is_of(self, camera: str) -> bool:
+        """Whether it speaks of one camera's intrinsics alone."""
+        return all(key[:2] == ("camera", camera) for key in self.keys)
+
     def given(self, keys: Collection[Key]) -> GaussianPrior:
         """What it says of those of its numbers that are among the keys, with all others held at their mean."""
         own = self.information.among(keys)

@@ -17,10 +17,10 @@ from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals
+from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 
@@ -152,7 +152,8 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
         width, height = camera.image_size
         off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
         own = end.problem.sights.of_camera(name)
-        reach = np.concatenate([own.pixels, own.curve_pixels]).max(axis=0, initial=0.0)
+        seen = own.pixels, own.curve_pixels
+        reach = np.array([max(float(np.max(one[:, k], initial=0.0)) for one in seen) for k in (0, 1)])
         if off_px > _OFF_CENTRE * np.hypot(width, height) or _suits_another(camera, reach, off_px):
             warnings.append(
                 f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image of {width} x "

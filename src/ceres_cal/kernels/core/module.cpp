@@ -7,6 +7,7 @@
 #include "arguments.hpp"
 #include "planes.hpp"
 #include "saddles.hpp"
+#include "strands.hpp"
 #include "sums.hpp"
 
 namespace ceres_cal {
@@ -175,6 +176,29 @@ void fit_saddles(const Array<const float, N, N>& levels, const Read<N, Saddles::
     });
 }
 
+int64_t strands_left(const Read<N, N>& values, const Bounds& bounds, const Bounds& group, const Read<N, N, N>& rows,
+                     const Read<N>& shares, const Filled<N>& logs, const Filled<N, N, N>& left) {
+    const size_t shapes = values.shape(0), size = rows.shape(0), strands = rows.shape(1), numbers = rows.shape(2);
+    require(values.shape(1) == size && numbers > Strands::POSE, "values are (D, M), rows (M, S, Z) with Z over 6");
+    require(bounds.size() == shapes + 1 && group.size() == strands, "bounds are (D + 1,), group (S,)");
+    const size_t rest = numbers - Strands::POSE, many = shares.size();
+    require(logs.size() == many && left.shape(0) == many && left.shape(1) == rest && left.shape(2) == rest,
+            "logs are (A,), left (A, Z - 6, Z - 6)");
+    check_bounds(bounds, 0, static_cast<int64_t>(shapes), strands);
+    int64_t groups = 0;
+    for (size_t s = 0; s < strands; ++s) {
+        require(group.data()[s] >= 0 && group.data()[s] < INT32_MAX, "group: numbers from 0 on are needed");
+        groups = std::max(groups, group.data()[s] + 1);
+    }
+    return unlocked([&] {
+        Strands sums(whole(size), whole(strands), whole(numbers), rows.data(), group.data(), groups, whole(many),
+                     shares.data(), logs.data(), left.data());
+        for (int64_t d = 0; d < static_cast<int64_t>(shapes); ++d)
+            sums.add(static_cast<int>(bounds.data()[d]), static_cast<int>(bounds.data()[d + 1]), row(values, d));
+        return sums.eliminate();
+    });
+}
+
 // Whether the other build, for processors of x86-64-v3, runs here, and there is one.
 bool has_avx2() {
 #if !defined(CERES_CAL_HAS_V3)
@@ -201,6 +225,7 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("point_rows", &find_rows<PointsGiven, 2>);
     m.def("fit_saddles", &fit_saddles);
     m.def("curve_rows", &find_rows<CurvesGiven, 1>);
+    m.def("strands_left", &strands_left);
 }
 
 }  // namespace ceres_cal

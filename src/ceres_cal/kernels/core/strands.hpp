@@ -1,0 +1,109 @@
+// Errors that go together along strands of observations: what is left of these where they do (effects/likelihood.py).
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "dense.hpp"
+
+namespace ceres_cal {
+
+// Sums over strands, shape by shape, for some shares a of the variance that goes together: of correlation
+// R = (1 - a) 1 + a K, along the eigenvectors of K.
+class Strands {
+  public:
+    static constexpr int POSE = 6;
+
+    // rows (size, strands, numbers): six of a private placement, those of what is shared, the residual. group: (strands)
+    // whose placement it is, of so many. logs (shares) and left (shares, rest, rest) are added to.
+    Strands(int size, int strands, int numbers, const double* rows, const int64_t* group, int64_t groups, int shares,
+            const double* share, double* logs, double* left)
+        : size_(size), strands_(strands), numbers_(numbers), rest_(numbers - POSE), shares_(shares), groups_(groups),
+          rows_(rows), share_(share), group_(group), logs_(logs), left_(left),
+          placed_(static_cast<size_t>(shares * groups * POSE * numbers)) {}
+
+    // The strands from first to last, all of the same eigenvalues (size): log det R, and x^T R^-1 x.
+    void add(int first, int last, const double* values) {
+        const int own = POSE * numbers_, all = rest_ * rest_;
+        std::vector<double> weights(static_cast<size_t>(shares_ * size_));
+        for (int a = 0; a < shares_; ++a)
+            for (int m = 0; m < size_; ++m) {
+                const double variance = 1.0 - share_[a] * (1.0 - values[m]);
+                weights[static_cast<size_t>(size_ * a + m)] = 1.0 / variance;
+                logs_[a] += (last - first) * std::log(variance);
+            }
+        const auto spread = [&](const std::vector<double>& products, int count, double* to, int64_t apart) {
+            for (int a = 0; a < shares_; ++a)
+                for (int m = 0; m < size_; ++m)
+                    add_times(count, weights[static_cast<size_t>(size_ * a + m)], products.data() + count * m,
+                              to + apart * a);
+        };
+        rests_.assign(static_cast<size_t>(size_ * all), 0.0);
+        for (int s = first; s < last; ++s) {  // strands of a group follow one another, or are added one by one
+            if (s == first || group_[s] != group_[s - 1]) poses_.assign(static_cast<size_t>(size_ * own), 0.0);
+            for (int m = 0; m < size_; ++m) {
+                const double* x = rows_ + (static_cast<int64_t>(m) * strands_ + s) * numbers_;
+                for (int j = 0; j < POSE; ++j) add_times(numbers_, x[j], x, poses_.data() + own * m + numbers_ * j);
+                for (int j = 0; j < rest_; ++j)
+                    add_times(rest_, x[POSE + j], x + POSE, rests_.data() + all * m + rest_ * j);
+            }
+            if (s + 1 == last || group_[s + 1] != group_[s]) spread(poses_, own, placed(0, group_[s]), groups_ * own);
+        }
+        spread(rests_, all, left_, all);
+    }
+
+    // Private placements eliminated; how many numbers they are.
+    int64_t eliminate() {
+        int64_t taken = 0;
+        for (int a = 0; a < shares_; ++a)
+            for (int64_t g = 0; g < groups_; ++g) {
+                const int own = eliminate_one(placed(a, g), logs_[a], left_ + a * rest_ * rest_);
+                if (a == 0) taken += own;
+            }
+        return taken;
+    }
+
+  private:
+    static void add_times(int count, double factor, const double* of, double* to) {
+        CERES_CAL_INDEPENDENT
+        for (int i = 0; i < count; ++i) to[i] += factor * of[i];
+    }
+
+    double* placed(int a, int64_t g) { return placed_.data() + (a * groups_ + g) * POSE * numbers_; }
+
+    // placed (6, numbers) is one group's: its normal equations, and how they couple with the rest.
+    int eliminate_one(const double* placed, double& log, double* left) {
+        constexpr double NOTHING = 1e-9;
+        double normal[POSE * POSE] = {}, upper[POSE * POSE];
+        coupling_.assign(static_cast<size_t>(POSE * rest_), 0.0);
+        int taken = 0;
+        for (int j = 0; j < POSE; ++j) {
+            normal[(POSE + 1) * j] = 1.0;
+            if (!(placed[(numbers_ + 1) * j] > NOTHING)) continue;
+            ++taken;
+            for (int i = 0; i <= j; ++i)
+                if (placed[(numbers_ + 1) * i] > NOTHING) normal[POSE * j + i] = placed[numbers_ * j + i];
+            std::copy_n(placed + numbers_ * j + POSE, rest_, coupling_.data() + rest_ * j);
+        }
+        if (taken == 0) return 0;
+        cholesky(POSE, normal, POSE, upper);
+        solved_ = coupling_;
+        substitute(POSE, upper, solved_.data(), rest_);
+        for (int j = 0; j < POSE; ++j) {
+            if (upper[(POSE + 1) * j] > 0.0) log += 2.0 * std::log(upper[(POSE + 1) * j]);
+            for (int i = 0; i < rest_; ++i)
+                add_times(rest_, -coupling_[static_cast<size_t>(rest_ * j + i)], solved_.data() + rest_ * j,
+                          left + rest_ * i);
+        }
+        return taken;
+    }
+
+    int size_, strands_, numbers_, rest_, shares_;
+    int64_t groups_;
+    const double *rows_, *share_;
+    const int64_t* group_;
+    double *logs_, *left_;
+    std::vector<double> placed_, poses_, rests_, coupling_, solved_;
+};
+
+}  // namespace ceres_cal
