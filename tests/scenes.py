@@ -12,7 +12,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
-from ceres_cal.scene.lens.surface import COLUMNS, ROWS
+from ceres_cal.scene.lens.spline import COLUMNS, ROWS
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import BoardRanges, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
 

@@ -17,14 +17,15 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.effects.evidence import VIEW_ASIDE, Offsets, RandomEffects
+from ceres_cal.effects.aside import FeatureGroups, Offsets, groups_of
+from ceres_cal.effects.evidence import VIEW_ASIDE, RandomEffects
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference
 from ceres_cal.robust import competing
-from ceres_cal.robust import groups as compared
+from ceres_cal.robust import subproblem as compared
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Segment
@@ -321,11 +322,7 @@ def test_features_of_different_targets_are_different_wholes() -> None:
     observations = simulate(every, NOISE, seed=0).observations
     target = np.array([view.target for view in observations.views])
     owner = target[np.concatenate([observations.points.view, observations.curves.view])]
-    kinds = [
-        one
-        for one in compared.groups_of(observations, gather_sights(observations))
-        if isinstance(one, compared.FeatureGroups)
-    ]
+    kinds = [one for one in groups_of(observations, gather_sights(observations)) if isinstance(one, FeatureGroups)]
     assert len(kinds) == 2
     for wholes in kinds:
         assert all(len(set(owner[wholes.of == number])) == 1 for number in set(wholes.of.tolist()) - {-1})

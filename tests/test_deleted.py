@@ -9,11 +9,10 @@ from scenes import RADIAL, SCENES
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
-from ceres_cal.problem.noise import Inliers, NoiseScales, relative_lengths
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
-from ceres_cal.problem.residuals import residuals
-from ceres_cal.robust.deleted import Fitted, by_deleted_residuals, deleted_lengths
+from ceres_cal.problem.residuals import relative_lengths, residuals
+from ceres_cal.robust.noise import Fitted, Inliers, NoiseScales, by_deleted_residuals, deleted_lengths
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.simulate import Disturbance, simulate
 

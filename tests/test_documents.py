@@ -8,7 +8,7 @@ import pytest
 from data.documents import DOCUMENTS, Step, agree, differences, rewritten, run, steps_of
 
 from ceres_cal import InputError
-from ceres_cal.cli import chosen
+from ceres_cal.cli.terminal import chosen
 from data import documents
 
 # `python scripts/run.py documents` runs the others, too, which hold little else

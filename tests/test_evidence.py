@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.effects.columns import EffectColumns, EffectSums, SparseColumns, grouped
+from ceres_cal.effects.aside import measure_offsets
+from ceres_cal.effects.columns import EffectColumns, EffectSums, SparseColumns, grouped, score_all
 from ceres_cal.effects.effect import Case, half_diagonals
 from ceres_cal.effects.evidence import (
     FEATURE_ASIDE,
@@ -19,11 +20,9 @@ from ceres_cal.effects.evidence import (
     SizePrior,
     agreement,
     logsum,
-    measure_offsets,
 )
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
-from ceres_cal.effects.score_tests import score_all
 from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.effects.strands import decay, distances_of, families_of, views_or_placements
 from ceres_cal.effects.table import EFFECTS

@@ -15,9 +15,9 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
-from ceres_cal.problem.noise import USUAL_EQUATIONS
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance
+from ceres_cal.robust.noise import USUAL_EQUATIONS
 from ceres_cal.simulate import field_scene, simulate
 
 

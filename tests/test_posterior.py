@@ -11,9 +11,8 @@ import pytest
 from scenes import SCENES
 from scipy.stats import t as student
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Spread
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.spread import Spread
 from ceres_cal.base.tails import student_95
 from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibration.calibrating import calibrate
@@ -21,10 +20,9 @@ from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.posterior import make_posterior
 from ceres_cal.problem.bundle import _ParameterBlocks, solve
-from ceres_cal.problem.costs import Run, SightCost
+from ceres_cal.problem.costs import PriorCost, Run, SightCost
 from ceres_cal.problem.information import Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
-from ceres_cal.problem.prior_cost import PriorCost
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import difference, free_keys, moved

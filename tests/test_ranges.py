@@ -18,7 +18,7 @@ from ceres_cal.moves.refit_plan import RefitOptions
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Prior
 from ceres_cal.problem.parameters import Options
-from ceres_cal.problem.ranges import require_possible_numbers
+from ceres_cal.problem.quantities import require_possible_numbers
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.targets import custom
 from ceres_cal.simulate import Disturbance, simulate

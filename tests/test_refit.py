@@ -36,9 +36,8 @@ from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitOptions, carried_p
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.bundle import _ParameterBlocks
-from ceres_cal.problem.costs import Run
+from ceres_cal.problem.costs import PriorCost, Run
 from ceres_cal.problem.parameters import Layout, Options, Station
-from ceres_cal.problem.prior_cost import PriorCost
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.structure import Tolerance

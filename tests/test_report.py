@@ -22,8 +22,7 @@ from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
 from ceres_cal.base.words import HEIGHTS_M, at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.effects.columns import EffectColumns
-from ceres_cal.effects.score_tests import ScoreTest
+from ceres_cal.effects.columns import EffectColumns, ScoreTest
 from ceres_cal.effects.table.camera import motion_columns
 from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality

@@ -19,7 +19,8 @@ from ceres_cal.problem.quantities import pixel_slopes
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.lens import Spline, make_lens
-from ceres_cal.scene.lens.surface import COLUMNS, NODES, ROWS, Surface, roughness
+from ceres_cal.scene.lens.spline import COLUMNS, NODES, ROWS
+from ceres_cal.scene.lens.surface import Surface, roughness
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.initialise import initialise
 
@@ -96,7 +97,7 @@ def test_low_powers_are_left_to_the_rest_of_the_lens() -> None:
 
     def size(shape: Array) -> float:
         heights = np.stack([shape, 0.0 * shape], axis=2).ravel()
-        return float(1.0 / np.sqrt(heights @ roughness(*EXTENTS.tolist()) @ heights))
+        return float(1.0 / np.sqrt(heights @ roughness(*EXTENTS.tolist(), COLUMNS, ROWS) @ heights))
 
     long, short = (size(np.outer(np.cos(k * np.pi * x), np.cos(k * np.pi * y))) for k in (1, 3))
     assert long > 3.0 * short  # 0.37 and 0.11 measured

@@ -38,8 +38,7 @@ from ceres_cal.problem.information import Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Options, make_layout, unit_px
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.quantities import intrinsic_keys, moved, natural_sizes
-from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.quantities import PHI_RANGE, intrinsic_keys, moved, natural_sizes
 from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.foreign import nearest

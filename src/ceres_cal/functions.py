@@ -10,9 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import ImageProgress, InputError
 from ceres_cal.base.images import Images, image_files, images_and_videos
-from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such
 from ceres_cal.calibration import Calibration

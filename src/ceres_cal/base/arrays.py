@@ -1,4 +1,5 @@
-"""Arrays by the kind of their numbers, once for the whole package; what numbers make of a step that fails.
+"""Arrays by the kind of their numbers, once for the whole package; what numbers make of a step that fails; inverses of
+matrices that may be singular.
 
 Shapes stand in the docstrings.
 """
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from ceres_cal.base.errors import SolutionError
@@ -88,3 +90,163 @@ def numerical(step: str) -> Iterator[None]:
             raise SolutionError(
                 f"{step} failed numerically ({error}): check pixels, sigmas, labels and target dimensions"
             ) from error
+
+
+# ---- covariances where some directions may be unknown ---------------------------------------------------------------
+
+
+# A covariance does not exist where nothing is known. Here the finite part and the unknown directions are kept apart, so
+# that a number which does not depend on an unknown direction keeps its honest, finite sigma and one which does gets
+# infinity: never 0, never a large number that is rounding alone.
+
+NOTHING = 2e-14
+"""Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
+1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
+_REGULAR = 1e8  # the inverse of such an eigenvalue; plain inverses are good to 1e-7 there
+
+
+def _nothing(count: int) -> float:
+    return NOTHING * max(1.0, count / 10.0)
+
+
+def _scaled(information: Array, limits: Array) -> tuple[Array, Array]:
+    """Scale (..., n) that makes the diagonal one, and the information (..., n, n) in it."""
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    known = diagonal > limits**-2.0
+    scale = np.where(known, 1.0 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
+    # What is not known at all has rounding on its diagonal, which must not be scaled up.
+    information = np.where(known[..., :, None] & known[..., None, :], information, 0.0)
+    return scale, information * scale[..., :, None] * scale[..., None, :]
+
+
+def known_inverses(information: Array, limits: Array) -> Array:
+    """Inverses (..., n, n) of information matrices over what is known; unknown directions are left out.
+
+    Args:
+        limits: (n,) or (..., n), see `Spread.of`.
+    """
+    scale, scaled = _scaled(information, limits)
+    inverse = _regular_inverses(scaled)
+    if inverse is not None:
+        return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
+    values, vectors = np.linalg.eigh(scaled)
+    known = values > _nothing(values.shape[-1])
+    kept = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
+    half = vectors * np.sqrt(kept)[..., None, :] * scale[..., :, None]
+    return np.asarray(half @ np.swapaxes(half, -1, -2))
+
+
+def are_known(information: Array, limits: Array) -> bool:
+    """Whether nothing is unknown in any of many matrices (S, n, n), at a glance; False where it takes a closer look."""
+    return _regular_inverses(_scaled(information, limits)[1]) is not None
+
+
+def _regular_inverses(scaled: Array) -> Array | None:
+    """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:  # quiet: eigenvalues are asked instead, and a direction that is unknown stays so
+        return None
+    sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
+    regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < _REGULAR)
+    return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
+
+
+def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array:
+    """(n, n) information about some numbers, the others integrated out: the Schur complement of the whole.
+
+    Args:
+        here: (n, n). coupling: (m, n). others: (m, m), their limits (m,) see `Spread.of`.
+    """
+    residue = 1e-11  # what a Schur complement leaves of a direction that is unknown, relative to what went in
+    told = np.flatnonzero(np.diagonal(here) > 0.0)  # of the others nothing is known
+    coupling = coupling[:, told]
+    left = here[np.ix_(told, told)] - coupling.T @ known_inverses(others, limits) @ coupling
+    scale = np.sqrt(np.diagonal(here)[told])
+    values, vectors = np.linalg.eigh(0.5 * (left + left.T) / scale[:, None] / scale)
+    root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) * scale[:, None]  # the rest is rounding
+    whole = np.zeros_like(here)
+    whole[np.ix_(told, told)] = root @ root.T
+    return whole
+
+
+def thin_root(information: Array, sd: Array) -> Array:
+    """(R, n) with root^T root = information (n, n), but for what tells next to nothing of numbers that are known to sd
+    (n,): a Cholesky factor, the row that tells most first.
+    """
+    negligible = 1e-9  # of what is known of a number
+    left, rows, variances = np.diagonal(information).copy(), np.empty((len(sd), len(sd))), sd**2
+    for count in range(len(sd)):
+        most = int(np.argmax(left * variances))
+        if left[most] * variances[most] <= negligible:
+            return rows[:count]
+        rows[count] = (information[most] - rows[:count, most] @ rows[:count]) / np.sqrt(left[most])
+        left -= rows[count] ** 2
+    return rows
+
+
+class Spread(Struct, frozen=True, eq=False):
+    """What is known of n numbers.
+
+    Attributes:
+        covariance: (n, n) finite; of the numbers with their unknown directions held.
+        unknown: (n, k) directions about which nothing is known, in units of `scale`.
+        scale: (n,) sigma of each number if all the others were known.
+    """
+
+    covariance: Array
+    unknown: Array
+    scale: Array
+
+    @classmethod
+    def of(cls, information: Array, limits: Array) -> Spread:
+        """Of an information matrix (n, n), symmetric, not necessarily of full rank.
+
+        Args:
+            limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
+        """
+        scale, scaled = _scaled(np.asarray(information, dtype=float), limits)
+        # A file has the lower triangle, and says the same to the last digit.
+        inverse = _regular_inverses(np.tril(scaled) + np.tril(scaled, -1).T)
+        if inverse is not None:
+            return cls(inverse * scale[:, None] * scale, np.empty((len(scale), 0)), scale)
+        values, vectors = np.linalg.eigh(scaled)
+        lost = values <= _nothing(len(values))
+        half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
+        return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)
+
+    def depends(self, jacobian: Array) -> Mask:
+        """(..., m) whether functions with derivatives (..., m, n) depend on an unknown direction."""
+        if not self.unknown.shape[1]:
+            return np.zeros(jacobian.shape[:-1], dtype=bool)
+        size = np.linalg.norm(jacobian * self.scale, axis=-1)
+        # What leaks through below the root adds no more than the sigma that the function has with all else known.
+        return np.asarray(np.linalg.norm(jacobian @ self.unknown, axis=-1) > np.sqrt(_nothing(len(self.scale))) * size)
+
+    def through(self, jacobian: Array) -> Array:
+        """Covariances (..., m, m) of functions with derivatives (..., m, n); infinite variance where they depend on an
+        unknown direction, NaN as their covariance with others.
+        """
+        # In one product of matrices: many of a few rows each take up to four times as long.
+        along = np.tensordot(jacobian, self.covariance, axes=1)
+        return self._marked(along @ np.swapaxes(jacobian, -1, -2), self.depends(jacobian))
+
+    @staticmethod
+    def _marked(covariances: Array, lost: Mask) -> Array:
+        """Covariances (..., m, m) with infinity and NaN where functions (..., m) depend on an unknown direction."""
+        if np.any(lost):
+            variances = np.where(lost, np.inf, np.diagonal(covariances, axis1=-2, axis2=-1))
+            covariances = np.where(np.logical_or(lost[..., :, None], lost[..., None, :]), np.nan, covariances)
+            diagonal = np.arange(covariances.shape[-1])
+            covariances[..., diagonal, diagonal] = variances
+        return np.asarray(covariances)
+
+    @property
+    def matrix(self) -> Array:
+        """(n, n) covariance of the numbers themselves, with infinity and NaN as `through` gives them."""
+        return self._marked(self.covariance, self.depends(np.eye(len(self.scale))))
+
+    @property
+    def sd(self) -> Array:
+        """(n,) standard deviations, infinite where a number depends on an unknown direction."""
+        return np.asarray(np.sqrt(np.diagonal(self.matrix)))

@@ -19,8 +19,7 @@ from typing import IO, Any, Literal, TypeVar, cast
 
 import msgspec
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.progress import note
+from ceres_cal.base.errors import InputError, note
 from ceres_cal.base.words import printable
 
 T = TypeVar("T")

@@ -28,7 +28,7 @@ from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import problem_of
-from ceres_cal.problem.ranges import require_possible_numbers
+from ceres_cal.problem.quantities import require_possible_numbers
 from ceres_cal.problem.structure import EXACT, make_structure
 from ceres_cal.robust.as_built import AS_DRAWN, Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by

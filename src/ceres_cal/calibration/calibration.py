@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -35,7 +35,6 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.files import PosteriorFile
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.seam import Disagreement, disagreement
 from ceres_cal.posterior.uncertainty import Uncertainty
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, Options, make_layout
@@ -47,6 +46,9 @@ from ceres_cal.robust.stated import Conflict, agreed
 from ceres_cal.robust.unsteady import without_unsteadiness
 from ceres_cal.scene.camera import Camera, CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
+
+if TYPE_CHECKING:
+    from ceres_cal.posterior.seam import Disagreement
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
@@ -149,6 +151,8 @@ class Calibration(Frozen):
         """
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
+        from ceres_cal.posterior.seam import disagreement
+
         used = self.drawn_alike(observations).part(*self.inlier_masks(observations))
         return disagreement(used, self.estimate, self.uncertainty.posterior, self.fit.scales, (first, second))
 

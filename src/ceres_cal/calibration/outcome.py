@@ -16,17 +16,17 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import bounds_text, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejected
+from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.uncertainty import Uncertainty
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
-from ceres_cal.problem.noise import visible_from
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.robust.competing import Explanation
+from ceres_cal.robust.noise import visible_from
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_possible
 from ceres_cal.start.baseline import four_point_baseline

@@ -39,17 +39,17 @@ from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_a
 from ceres_cal.robust.competing import compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
-from ceres_cal.robust.groups import Subproblem
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.subproblem import Subproblem
 from ceres_cal.robust.unsteady import Unsteady, find_unsteady
 from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
+    from ceres_cal.effects.aside import Explanation
     from ceres_cal.robust.bulk import Settled
-    from ceres_cal.robust.competing import Explanation
 
 
 class Again(Frozen, eq=True):

@@ -262,7 +262,7 @@ def parse_estimates(specs: Sequence[str], targets: Mapping[str, Target]) -> tupl
 
 def _parsed(text: str, targets: Mapping[str, Target]) -> Prior:
     from ceres_cal.observations import Prior
-    from ceres_cal.problem.ranges import dimension_range
+    from ceres_cal.problem.quantities import dimension_range
 
     where = f"--estimate {text!r}"
     left, equals, right = text.partition("=")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration, LensChoice
     from ceres_cal.diagnostics import Diagnosis
     from ceres_cal.observations import Observations
-    from ceres_cal.problem.ranges import Range
+    from ceres_cal.problem.quantities import Range
     from ceres_cal.report import FramePhotographs
     from ceres_cal.scene.targets import Target
 
@@ -71,7 +71,7 @@ def require_shown(
     from ceres_cal.detect.boards import finder_of
     from ceres_cal.detect.images import read_colour
     from ceres_cal.problem.parameters import Options
-    from ceres_cal.problem.ranges import camera_ranges, place_range
+    from ceres_cal.problem.quantities import camera_ranges, place_range
     from ceres_cal.scene.targets import checkerboard
 
     least = 0.1  # of the picture's diagonal, that a field is large which can be found

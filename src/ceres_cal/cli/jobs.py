@@ -21,10 +21,9 @@ from typing import Any
 
 import msgspec
 
-from ceres_cal.base.errors import CalibrationError, InputError, answer_or_reason, attempt
+from ceres_cal.base.errors import CalibrationError, InputError, answer_or_reason, attempt, note
 from ceres_cal.base.files import convert, parse_json, read_bytes
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.progress import note
 from ceres_cal.base.version import __version__
 from ceres_cal.base.words import printable
 from ceres_cal.observations import FORMAT

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
-from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.errors import ImageProgress, InputError, NothingShownError
 from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.threads import in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
 from ceres_cal.detect.images import read_grey

@@ -17,13 +17,13 @@ from ceres_cal.base.tails import log_chi2_tail, log_f_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.effects.columns import Selection
 from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.score_tests import Selection
 from ceres_cal.effects.table.targets import feature_of
 from ceres_cal.observations import Observations
-from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.structure import numbers_by_kind
+from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.curves import nearest_on_track
 
 # Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound

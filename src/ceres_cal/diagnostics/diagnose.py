@@ -18,18 +18,16 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResults, measure_noise, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.effects.columns import EffectSums, least_absolute
+from ceres_cal.effects.columns import EffectSums, least_absolute, select
 from ceres_cal.effects.effect import Finding
-from ceres_cal.effects.joint import JointStep, joint_step
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
-from ceres_cal.effects.score_tests import select
-from ceres_cal.effects.table import EFFECTS, columns_of_all
+from ceres_cal.effects.table import EFFECTS, JointStep, columns_of_all, joint_step
 from ceres_cal.effects.table.targets import CurveAside, PointAside
 from ceres_cal.observations import Observations
-from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, judge, relative_lengths
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.residuals import Residuals, residuals, write_equations
+from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals, write_equations
+from ceres_cal.robust.noise import USUAL_EQUATIONS, Inliers, judge
 from ceres_cal.robust.other_minima import with_lost_boards_posed
 from ceres_cal.robust.stated import Conflict
 

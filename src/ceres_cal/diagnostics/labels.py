@@ -20,10 +20,10 @@ from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Curves, Observations
-from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import EXACT
+from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_on
 from ceres_cal.scene.targets import Target

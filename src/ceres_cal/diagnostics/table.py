@@ -17,8 +17,8 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.shown import brief
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
-from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.residuals import Equations, plane_shift
+from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera
 
 INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from ceres_cal.base.tails import student_95
 from ceres_cal.base.words import two_digits
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
-from ceres_cal.effects.likelihood import Likelihoods, is_loud, likelihoods
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.strands import (
     Strand,
@@ -35,6 +35,7 @@ from ceres_cal.effects.strands import (
     distances_of,
     families_of,
     go_over_groups,
+    is_loud,
     sampled,
     views_or_placements,
 )
@@ -44,6 +45,9 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Residuals
+
+if TYPE_CHECKING:
+    from ceres_cal.effects.likelihood import Likelihoods
 
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
 
@@ -107,6 +111,8 @@ class _Average(Frozen):
     def of(cls, shared: Array, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
         """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
         negligible = 1e-3  # weight below which a place on the grid is left out
+        from ceres_cal.effects.likelihood import likelihoods
+
         own = np.sum(shared[rows] ** 2)
         at = likelihoods(families, may_be_smooth, float(own))
         variance = at.variance / at.variance[0]  # the noise scale is that of independent errors

@@ -14,10 +14,9 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import first_of, two_digits
-from ceres_cal.effects.columns import EffectColumns
+from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.effects.score_tests import ScoreTest, Selection
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px

@@ -23,14 +23,14 @@ scatter of the others explains (`Offsets`).
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from typing import TypeVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.effects.columns import EffectColumns, SparseColumns
+from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
 
@@ -351,62 +351,3 @@ class RepeatedAmounts(Frozen):
             sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[one]), of) for one, of in beside.items())])
             found[name], asked[name] = self.size(own, at, sigmas, priors[name]), beside
         return found
-
-
-class Offsets(Frozen):
-    """What residuals say of the offsets of G groups.
-
-    Attributes:
-        effects: their modes as random effects. modes: (G, R, M) what an offset of each group does to them.
-        prior: of a group that does not belong, and of its offset.
-    """
-
-    effects: RandomEffects
-    modes: Array
-    prior: SizePrior
-
-    def log_evidence(self, wrong: Sequence[int] = ()) -> float:
-        """Of these groups not belonging, all others scattering alike."""
-        return float(self._log_evidence(self._together(wrong)[None], len(wrong))[0])
-
-    def log_evidence_with_each(self, wrong: Sequence[int] = ()) -> Array:
-        """(G,) the same with each one of the groups besides; -inf for those that are there already."""
-        known = np.broadcast_to(self._together(wrong), (len(self.modes), *self._together(wrong).shape))
-        evidence = self._log_evidence(np.concatenate([known, self.modes], axis=2), len(wrong) + 1)
-        evidence[list(wrong)] = -np.inf
-        return evidence
-
-    def _together(self, groups: Sequence[int]) -> Array:
-        """(R, K) modes of some groups side by side."""
-        return np.concatenate([np.zeros((self.modes.shape[1], 0)), *self.modes[list(groups)]], axis=1)
-
-    def _log_evidence(self, modes: Array, count: int) -> Array:
-        """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
-        sizes, scatter = self.prior.sizes[: None if count else 1], OFFSETS_SCATTER.scatter
-        logs = self.effects.log_evidence(modes, scatter, np.array(sizes))
-        priors = np.tile(OFFSETS_SCATTER.probabilities / len(sizes), len(sizes))
-        total = logsum(logs.reshape(len(modes), -1) + np.log(priors))
-        return np.asarray(total + count * np.log((1.0 - self.prior.absent) / len(self.modes)))
-
-
-def measure_offsets(model: Linearised, effect: EffectColumns, prior: SizePrior) -> Offsets:
-    """What a model's residuals say of offsets.
-
-    Args:
-        effect: its columns, here in standard deviations of an equation, of order one. prior: of a group that does not
-            belong.
-    """
-    columns, group = effect.columns, effect.group
-    groups, width = int(group.max()) + 1, columns.shape[1]
-    rows = np.flatnonzero((group >= 0) & model.used)
-    every = SparseColumns.of_groups(model, columns, group, groups)
-    there = np.flatnonzero(every.summed(every.values))
-    normal, slope, _ = every.left_of(model)
-    normal, slope = normal[np.ix_(there, there)], slope[there]
-    least = 1e-5 * float(np.bincount(group[rows]).max())  # what the model leaves of directions that can be judged
-    effects = RandomEffects.of(normal, slope, least)
-    rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
-    exact = model.spare * (LEAST_PX * median(model.weight[rows])) ** 2
-    modes = effects.modes(np.eye(groups * width)[there]).reshape(-1, groups, width)
-    effects = replace(effects, rest=max(rest, exact), freedom=float(model.spare))
-    return Offsets(effects, np.swapaxes(modes, 0, 1), prior)

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import NOTHING, Array
 from ceres_cal.base.frozen import replace
-from ceres_cal.base.spread import NOTHING
 from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate

@@ -22,8 +22,7 @@ from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import intrinsic_keys
-from ceres_cal.problem.ranges import require_possible_numbers
+from ceres_cal.problem.quantities import intrinsic_keys, require_possible_numbers
 from ceres_cal.scene.symmetry import counterparts
 from ceres_cal.scene.targets import target_from_spec
 

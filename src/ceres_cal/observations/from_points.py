@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.typed import checked, numbers_in, rows, size_in
+from ceres_cal.base.typed import numbers_in, rows, size_in
 from ceres_cal.base.words import no_such
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Curves, Points, View
 from ceres_cal.observations.files import Content
@@ -18,97 +18,65 @@ from ceres_cal.scene.curves import SIDES
 from ceres_cal.scene.targets import Target
 
 
-class FromArrays(Content):
-    """Observations that are made of arrays."""
+def points_by_frame(
+    pixels: Any,
+    points: Target | ArrayLike,
+    image_size: tuple[int, int],
+    camera: str,
+    sigma_px: float,
+    moves: bool | None,
+) -> Content:
+    """See `Observations.from_points`."""
+    target = points if isinstance(points, Target) else _points_target(points)
+    frames = _frames(pixels)
+    movable = target.movable if moves is None else moves
+    views, seen_rows, name = [], [], _name(target) if isinstance(points, Target) else "target"
+    for number, (frame, values) in enumerate(frames.items()):
+        seen = _pixels(values, f"frame {frame!r}")
+        if len(seen) != len(target.points):
+            raise InputError(
+                f"frame {frame!r}: {len(seen)} pixels for {len(target.points)} points: give one for each, NaN "
+                "where it was not seen"
+            )
+        views.append(View(frame, camera, camera, name, frame if movable else None))
+        found = np.flatnonzero(np.isfinite(seen).all(axis=1))
+        seen_rows.append((np.full(len(found), number), found, seen[found]))
+    if not seen_rows:
+        raise InputError("pixels must hold at least one frame")
+    view, feature, where = (np.concatenate(part) for part in zip(*seen_rows, strict=True))
+    every = Points(view, feature, where, np.full(len(view), float(sigma_px)))
+    return Content({name: target}, {camera: size_in(image_size)}, tuple(views), every, NO_CURVES)
 
-    @classmethod
-    @checked
-    def from_points(
-        cls,
-        pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
-        points: Target | ArrayLike,
-        image_size: tuple[int, int],
-        *,
-        camera: str = "camera",
-        sigma_px: float = 1.0,
-        moves: bool | None = None,
-    ) -> Self:
-        """Observations of points of one target by one camera, in one frame or in many.
 
-        Args:
-            pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
-                of the points, NaN where it was not seen.
-            points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
-            image_size: (width, height) px. sigma_px: standard deviation of each coordinate.
-            moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
-                are the world.
-
-        Raises:
-            InputError: shapes or counts that do not fit; naming the frame.
-        """
-        target = points if isinstance(points, Target) else _points_target(points)
-        frames = _frames(pixels)
-        movable = target.movable if moves is None else moves
-        views, seen_rows, name = [], [], _name(target) if isinstance(points, Target) else "target"
-        for number, (frame, values) in enumerate(frames.items()):
-            seen = _pixels(values, f"frame {frame!r}")
-            if len(seen) != len(target.points):
-                raise InputError(
-                    f"frame {frame!r}: {len(seen)} pixels for {len(target.points)} points: give one for each, NaN "
-                    "where it was not seen"
-                )
-            views.append(View(frame, camera, camera, name, frame if movable else None))
-            found = np.flatnonzero(np.isfinite(seen).all(axis=1))
-            seen_rows.append((np.full(len(found), number), found, seen[found]))
-        if not seen_rows:
-            raise InputError("pixels must hold at least one frame")
-        view, feature, where = (np.concatenate(part) for part in zip(*seen_rows, strict=True))
-        every = Points(view, feature, where, np.full(len(view), float(sigma_px)))
-        return cls({name: target}, {camera: size_in(image_size)}, tuple(views), every, NO_CURVES)
-
-    @classmethod
-    @checked
-    def from_curves(
-        cls,
-        pixels: Mapping[str, ArrayLike],
-        target: Target,
-        image_size: tuple[int, int],
-        *,
-        camera: str = "camera",
-        frame: str = "0",
-        sigma_px: float = 1.0,
-        side: str = "centre",
-    ) -> Self:
-        """Observations of painted lines and arcs of one target in one frame of one camera.
-
-        Args:
-            pixels: name of each line -> pixels (N, 2) that lie on it, anywhere along it, such as
-                `{"HalfwayLine": [[640.1, 92.4], [641.0, 180.2]]}`.
-            image_size: (width, height) px. sigma_px: standard deviation of the distance to the line.
-            side: "centre" of the paint, or its "left" or "right" edge, as seen along the line.
-
-        Raises:
-            InputError: a line that the target does not have, or a shape that does not fit; naming the line.
-        """
-        if side not in SIDES:
-            raise InputError(no_such("side", side, SIDES))
-        if not pixels:
-            raise InputError("pixels must hold at least one line")
-        for curve in pixels:
-            if curve not in target.curves:
-                raise InputError(f"pixels: {no_such('line', curve, target.curves)}")
-        seen = [_pixels(values, f"line {curve!r}") for curve, values in pixels.items()]
-        feature = np.repeat([target.curve_index[curve] for curve in pixels], [len(one) for one in seen])
-        count, name = len(feature), _name(target)
-        curves = Curves(
-            np.zeros(count, np.int32),
-            feature.astype(np.int32),
-            np.concatenate(seen),
-            np.full(count, float(sigma_px)),
-            np.full(count, SIDES[side], np.int8),
-        )
-        view = View(frame, camera, camera, name, frame if target.movable else None)
-        return cls({name: target}, {camera: size_in(image_size)}, (view,), NO_POINTS, curves)
+def pixels_by_curve(
+    pixels: Mapping[str, ArrayLike],
+    target: Target,
+    image_size: tuple[int, int],
+    camera: str,
+    frame: str,
+    sigma_px: float,
+    side: str,
+) -> Content:
+    """See `Observations.from_curves`."""
+    if side not in SIDES:
+        raise InputError(no_such("side", side, SIDES))
+    if not pixels:
+        raise InputError("pixels must hold at least one line")
+    for curve in pixels:
+        if curve not in target.curves:
+            raise InputError(f"pixels: {no_such('line', curve, target.curves)}")
+    seen = [_pixels(values, f"line {curve!r}") for curve, values in pixels.items()]
+    feature = np.repeat([target.curve_index[curve] for curve in pixels], [len(one) for one in seen])
+    count, name = len(feature), _name(target)
+    curves = Curves(
+        np.zeros(count, np.int32),
+        feature.astype(np.int32),
+        np.concatenate(seen),
+        np.full(count, float(sigma_px)),
+        np.full(count, SIDES[side], np.int8),
+    )
+    view = View(frame, camera, camera, name, frame if target.movable else None)
+    return Content({name: target}, {camera: size_in(image_size)}, (view,), NO_POINTS, curves)
 
 
 def _name(target: Target) -> str:

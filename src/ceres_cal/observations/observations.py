@@ -13,10 +13,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.frozen import cached_property, replace
+from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.columns import (
     Columns,
@@ -29,15 +31,14 @@ from ceres_cal.observations.columns import (
     taken,
     view_label,
 )
-from ceres_cal.observations.files import header_of, read_content, write_content
-from ceres_cal.observations.from_points import FromArrays
+from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.validation import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.scene.targets import Target
 
 _NAMES = attrgetter("camera", "station", "target", "placement")
 
 
-class Observations(FromArrays):
+class Observations(Content):
     """Everything that was observed.
 
     Attributes:
@@ -88,6 +89,65 @@ class Observations(FromArrays):
                 "frames different names, such as by a dict of pixels"
             )
         return combine([self, other])
+
+    # ---- from arrays, as detectors give them ---------------------------------------------------------------------
+
+    @classmethod
+    @checked
+    def from_points(
+        cls,
+        pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
+        points: Target | ArrayLike,
+        image_size: tuple[int, int],
+        *,
+        camera: str = "camera",
+        sigma_px: float = 1.0,
+        moves: bool | None = None,
+    ) -> Observations:
+        """Observations of points of one target by one camera, in one frame or in many.
+
+        Args:
+            pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
+                of the points, NaN where it was not seen.
+            points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
+            image_size: (width, height) px. sigma_px: standard deviation of each coordinate.
+            moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
+                are the world.
+
+        Raises:
+            InputError: shapes or counts that do not fit; naming the frame.
+        """
+        from ceres_cal.observations.from_points import points_by_frame
+
+        return cls(**vars(points_by_frame(pixels, points, image_size, camera, sigma_px, moves)))
+
+    @classmethod
+    @checked
+    def from_curves(
+        cls,
+        pixels: Mapping[str, ArrayLike],
+        target: Target,
+        image_size: tuple[int, int],
+        *,
+        camera: str = "camera",
+        frame: str = "0",
+        sigma_px: float = 1.0,
+        side: str = "centre",
+    ) -> Observations:
+        """Observations of painted lines and arcs of one target in one frame of one camera.
+
+        Args:
+            pixels: name of each line -> pixels (N, 2) that lie on it, anywhere along it, such as
+                `{"HalfwayLine": [[640.1, 92.4], [641.0, 180.2]]}`.
+            image_size: (width, height) px. sigma_px: standard deviation of the distance to the line.
+            side: "centre" of the paint, or its "left" or "right" edge, as seen along the line.
+
+        Raises:
+            InputError: a line that the target does not have, or a shape that does not fit; naming the line.
+        """
+        from ceres_cal.observations.from_points import pixels_by_curve
+
+        return cls(**vars(pixels_by_curve(pixels, target, image_size, camera, frame, sigma_px, side)))
 
     # ---- files --------------------------------------------------------------------------------------------------
 

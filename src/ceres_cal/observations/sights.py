@@ -383,3 +383,21 @@ def thinned(observations: Observations, most: int, fewest_frames: int = 40) -> O
     for mask in masks:
         mask[np.flatnonzero(mask)[np.arange(np.count_nonzero(mask)) % step > 0]] = False
     return observations.part(*masks)
+
+
+def some_views(counts: Indices, most: int, fewest: int) -> Indices:
+    """Numbers of some of the views that show anything, so many observations (V,) each, evenly: as many as hold what is
+    asked, and no fewer than a few.
+    """
+    shown = np.flatnonzero(counts)
+    taken = min(max(fewest, len(shown) * most // int(counts.sum())), len(shown))
+    return np.asarray(shown[np.linspace(0, len(shown) - 1, taken).astype(np.int64)])
+
+
+def thinned_by_key(rows: Indices, key: Indices, of_group: Mask, most_rows: int) -> Indices:
+    """Of rows with the same key some, evenly, where they are of a group: so many at most."""
+    order = np.argsort(key, kind="stable")
+    _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
+    place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)
+    most = np.where(of_group[order], np.minimum(size, most_rows), size)
+    return np.asarray(rows[order[(place * most) // size != ((place - 1) * most) // size]])

@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import numerical
 from ceres_cal.base.frozen import replace
+from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.observations import Observations
@@ -23,10 +24,8 @@ from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Information, over
 from ceres_cal.problem.parameters import Estimate, unit_px
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import difference, moved
-from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.quantities import PHI_RANGE, difference, moved
 from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.robust.competing import Explanation
 from ceres_cal.robust.conflicts import Conflicts
 from ceres_cal.robust.other_minima import minima_of
 from ceres_cal.robust.robust import RobustSolution

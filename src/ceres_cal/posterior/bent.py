@@ -28,8 +28,7 @@ from ceres_cal.problem.information import Information, Key, over
 from ceres_cal.problem.parameters import Estimate, unit_px
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import difference, moved, natural_sizes
-from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.quantities import PHI_RANGE, difference, moved, natural_sizes
 from ceres_cal.problem.reduced import information
 from ceres_cal.robust.other_minima import FEW, solved_soon
 

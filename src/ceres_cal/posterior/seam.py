@@ -13,9 +13,18 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.posterior.maps import FieldGrid, FieldMap, field_map, located_by, station_keys, visible_pixels
+from ceres_cal.posterior.maps import (
+    FieldGrid,
+    FieldMap,
+    Functional,
+    Reading,
+    field_map,
+    located_by,
+    read,
+    station_keys,
+    visible_pixels,
+)
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.reading import Functional, Reading, read
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import moved, natural_sizes

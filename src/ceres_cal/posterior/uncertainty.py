@@ -7,27 +7,28 @@ it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, median
+from ceres_cal.base.arrays import Array, are_known, median
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.shown import Shown, html_of, text_of
-from ceres_cal.base.spread import are_known
 from ceres_cal.base.typed import rows
 from ceres_cal.base.words import at_precision, two_digits
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
 from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.seam import RigPair, rig_pairs, seam_map
 from ceres_cal.problem.information import PLACEMENT_QUANTITIES, Key, sigma_limits
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes, values_of
 from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.targets import Target
+
+if TYPE_CHECKING:
+    from ceres_cal.posterior.seam import RigPair
 
 KNOWN, WEAK = 0.01, 0.3
 """Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
@@ -259,6 +260,10 @@ class Uncertainty(Frozen):
     @cached_property
     def rig(self) -> tuple[RigPair, ...]:
         """Baseline and angle between the first station and those of other cameras."""
+        if len({station.camera for station in self.estimate.stations.values()}) < 2:
+            return ()
+        from ceres_cal.posterior.seam import rig_pairs
+
         return rig_pairs(self.estimate, self.posterior)
 
     @property
@@ -318,6 +323,8 @@ class Uncertainty(Frozen):
         Raises:
             InputError: see `map_sd_mm`.
         """
+        from ceres_cal.posterior.seam import seam_map
+
         return seam_map(self.estimate, self.posterior, (first, second), self._grid(height_m, x_m, y_m))
 
     def _grid(self, height_m: float, x_m: ArrayLike | None, y_m: ArrayLike | None) -> FieldGrid:

@@ -1,10 +1,6 @@
-"""Cost functions of the observations, and the numbers of a camera as Ceres moves them.
+"""Cost functions of the observations and of priors.
 
 What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++.
-
-A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
-height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps. In
-coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
 """
 
 from __future__ import annotations
@@ -17,15 +13,17 @@ import numpy as np
 import pyceres
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales, unit_px
+from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
+from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
+from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, logarithmic
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.problem.structure import Structure
-from ceres_cal.scene.camera import Camera
 
 
 @dataclass(eq=False)
@@ -57,10 +55,10 @@ class CostValue(NamedTuple):
 Evaluated = Callable[[Array, Sequence[Array]], CostValue]
 """What answers in a place, whole and by blocks."""
 
-_CostFunction: Any = pyceres.CostFunction  # which has no types
+CostFunction: Any = pyceres.CostFunction  # which has no types
 
 
-class CachedCost(_CostFunction):
+class CachedCost(CostFunction):
     """A cost function; what it costs is `evaluated`: the answer in a place, whole and by blocks; None where an
     observation cannot be projected from there. pyceres' metaclass lets no class with abstract methods join.
     """
@@ -298,65 +296,6 @@ class EliminatedCost(_SightsCost):
         return self._sights.keys, self._accepted.poses
 
 
-_PHI = 0  # of the intrinsics
-
-
-class Chart:
-    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
-    have made in Python.
-    """
-
-    def __init__(self, camera: Camera, free: Indices) -> None:
-        powers = np.array([0.0] * 4 + [order - 1.0 for order in camera.lens.orders] + [0.0])
-        self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
-
-    def moved(self, numbers: Array) -> Array:
-        """(K,) what Ceres moves, of the free numbers (K,)."""
-        return np.asarray(numbers / self._scales(numbers))
-
-    def numbers(self, moved: Array) -> Array:
-        """(K,) the free numbers again."""
-        return np.asarray(moved * self._scales(moved))
-
-    def chained(self, jacobian: Array, numbers: Array) -> Array:
-        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
-        chained = jacobian * self._scales(numbers)
-        chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
-        return np.asarray(chained)
-
-    def _scales(self, numbers: Array) -> Array:
-        nothing = 1e-30  # phi may be 0 on the way: no camera, which shows nothing
-        return np.asarray((numbers[self._phi] / self._unit or nothing) ** self._powers)
-
-
-def chart_of(camera: Camera, free: Indices) -> Chart | None:
-    """None where the numbers are moved as they are."""
-    return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
-
-
-class ChartedCost(_CostFunction):
-    """A cost function over what Ceres moves, of one over the numbers themselves."""
-
-    def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:
-        super().__init__()
-        self._run, self._cost, self._charts = run, cost, charts
-        self.set_num_residuals(cost.num_residuals())
-        self.set_parameter_block_sizes(cost.parameter_block_sizes())
-
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        with self._run:
-            numbers = [
-                chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
-            ]
-            if not self._cost.Evaluate(numbers, residuals, jacobians):
-                return False
-            for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
-                if chart:
-                    jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
-            return True
-        return False
-
-
 def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> Array | None:
     """(size, size) what is known of a lens's roughness, by the numbers of its camera's block; None of nothing."""
     camera, whole = estimate.cameras[name], None
@@ -367,3 +306,115 @@ def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> A
         whole = np.zeros((size, size)) if whole is None else whole
         whole[np.ix_(at, at)] += scales[:, None] * prior.information.matrix * scales
     return whole
+
+
+# ---- a prior's block: root (x - mean) over every camera, station and structure number that it speaks of ------------
+
+
+class _Linear(NamedTuple):
+    """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
+
+    columns: list[int]
+    slots: list[int]
+    scales: Array
+    size: int
+
+    def values(self, block: Array) -> Array:
+        """(n,) in the units of the keys."""
+        return np.asarray(block[self.slots] * self.scales)
+
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, size) derivatives by the block of root (R, n) times the values."""
+        slopes = np.zeros((len(root), self.size))
+        slopes[:, self.slots] = root * self.scales
+        return slopes
+
+
+class _StationCoordinates(NamedTuple):
+    """A station's position, and its turn from the prior's rotation about its own axes."""
+
+    columns: list[int]
+    rows: list[int]
+    rotation: Array
+    size: int = 6
+
+    def values(self, block: Array) -> Array:
+        """(n,) in the units of the keys."""
+        pose = Pose.exp(block)
+        turn = rotation_log(pose.rotation @ self.rotation.T)
+        return np.concatenate([pose.position, turn])[self.rows]
+
+    def slopes(self, block: Array, root: Array) -> Array:
+        """(R, 6) derivatives of root (R, n) times the values by the rotation vector and the translation."""
+        inverse, left = rotation_exp(block[:3]).T, left_jacobian(block[:3])
+        slopes = np.zeros((6, 6))
+        slopes[:3] = np.hstack([-inverse @ skew(block[3:]) @ left, -inverse])
+        turn = rotation_log(inverse.T @ self.rotation.T)
+        slopes[3:, :3] = np.linalg.solve(left_jacobian(turn), left)
+        return np.asarray(root @ slopes[self.rows])
+
+
+class PriorCost(CachedCost):
+    """root (x - mean), in standard deviations, of a prior on free numbers alone.
+
+    Attributes:
+        owners: whose blocks the solver hands over, as ("camera" or "station", name), or ("structure", "").
+    """
+
+    def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
+        super().__init__(run)
+        self._is_usual, self._is_log = prior.is_usual, prior.is_log
+        self._root, self._mean = prior.information.root, prior.mean
+        parts = dict(_parts(prior, estimate, layout))
+        self._parts = list(parts.values())
+        self.owners: list[tuple[str, str]] = list(parts)
+        self.set_num_residuals(len(self._root))
+        self.set_parameter_block_sizes([part.size for part in self._parts])
+
+    def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
+        off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
+        for part, block in blocks:
+            off[part.columns] += part.values(block)
+        root = self._root
+        if self._is_log:
+            off, slope = logarithmic(off, self._mean)
+            root = root * slope
+        residuals = self._root @ off
+        if self._is_usual:
+            residuals, slope = _bent(residuals)
+            root = slope[:, None] * root
+        slopes = [part.slopes(block, root[:, part.columns]).reshape(-1) for part, block in blocks]
+        return CostValue(at, residuals, slopes)
+
+
+def _bent(residuals: Array) -> tuple[Array, Array]:
+    """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
+    least = 1e-12  # over where it bends: Cauchy's loss leaves that as it is
+    squares = np.maximum((residuals / USUAL_BENDS) ** 2, least**2)
+    lengths = np.sqrt(np.log1p(squares))
+    return USUAL_BENDS * np.copysign(lengths, residuals), np.sqrt(squares) / (lengths * (1.0 + squares))
+
+
+def _parts(
+    prior: GaussianPrior, estimate: Estimate, layout: Layout
+) -> Sequence[tuple[tuple[str, str], _Linear | _StationCoordinates]]:
+    """The blocks that a prior depends on, by owner."""
+    parts: list[tuple[tuple[str, str], _Linear | _StationCoordinates]] = []
+    for (kind, owner), columns in columns_by_owner(prior.keys).items():
+        quantities = [prior.keys[column].quantity for column in columns]
+        if kind == "camera":
+            camera, free = estimate.cameras[owner], layout.free[owner].tolist()
+            numbers = [intrinsic_names(camera.lens).index(quantity) for quantity in quantities]
+            slots, scales = [free.index(number) for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
+            parts.append(((kind, owner), _Linear(columns, slots, scales, len(free))))
+        elif kind == "station":
+            rows = [STATION_QUANTITIES.index(quantity) for quantity in quantities]
+            # Without turns among its numbers any rotation will do.
+            rotation = prior.rotations.get(owner, estimate.stations[owner].cam_from_world.rotation)
+            parts.append(((kind, owner), _StationCoordinates(columns, rows, rotation)))
+    structure = [column for column, key in enumerate(prior.keys) if key.is_structure]
+    if structure:
+        names = estimate.structure.names
+        slots = [names.index(prior.keys[column].structure_name) for column in structure]
+        parts.append((("structure", ""), _Linear(structure, slots, np.ones(len(slots)), len(names))))
+    return parts

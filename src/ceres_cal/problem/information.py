@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Spread, known_inverses, without
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.spread import Spread, known_inverses, without
 
 _TURNS = ("turn_x", "turn_y", "turn_z")
 STATION_QUANTITIES = ("x", "y", "height", *_TURNS)

@@ -13,10 +13,9 @@ from operator import add
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, known_inverses
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.spread import known_inverses
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.costs import NORMAL_NS, kernel_loss

@@ -180,6 +180,13 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
     return np.concatenate(nearest)
 
 
+def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
+    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
+    points, curves = residuals.lengths
+    points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
+    return np.fmin(points, np.inf, out=points), np.fmin(curves, np.inf, out=curves)  # NaN is infinite
+
+
 class Equations(Frozen):
     """E scalar equations, sight after sight.
 

@@ -22,11 +22,10 @@ from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import SightKey, Sights, sights_of
 from ceres_cal.problem.costs import Run, SightCost
-from ceres_cal.problem.noise import LengthSums, relative_lengths
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import normals_of
-from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.residuals import relative_lengths, residuals
 from ceres_cal.scene.targets import Target
 
 # Bins of a histogram of lengths in stated sigmas, to 2e7: from which on one is, and how much wider than the last.
@@ -61,10 +60,10 @@ class Histogram(Frozen):
         middle = np.searchsorted(total, total[-1] // 2 + 1)
         return float(_LEAST * np.exp((middle + 0.5) * _WIDTH)) if total[-1] else 0.0
 
-    def within(self, bound: float) -> LengthSums:
-        """Of those that are no longer, to the width of a bin."""
+    def within(self, bound: float) -> tuple[int, float]:
+        """Of those that are no longer, to the width of a bin: how many, and the sum of their squares."""
         last = int(_bin_of(np.array([bound]))[0])
-        return LengthSums(int(self.counts[:last].sum()), float(self.squares[:last].sum()))
+        return int(self.counts[:last].sum()), float(self.squares[:last].sum())
 
 
 def _bin_of(lengths: Array) -> Indices32:

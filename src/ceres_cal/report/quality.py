@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import Struct
@@ -18,16 +19,17 @@ from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.effects.effect import CameraEffect, Finding
-from ceres_cal.effects.joint import JointStep
-from ceres_cal.effects.table import EFFECTS
+from ceres_cal.effects.table import EFFECTS, JointStep
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import thinned
 from ceres_cal.posterior.maps import FieldMap, ImageMap, locate_slopes, visible_pixels
-from ceres_cal.posterior.seam import Disagreement
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import OF_PIXELS
 from ceres_cal.scene.targets import Target
+
+if TYPE_CHECKING:
+    from ceres_cal.posterior.seam import Disagreement
 
 
 class FaultyMap(Struct, frozen=True, eq=False):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from ceres_cal.base.errors import StepProgress
 from ceres_cal.base.files import write_bytes
-from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import counted, first_of
 from ceres_cal.calibration import Calibration, LensChoice

@@ -22,7 +22,6 @@ from ceres_cal.base.words import (
     two_digits,
 )
 from ceres_cal.posterior.maps import FieldMap
-from ceres_cal.posterior.seam import RigPair
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.report import grounds
 from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
@@ -30,6 +29,7 @@ from ceres_cal.report.numbers import bounds, number_sections, observed, outliers
 from ceres_cal.report.quality import Quality, Seam
 
 if TYPE_CHECKING:
+    from ceres_cal.posterior.seam import RigPair
     from ceres_cal.report.material import Material
 
 _MOST_FINDINGS, _MOST_DIRECTIONS = 3, 4

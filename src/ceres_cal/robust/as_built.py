@@ -22,6 +22,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
@@ -34,7 +35,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import Equations, equations_of, whole_structure
 from ceres_cal.problem.structure import EXACT, Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn
-from ceres_cal.robust.competing import Explanation, Solver, compete
+from ceres_cal.robust.competing import Solver, compete
 from ceres_cal.robust.robust import RobustSolution, judge_at, solve_robustly
 from ceres_cal.scene.targets import Target
 

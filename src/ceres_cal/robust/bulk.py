@@ -15,11 +15,17 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import SightKey
+from ceres_cal.observations.sights import SightKey, some_views
 from ceres_cal.problem.bundle import Progress, Solution, solve
 from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
-from ceres_cal.problem.noise import (
+from ceres_cal.problem.parameters import Estimate, Layout
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals
+from ceres_cal.problem.shares import Histogram, Looked, Share, ShareRequest, Used, cut
+from ceres_cal.robust.noise import (
     SAME,
     Inliers,
     NoiseScales,
@@ -27,15 +33,7 @@ from ceres_cal.problem.noise import (
     by_count,
     by_leverage,
     noise_of,
-    relative_lengths,
 )
-from ceres_cal.problem.parameters import Estimate, Layout
-from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.problem.shares import Histogram, Looked, Share, ShareRequest, Used, cut
-from ceres_cal.robust.competing import Explanation
-from ceres_cal.robust.groups import some_views
 from ceres_cal.robust.robust import RobustSolution, Rounds
 
 # Observations of the part, and views of it at least.
@@ -197,7 +195,7 @@ class _BulkResiduals(Frozen):
     def inside(self, noise: NoiseScales) -> tuple[int, int]:
         """How many points and curve observations are no outliers."""
         points, curves = self._histograms
-        return points.within(noise.bounds[0]).count, curves.within(noise.bounds[1]).count
+        return points.within(noise.bounds[0])[0], curves.within(noise.bounds[1])[0]
 
     @property
     def _histograms(self) -> tuple[Histogram, Histogram]:
@@ -255,7 +253,7 @@ class _SumRounds(Rounds[_SumRound]):
         """The problem of what takes part, judged at the last estimate."""
         options, (points, curves) = self._problem.options, noise.bounds
         inside = seen.lengths[0] <= points, seen.lengths[1] <= curves
-        equations = 2 * seen.looked.points.within(points).count + seen.looked.curves.within(curves).count
+        equations = 2 * seen.looked.points.within(points)[0] + seen.looked.curves.within(curves)[0]
         judged_at = seen.name, of_world(seen.estimate)
         judged = SharedObservations(self._engine, self._bulk.keys, equations, judged_at, noise.bounds, self._along)
         weighting = Weighting(noise.points, noise.curves, options.loss, options.loss_scale)

@@ -16,89 +16,36 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base.arrays import Indices, Mask, medians_known
-from ceres_cal.base.errors import CalibrationError, attempt, or_none
+from ceres_cal.base.errors import or_none
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.words import two_digits
+from ceres_cal.effects.aside import (
+    DOUBTFUL,
+    Explanation,
+    FeatureGroups,
+    ObservationGroups,
+    Offsets,
+    ViewGroups,
+    groups_of,
+    measure_offsets,
+)
 from ceres_cal.effects.columns import least_absolute
-from ceres_cal.effects.evidence import Offsets, measure_offsets
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import with_placements_at_best
-from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.conflicts import without_suspicious
-from ceres_cal.robust.groups import (
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust.subproblem import (
     FEWEST,
-    FeatureGroups,
-    ObservationGroups,
     Subproblem,
-    ViewGroups,
     compared_part,
     excess,
     groups_compared,
-    groups_of,
     mostly_rejected,
     rows_compared,
 )
-from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_fits
-
-# Log odds between which both explanations are named: 19 to 1.
-DOUBTFUL = 3.0
-
-
-class Explanation(Frozen):
-    """That a group of observations does not belong.
-
-    Attributes:
-        name: of the group. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
-            lies aside, the median. log_odds: natural logarithm of the odds that it does not belong.
-        remedy: what to look at. instead: what the next best explanation says. other: the estimate of the less
-            probable one of the two.
-    """
-
-    name: str
-    rows: Mask
-    aside_px: float
-    log_odds: float
-    remedy: str
-    instead: str
-    other: Estimate
-
-    @property
-    def doubt(self) -> float:
-        """Probability of the less probable explanation."""
-        return float(1.0 / (1.0 + np.exp(abs(self.log_odds))))
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether both explanations are to be named."""
-        return abs(self.log_odds) < DOUBTFUL
-
-    @property
-    def is_taken(self) -> bool:
-        """Whether it is the more probable one, and its observations are taken out."""
-        return self.log_odds > 0.0
-
-    @property
-    def words(self) -> str:
-        """What it says."""
-        return f"the whole of {self.name}: {np.count_nonzero(self.rows)} rows, {two_digits(self.aside_px)} px off"
-
-    @property
-    def warning(self) -> str:
-        """What to know before the calibration is used."""
-        if not self.is_doubtful:
-            return f"{self.words}: taken out together; {self.remedy}"
-        where = f"{self.name} may be {two_digits(self.aside_px)} px off its nominal position"
-        sure = f"probability {100.0 * (1.0 - self.doubt if self.is_taken else self.doubt):.0f} %"
-        how = "taken out together" if self.is_taken else "used"
-        return (
-            f"{where} ({sure}; {np.count_nonzero(self.rows)} rows, {how}). The stated uncertainties include this. "
-            "Look at it in the picture, or observe more"
-        )
-
 
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
@@ -126,7 +73,7 @@ def compete(
     taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
     for trial in trials:
         groups = every.kinds[some.kinds.index(trial.suspects[0])]
-        own = [groups.among(np.array([number])) & taking_part for number in trial.suspects[1]]
+        own = [groups.among([number]) & taking_part for number in trial.suspects[1]]
         found = trial.explanations if some is part else [_as_stated(one, part, solver) for one in trial.explanations]
         explanations += [replace(one, rows=rows) for one, rows in zip(found, own, strict=True)]
         if trial.log_odds >= 0.0:
@@ -141,24 +88,24 @@ def compete(
 def _freed(every: Subproblem, solver: Solver) -> Subproblem:
     """Without the statements that look wrong: a line is not blamed for what they bend."""
     freed = without_suspicious(every.problem, every.observations, every.end)
-    if freed is every.problem:
-        return every
-    # quiet: they are competed with as stated; what contradicts them is tested afterwards
-    end = attempt(lambda: solver(freed, every))
-    if isinstance(end, CalibrationError) or end.solution.failed:
-        return every
-    return replace(every, problem=freed, end=end)
+    # Where that fails they are competed with as stated; what contradicts them is tested afterwards.
+    end = None if freed is every.problem else _solved(freed, every, solver)
+    return every if end is None else replace(every, problem=freed, end=end)
 
 
 def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanation:
     """With the other estimate under all that is stated: what moves without that is no doubt about a group."""
     if not one.is_doubtful:
         return one
-    # quiet: without that solve the doubt stays as large as it was
-    other = part.end if one.is_taken else attempt(lambda: solver(part.without(one.rows), part))
-    if isinstance(other, CalibrationError) or other.solution.failed:
-        return one
-    return replace(one, other=other.solution.estimate)
+    # Where that fails the doubt stays as large as it was.
+    other = part.end if one.is_taken else _solved(part.without(one.rows), part, solver)
+    return one if other is None else replace(one, other=other.solution.estimate)
+
+
+@or_none  # quiet: whoever asks goes on without it
+def _solved(problem: Problem, part: Subproblem, solver: Solver) -> RobustSolution | None:
+    end = solver(problem, part)
+    return None if end.solution.failed else end
 
 
 _Suspects = tuple[ObservationGroups, tuple[int, ...]]
@@ -228,7 +175,7 @@ class _Competition:
         """Groups without which the rest may be better explained."""
         for groups in self._some.kinds:
             for numbers in (*self._mostly_rejected(end, groups), *self._by_offsets(end, groups)):
-                rows = tuple(np.flatnonzero(groups.among(np.array(numbers))).tolist())
+                rows = tuple(np.flatnonzero(groups.among(numbers)).tolist())
                 if rows not in self._tried:
                     self._tried.add(rows)
                     yield groups, numbers
@@ -274,26 +221,28 @@ class _Competition:
         chosen, offsets = self._offsets(replace(without, residuals=there), groups, numbers)
         if offsets is None:
             return None
-        lengths, explanations = np.concatenate(there.lengths), []
-        for number in numbers:
-            odds, rival = _odds(offsets, chosen, number, numbers)
-            own = groups.among(np.array([number])) & self._taking_part
+        lengths, explanations, places = np.concatenate(there.lengths), [], np.searchsorted(chosen, numbers).tolist()
+        for number, place in zip(numbers, places, strict=True):
+            odds, rival = offsets.odds(place, places)
+            own = groups.among([number]) & self._taking_part
             other = (end if odds > 0.0 else without).solution.estimate
             instead = "it belongs"
             if rival is not None and abs(odds) < DOUBTFUL:
-                instead = f"the whole of {groups.name(rival)} does not belong"
-                rivals = self._without(groups, tuple(rival if one == number else one for one in numbers))
+                in_its_place = int(chosen[rival])
+                instead = f"the whole of {groups.name(in_its_place)} does not belong"
+                rivals = self._without(groups, tuple(in_its_place if one == number else one for one in numbers))
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
             aside_px = float(medians_known(lengths[own]))
             explanations.append(Explanation(groups.name(number), own, aside_px, odds, groups.remedy, instead, other))
-        rows = groups.among(np.array(numbers)) & self._taking_part
-        least = min(one.log_odds for one in explanations)
-        return _Trial(suspects, without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
+        rows, least = groups.among(numbers) & self._taking_part, min(one.log_odds for one in explanations)
+        further = offsets.next(places)
+        further = None if further is None else int(chosen[further])
+        return _Trial(suspects, without, rows, least, tuple(explanations), further)
 
     @or_none  # quiet: what determines nothing without the suspects is no explanation
     def _without(self, groups: ObservationGroups, numbers: tuple[int, ...]) -> RobustSolution | None:
         """The end of a solve without some groups; None where the others determine nothing."""
-        gone = groups.among(np.array(numbers))
+        gone = groups.among(numbers)
         end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
         every = self._some.problem
         there = residuals(self._some.observations, every.sights, end.solution.estimate)
@@ -311,7 +260,7 @@ class _Competition:
 
         None where some of these lie here and there: they are no group.
         """
-        recalled = groups.among(np.array(back, dtype=np.int64)) & self._taking_part
+        recalled = groups.among(back) & self._taking_part
         observations, problem = self._some.observations, self._some.problem
         rows = rows_compared(groups, end, self._taking_part, recalled)
         sights = self._some.of_rows(rows).sights
@@ -320,43 +269,20 @@ class _Competition:
         equations = write_equations(observations, sights, end.solution.estimate, end.residuals)
         weights = end.weights_of(observations, equations)
         here = recalled[equations.observation]
-        weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
-        model = make_linear_model(problem, end.solution.estimate, equations, weights)
+        used = weights.used | here
         chosen, share = groups_compared(groups, end, rows & (end.inliers.rows | recalled), back)
         effect = groups.columns(equations, chosen)
-        agreeing = model.used.copy()
         for number in back:
             own = np.flatnonzero(effect.group == np.searchsorted(chosen, number))
-            left = (equations.residual * model.weight)[own]
+            left = (equations.residual * weights.inverse_sigma)[own]
             left = left + effect.columns[own] @ least_absolute(effect.columns[own], left)
             agree = np.abs(left) <= problem.options.reject_sigma
             if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
                 return chosen, None
-            agreeing[own] = agree
-        if back:
-            model = make_linear_model(problem, end.solution.estimate, equations, replace(weights, used=agreeing))
+            used[own] = agree
         if len(chosen) < 2:
             return chosen, None
+        weights = replace(weights, used=used, robust=np.where(here, 1.0, weights.robust))
+        model = make_linear_model(problem, end.solution.estimate, equations, weights)
         prior = groups.prior  # that it is one of those that are compared
         return chosen, measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
-
-
-def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:
-    """Log odds that one of the wrong groups does not belong, against that it does, or another one in its place: then
-    which.
-    """
-    at = {int(one): place for place, one in enumerate(chosen)}
-    others = [at[one] for one in wrong if one != number]
-    each = offsets.log_evidence_with_each(others)
-    evidence, none = float(each[at[number]]), offsets.log_evidence(others)
-    each[at[number]] = -np.inf
-    rival = int(np.argmax(each))
-    return evidence - max(none, float(each[rival])), int(chosen[rival]) if each[rival] > none else None
-
-
-def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | None:
-    """The group that does not belong, either, when these do not; None where there is none."""
-    at = [int(np.flatnonzero(chosen == number)[0]) for number in wrong]
-    each = offsets.log_evidence_with_each(at)
-    best = int(np.argmax(each))
-    return int(chosen[best]) if each[best] > offsets.log_evidence(at) else None

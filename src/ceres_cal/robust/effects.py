@@ -15,11 +15,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.effects.columns import EffectColumns, SparseColumns
+from ceres_cal.effects.columns import EffectColumns, ScoreTest, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import make_linear_model
-from ceres_cal.effects.score_tests import ScoreTest
 from ceres_cal.effects.strands import strand_names
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations

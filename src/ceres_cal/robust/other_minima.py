@@ -23,10 +23,10 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Solution, placement_costs, solve
 from ceres_cal.problem.information import Information
-from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import difference, natural_sizes
+from ceres_cal.robust.noise import Inliers
 from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 

@@ -15,16 +15,24 @@ from ceres_cal.base.arrays import Indices, numerical
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.linearised import Weights, equation_weights
-from ceres_cal.effects.smoothness import with_smoothness
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
-from ceres_cal.problem.noise import Inliers, Redundancy, by_count, by_leverage, judge, median_scales, visible_from
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, residuals_alone
-from ceres_cal.robust.deleted import Fitted, by_deleted_residuals
+from ceres_cal.robust.noise import (
+    Fitted,
+    Inliers,
+    Redundancy,
+    by_count,
+    by_deleted_residuals,
+    by_leverage,
+    judge,
+    median_scales,
+    visible_from,
+)
 from ceres_cal.robust.other_minima import with_lost_boards_posed, without_mirrored_poses
 
 MOST_ROUNDS = 15
@@ -297,7 +305,10 @@ class _RowRounds(Rounds[RobustSolution]):
     def _anew(self, state: RobustSolution) -> tuple[Inliers, ReducedInformation]:
         """Noise and inliers by the leverages there, and what they were taken from."""
         reduced = information(state.problem, state.solution.estimate)
-        self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
+        if any(camera.lens.roughness for camera in state.solution.estimate.cameras.values()):
+            from ceres_cal.effects.smoothness import with_smoothness
+
+            self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
         sights = state.problem.sights
         points, curves = reduced.leverages
         taken = points + self._problem.taken_up, curves

@@ -17,10 +17,10 @@ from ceres_cal.base.arrays import Array, Mask, distinct
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.noise import Inliers
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals
+from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 

@@ -20,7 +20,7 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
-from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.quantities import PHI_RANGE
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (

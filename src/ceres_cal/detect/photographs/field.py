@@ -10,9 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.base.arrays import Array32, Mask
-from ceres_cal.base.errors import CalibrationError, InputError, NothingShownError, attempt, naming, or_none
+from ceres_cal.base.errors import (
+    CalibrationError,
+    ImageProgress,
+    InputError,
+    NothingShownError,
+    attempt,
+    naming,
+    or_none,
+)
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.base.threads import single_threaded_blas
 from ceres_cal.base.words import frame_of

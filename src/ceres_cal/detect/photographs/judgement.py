@@ -11,7 +11,7 @@ from ceres_cal.detect.photographs.candidates import FieldSearch
 from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
 from ceres_cal.detect.photographs.matching import divergence
 from ceres_cal.detect.photographs.painted import BY_CHANCE
-from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.quantities import PHI_RANGE
 from ceres_cal.scene.curves import Arc
 from ceres_cal.scene.targets import Target
 

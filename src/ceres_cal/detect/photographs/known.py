@@ -6,9 +6,8 @@ from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 
-from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.errors import ImageProgress, InputError, NothingShownError
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.shown import brief
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards

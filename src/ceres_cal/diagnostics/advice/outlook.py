@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Spread, thin_root
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.spread import Spread, thin_root
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior

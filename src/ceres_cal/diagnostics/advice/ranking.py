@@ -9,10 +9,9 @@ from functools import partial
 import numpy as np
 
 from ceres_cal.base.arrays import numerical
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.base.executing import each
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.threads import single_threaded_blas
 from ceres_cal.base.typed import checked

@@ -11,9 +11,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, numbers_of
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped
+from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_all
 from ceres_cal.effects.effect import SMALL, CameraEffect, Case, Effect, Evidence, Words, amounts, half_diagonals
-from ceres_cal.effects.score_tests import score_all
 from ceres_cal.problem.parameters import OF_PIXELS, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens

@@ -1,7 +1,8 @@
 """Reading the residuals: how large the noise is, and which observations do not belong.
 
 Residuals are taken in units of their stated sigma; the noise scale is the factor by which the stated sigmas of a kind
-(points, curves) must be multiplied to describe what is seen.
+(points, curves) must be multiplied to describe what is seen. Where it is in doubt, an outlier is what the others alone
+predict elsewhere.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.effects.linearised import equation_weights, shared_columns, studentised
 from ceres_cal.observations import Observations
-from ceres_cal.observations.files import Content
-from ceres_cal.problem.parameters import Options
-from ceres_cal.problem.problem import Weighting
-from ceres_cal.problem.residuals import Residuals
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import from_placement
+from ceres_cal.problem.reduced import ReducedInformation
+from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths
 
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
@@ -127,13 +130,6 @@ class Inliers(Frozen):
         return self.point_scale, self.curve_scale
 
 
-def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
-    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
-    points, curves = residuals.lengths
-    points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
-    return np.fmin(points, np.inf, out=points), np.fmin(curves, np.inf, out=curves)  # NaN is infinite
-
-
 def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
     """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
     points, curves = relative_lengths(observations, residuals)
@@ -207,8 +203,8 @@ class Lengths(Protocol):
     def middle(self) -> float:
         """Their median; 0 of none."""
 
-    def within(self, bound: float) -> LengthSums:
-        """Of those that are no longer."""
+    def within(self, bound: float) -> tuple[int, float]:
+        """Of those that are no longer, how many, and the sum of their squares."""
 
 
 def noise_of(
@@ -220,20 +216,17 @@ def noise_of(
     floor = usual or (0.0, 0.0)
     spare_of_all = 2.0 * redundancy[0] * points.count + redundancy[1] * curves.count
     reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
-    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy[0])
-    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy[1])
-    spare = 2.0 * redundancy[0] * point_spread.count, redundancy[1] * curve_spread.count
+    p_sums = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy[0])
+    c_sums = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy[1])
+    spare = 2.0 * redundancy[0] * p_sums[0], redundancy[1] * c_sums[0]
     degrees = spare[0] + spare[1]
     if usual is not None:
-        p, c = point_spread.scale_from(usual[0], spare[0]), curve_spread.scale_from(usual[1], spare[1])
+        p, c = _scale_from(usual[0], p_sums, spare[0]), _scale_from(usual[1], c_sums, spare[1])
         degrees = max(degrees, 0.0) + USUAL_EQUATIONS
+    elif degrees < _LEAST_SPARE:
+        p, c, degrees = 1.0, 1.0, np.inf
     else:
-        p, c = (
-            point_spread.scale(spare[0], curve_spread, spare[1]),
-            curve_spread.scale(spare[1], point_spread, spare[0]),
-        )
-        if degrees < _LEAST_SPARE:
-            p, c, degrees = 1.0, 1.0, np.inf
+        p, c = _scale(p_sums, spare[0], c_sums, spare[1]), _scale(c_sums, spare[1], p_sums, spare[0])
     return NoiseScales(p, c, reject_sigma, degrees)
 
 
@@ -248,21 +241,20 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
 
 
-class LengthSums(Frozen, eq=True):
-    """Number and sum of squares of the lengths within the rejection bound."""
+_Sums = tuple[int, float]
+"""Number and sum of squares of the lengths within the rejection bound."""
 
-    count: int
-    squares: float
 
-    def scale(self, spare: float, other: LengthSums, other_spare: float) -> float:
-        """Their scale, when they bring so many spare equations: that of the other kind counts as much as a few."""
-        borrowed = min(_BORROWED, max(other_spare, 0.0))
-        variance = borrowed * other.squares / max(other_spare, 1.0)
-        return max(float(np.sqrt((self.squares + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE_PX)
+def _scale(sums: _Sums, spare: float, other: _Sums, other_spare: float) -> float:
+    """The scale of lengths that bring so many spare equations: that of the other kind counts as much as a few."""
+    borrowed = min(_BORROWED, max(other_spare, 0.0))
+    variance = borrowed * other[1] / max(other_spare, 1.0)
+    return max(float(np.sqrt((sums[1] + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE_PX)
 
-    def scale_from(self, usual: float, spare: float) -> float:
-        """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
-        return float(np.sqrt((self.squares + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
+
+def _scale_from(usual: float, sums: _Sums, spare: float) -> float:
+    """The same when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
+    return float(np.sqrt((sums[1] + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
 
 
 class EachLength:
@@ -281,17 +273,17 @@ class EachLength:
         """Their median; 0 of none."""
         return _middle(self._seen)
 
-    def within(self, bound: float) -> LengthSums:
+    def within(self, bound: float) -> _Sums:
         """Of those that are no longer."""
         count, squares = 0, 0.0
         for first in range(0, len(self._seen), _BLOCK):
             block = self._seen[first : first + _BLOCK]
             inside = block[block <= bound]
             count, squares = count + len(inside), squares + float(inside @ inside)
-        return LengthSums(count, squares)
+        return count, squares
 
 
-def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> LengthSums:
+def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> _Sums:
     """Of the lengths that the scale they have keeps.
 
     Args:
@@ -301,10 +293,96 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
     first = _median_scale(lengths, median_of_one)
     spread = lengths.within(reject_sigma * max(first, least))
     for _ in range(most_wider):
-        if degrees <= 0.0 or not spread.count:
+        count, squares = spread
+        if degrees <= 0.0 or not count:
             break
-        wider = lengths.within(reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))
-        if not spread.count < wider.count <= (1.0 + _TAIL) * spread.count:
+        wider = lengths.within(reject_sigma * float(np.sqrt(squares / (degrees * count))))
+        if not count < wider[0] <= (1.0 + _TAIL) * count:
             break
         spread = wider
     return spread
+
+
+# ---- outliers by deleted residuals ----------------------------------------------------------------------------------
+
+
+# How far off an observation is where the others alone predict it. A residual that the fit has taken up is short whether
+# or not it belongs, and one that only a guess predicts is long though it belongs: the only corner at a picture's rim,
+# once left out, would stay out. So where nothing changes any more those in doubt are judged by what the others say of
+# them, at the standard deviation of that (Cook and Weisberg 1982, Residuals and Influence in Regression, 2.2).
+
+
+class Fitted(Frozen):
+    """An estimate of some observations, and what these say there.
+
+    Attributes:
+        problem: of all the observations. used: (N + M,) which took part. residuals: of all. reduced: what those that
+            took part, and what was known before, say there.
+    """
+
+    problem: Problem
+    observations: Observations
+    estimate: Estimate
+    residuals: Residuals
+    used: Mask
+    reduced: ReducedInformation
+
+
+def by_deleted_residuals(inliers: Inliers, fitted: Fitted) -> Inliers:
+    """The inliers by deleted residuals, where the residuals alone, by which these are, leave it in doubt."""
+    # Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it says more of
+    # its place than all others, and then nobody knows which of the two is wrong.
+    doubted = 0.5**0.5
+    doubtful = np.isfinite(inliers.sigmas) & (inliers.sigmas > doubted * inliers.bound)
+    if not np.any(doubtful):
+        return inliers
+    rows = inliers.rows
+    observation, length = deleted_lengths(doubtful, inliers.weighting(fitted.problem.options), fitted)
+    rows[observation] = length <= inliers.bound
+    return inliers.with_rows(rows)
+
+
+def deleted_lengths(rows: Mask, weighting: Weighting, fitted: Fitted) -> tuple[Indices, Array]:
+    """Of some of the observations (N + M,), whose residuals are finite: which one each is, and the length of its
+    deleted residual in that one's standard deviations.
+    """
+    observations, estimate = fitted.observations, fitted.estimate
+    sights = fitted.problem.sights.used(*np.split(rows, [len(observations.points)]))
+    equations = equations_of(observations, sights, estimate, fitted.residuals)
+    weights = equation_weights(observations, weighting, equations, fitted.residuals)
+    share = np.where(fitted.used[equations.observation], weights.robust, 0.0)
+    leverage, overlap = _leverages(equations, weights.inverse_sigma, estimate, fitted.reduced)
+    residual = weights.inverse_sigma * equations.residual
+    observation, length = studentised(equations, residual, share, leverage, overlap)
+    return observation, np.abs(length)
+
+
+def _leverages(
+    equations: Equations, weight: Array, estimate: Estimate, reduced: ReducedInformation
+) -> tuple[Array, Array]:
+    """(E,) what the estimate's covariance adds to the variance of equations of this weight, in theirs, and (P,) to the
+    covariance of the two of each point.
+
+    How targets were built is held: what it would add is its own scatter.
+    """
+    rest = np.array([not key.is_structure for key in reduced.shared.keys], dtype=bool)
+    keys = [key for key in reduced.shared.keys if not key.is_structure]
+    covariance = reduced.shared.inverse[np.ix_(rest, rest)]
+    shared = shared_columns(equations, estimate, keys) * weight[:, None]
+    private, own = np.zeros((2, len(equations), 6))
+    for part in reduced.eliminated:
+        at = {name: number for number, name in enumerate(part.names)}
+        placed = np.array([at.get(str(key.placement), -1) for key in equations.sights.keys])[equations.sight]
+        rows = np.flatnonzero(placed >= 0)
+        world = estimate.stations[part.station].cam_from_world
+        chain = from_placement(equations.poses, world)[equations.sight[rows]]
+        private[rows] = np.einsum("ei,eij->ej", equations.pose[rows], chain) * weight[rows, None]
+        own[rows] = np.einsum("ei,eij->ej", private[rows], part.inverses[placed[rows]])
+        for column, key in enumerate(part.keys):
+            if not key.is_structure:
+                shared[rows, keys.index(key)] -= np.sum(private[rows] * part.gains[placed[rows], :, column], axis=1)
+    along, (first, second) = shared @ covariance, pairs_of(equations)
+    return (
+        np.sum(along * shared, axis=1) + np.sum(own * private, axis=1),
+        np.sum(along[first] * shared[second], axis=1) + np.sum(own[first] * private[second], axis=1),
+    )
