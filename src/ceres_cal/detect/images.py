@@ -17,6 +17,7 @@ from ceres_cal.detect.headers import claimed_size
 _BYTES_PER_PIXEL = 3
 # Of the pixels of a colour sensor, those that see blue, green and red.
 _OF_MOSAIC = np.array([0.25, 0.5, 0.25], np.float32)
+_AS_SEEN = np.array([0.114, 0.587, 0.299], np.float32)  # by eyes: the light of ITU-R BT.601, in JPEG files and videos
 _AROUND_PX = (301, 101, 31)  # over which what is left out is filled, ever nearer
 _LEAST_PX = 16  # of either side: what is looked at around a corner or across a line is wider
 _PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at a bit each
@@ -46,11 +47,22 @@ def light(image: Image) -> Array32:
 
     A sensor sees red in every other row of pixels and blue in the others. Of a line two pixels wide, most cameras' file
     has red drawn towards the one and blue towards the other; as human eyes weigh them that leaves up to 0.13 px of a
-    whole line. Weighed as the sensor's pixels are, what is white or grey stays where it is.
+    whole line. Weighed as the sensor's pixels are, what is white or grey stays where it is. Most JPEG files and videos
+    keep the colours of two by two pixels only, and draw blue aside by that: then it is what they keep of each pixel.
     """
     if image.ndim == 2:
         return image.astype(np.float32)
-    return np.asarray(cv2.transform(image.astype(np.float32), _OF_MOSAIC[None, :]), dtype=np.float32)
+    weights = _AS_SEEN if _is_colour_coarse(image) else _OF_MOSAIC
+    return np.asarray(cv2.transform(image.astype(np.float32), weights[None, :]), dtype=np.float32)
+
+
+def _is_colour_coarse(image: Image) -> bool:
+    """Whether the colours (blue beside what eyes see) of an image lack the detail that its light has."""
+    kernel, coarse = np.array([1.0, -2.0, 1.0], np.float32), 0.2  # 0.03 to 0.13 of JPEG files, else 0.41 and more
+    seen = cv2.transform(image.astype(np.float32), _AS_SEEN[None, :])
+    fine, colour = (cv2.sepFilter2D(one, -1, kernel, kernel) for one in (seen, image[..., 0] - seen))
+    clear = np.abs(fine) >= np.quantile(np.abs(fine), 0.99)
+    return bool(np.mean(np.abs(colour[clear])) < coarse * np.mean(np.abs(fine[clear])))
 
 
 def read_colour(path: str | Path) -> Image:

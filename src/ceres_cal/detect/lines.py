@@ -35,8 +35,9 @@ _LEAST_CONTRAST = 0.15
 # Least and most share of the contrast nearby: a robot's marker is brighter than paint in shadow. Both ends lie around
 # 1 and cannot be halved; 0.9 as the least loses a tenth of the line centres.
 _OF_NEARBY = 0.45, 1.7
-# Times the usual misfit: something else is in the window. Of line centres 5 % go at half of it, 1 % come at double.
-_NOISY = 3.0
+# Times the usual misfit: something else is in the window, or runs along the line, where it is as large a share of the
+# contrast, too. Of line centres 5 % go at half of the former, 1 % come at double.
+_NOISY, _NOISY_NEARBY = 3.0, 2.0
 _NEARBY = 4  # places to each side that a place is compared with
 # Off its neighbours: standard deviations, and at least so much. Of line centres 1 % go at half of it, 0.2 % come at
 # double.
@@ -199,12 +200,13 @@ def measure(
         blur, fits = coma, coma.fitted(windows, course)
     drawn = _OF_COMA * np.nan_to_num(fits.offset_px - even.offset_px) * np.sqrt(np.bincount(course.curve)[course.curve])
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
-    offset = rough + fits.offset_px
+    # What is blurred along a line as well is drawn to the inside of its bend.
+    offset = rough + fits.offset_px - 0.5 * blur.usual_px**2 * course.curvature
     found = _is_paint(course, fits, contrast, medians(windows.values))
     found = _goes_on(course, found, offset, fits.sigma_px)
     aside, remains = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
-    offset, sigma = offset - aside, np.hypot(np.hypot(fits.sigma_px, drawn), remains)
-    sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
+    offset = offset - aside
+    sigma = np.hypot(np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), drawn), remains)
     found = _goes_on(course, found, offset, sigma)
     offset = np.where(found, offset, np.nan)
     return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma is None)
@@ -240,7 +242,9 @@ def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) ->
         nearby = _medians(np.where(clear, height, np.nan), course.curve)
         alike |= (height > _OF_NEARBY[0] * nearby) & (height < _OF_NEARBY[1] * nearby)
     clear &= alike
-    return np.asarray(clear & (fits.noise < _NOISY * median(fits.noise[clear])))
+    misfit, share = (one / median(one[clear]) for one in (fits.noise, fits.noise / np.maximum(contrast, _TINY)))
+    along = _medians(np.where(fitted, np.minimum(misfit, share), np.nan), course.curve)
+    return np.asarray(clear & (misfit < _NOISY) & (along < _NOISY_NEARBY))
 
 
 def _neighbours(values: Array, curve: Indices32) -> Array:
@@ -280,16 +284,16 @@ def _threes(course: Course, found: Mask) -> Indices:
     return np.asarray(three[same & np.all(found[three], axis=1)])
 
 
-def _scatter(three: Indices, offset: Array, sigma: Array) -> float:
-    """The standard deviation, px, that besides sigma makes what the offsets of three places on a curve tell of their
-    scatter.
+def _as_scattered(three: Indices, offset: Array, sigma: Array) -> Array:
+    """(N,) the standard deviations, px, as what the offsets of three places on a curve tell of their scatter.
 
-    Carpet, wear, compression and the sampling of lines thinner than a pixel are not white noise, which is all that a
-    window knows; and what a window in good light knows best suffers from them no less.
+    Carpet, wear and compression are not white noise, which is all that a window knows; what a window in good light
+    knows best suffers from them no less, so it is added. What is less scatter than windows know is what they do not fit
+    and what is alike in all of them, as a sensor's colours: then all are smaller.
     """
     if len(three) < 20:
-        return 0.0
+        return sigma
     change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
     more = _SCATTER_PX[:, None]
-    usual = medians(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2))
-    return float(_SCATTER_PX[np.argmin(np.abs(usual / 0.6745 - 1.0))])
+    usual = medians(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2)) / 0.6745
+    return np.asarray(min(usual[0], 1.0) * np.hypot(sigma, _SCATTER_PX[np.argmin(np.abs(usual - 1.0))]))

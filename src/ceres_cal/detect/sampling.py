@@ -2,8 +2,10 @@
 
 A line that lies on the middle of a row of pixels, or between two rows, is drawn there. Elsewhere a sharp lens and a
 colour sensor, of whose pixels most colours are filled in, draw it up to 0.12 px towards one of them, by where it lies
-in the pixel. Along a line that is nearly level or upright that changes slowly, so that many places err together; nearer
-and farther ones tell it all the same, since lines are straight or round and what is drawn of them waves.
+in the pixel; and at 45 degrees by where it lies between the diagonals that see green. Red and blue are seen in every
+other row only, so what weighs them unlike waves over two pixels. Along a line in such a direction that changes slowly,
+so that many places err together; nearer and farther ones tell it all the same, since lines are straight or round and
+what is drawn of them waves.
 """
 
 from __future__ import annotations
@@ -17,6 +19,9 @@ _REMAINS = 0.15  # of the error, what is left once it is taken off
 _AROUND = 10  # places to either side, of which the mean tells where in its pixel a line lies
 _ROUNDS, _FEWEST = 5, 20
 _CURVATURE = np.array([1.0, -2.0, 1.0])
+# Across level lines, upright ones, and those along either diagonal, which a sensor of colours draws alike.
+_ACROSS = np.array([(0.0, 1.0), (1.0, 0.0), (0.5**0.5, 0.5**0.5), (0.5**0.5, -(0.5**0.5))])
+_CYCLES = (((0,), (0.5, 1.0, 2.0)), ((1,), (0.5, 1.0, 2.0)), ((2, 3), (0.5**0.5, 2.0**0.5)))  # 1/px
 
 
 def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px: int) -> tuple[Array, Array]:
@@ -31,21 +36,25 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
     aside: Array = np.zeros(len(course))
     if len(threes) < _FEWEST:
         return aside, aside
+    # Standard deviation of the error's amplitude, beforehand: what is wide has edges that are drawn aside alike.
+    prior_px = 0.1 / max(float(np.median(course.width_px)), 1.0)
     bends = offset_px[threes] @ _CURVATURE
     for _ in range(_ROUNDS):  # where in the pixel a line lies is where it is drawn but for that
         turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
-        amplitude = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends)
+        amplitude, sigma = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends, prior_px)
         aside = np.nan_to_num(turns.imag @ amplitude)
-    remains = _REMAINS * np.abs(amplitude) * np.nan_to_num(np.abs(turns) * np.sqrt(_alike(course, offset_px, turns)))
+    left = np.hypot(_REMAINS * amplitude, sigma)
+    remains = left * np.nan_to_num(np.abs(turns) * np.sqrt(_alike(course, offset_px, turns)))
     return aside, np.linalg.norm(remains, axis=1)
 
 
 def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
-    """(N, 4) how many places of its curve err as a place does: few where the line wanders through the pixels."""
+    """(N, K) how many places of its curve err as a place does: few where the line wanders through the pixels."""
     measured, alike = np.isfinite(offset_px), np.ones(turns.shape)
     for number in np.unique(course.curve):
-        own = course.curve == number
-        alike[own] = np.maximum(np.abs(np.sum(turns[own & measured], axis=0)), 1.0)
+        every = turns[measured & (course.curve == number)]
+        squares = np.maximum(np.sum(np.abs(every) ** 2, axis=0), 1e-12)
+        alike[course.curve == number] = np.maximum(np.abs(np.sum(every, axis=0)) ** 2 / squares, 1.0)
     return alike
 
 
@@ -60,11 +69,10 @@ def _smooth(curve: Indices32, offset_px: Array) -> Array:
     return smooth
 
 
-def _amplitudes(columns: Array, bends: Array) -> Array:
-    """(K,) of what, times columns (M, K), explains the bends (M,) but for a few."""
+def _amplitudes(columns: Array, bends: Array, prior_px: float) -> tuple[Array, Array]:
+    """(K,) of what, times columns (M, K), explains the bends (M,) but for a few; and its standard deviation (K,)."""
     robust = 2.0  # of the usual residual: Cauchy's scale
     least_px = 1e-4
-    prior_px = 0.1  # standard deviation of the error's amplitude, beforehand
     amplitude: Array = np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
         left = bends - columns @ amplitude
@@ -72,20 +80,27 @@ def _amplitudes(columns: Array, bends: Array) -> Array:
         weighted = columns / (1.0 + (left / (robust * usual)) ** 2)[:, None]
         normal = weighted.T @ columns + (usual / prior_px) ** 2 * np.eye(len(amplitude))
         amplitude = np.asarray(np.linalg.solve(normal, weighted.T @ bends), dtype=float)
-    return np.asarray(amplitude)
+    return np.asarray(amplitude), usual * np.sqrt(np.diag(np.linalg.inv(normal)))
 
 
 def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
-    """(N, 4) complex: how far round its pixel a line is, the mean over each window, along the normal: of level lines,
-    then of upright ones.
-    """
-    harmonics = (1.0, 2.0)
+    """(N, K) complex: how far round its pixel a line is, the mean over each window, along the normal: of each wave."""
     places, normals = course.pixels + offset_px[:, None] * course.normals, course.normals
+    nearest = np.argmax(np.abs(normals @ _ACROSS.T), axis=1)
     level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])
     along, across = (np.where(level, places[:, axis], places[:, 1 - axis]) for axis in (0, 1))
     n_along, n_across = (np.where(level, normals[:, axis], normals[:, 1 - axis]) for axis in (0, 1))
-    du = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1) - along[:, None]
+    u = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1)
+    du = u - along[:, None]
     bent = 0.5 * course.curvature[:, None] * (du / n_across[:, None]) ** 2
-    crossed = across[:, None] + (bent - du * n_along[:, None]) / n_across[:, None]
-    turns = [n_across * np.mean(np.exp(2j * np.pi * times * crossed), axis=1) for times in harmonics]
-    return np.column_stack([np.where(chosen, turn, 0.0) for chosen in (level, ~level) for turn in turns])
+    v = across[:, None] + (bent - du * n_along[:, None]) / n_across[:, None]
+    x, y = np.where(level[:, None], (u, v), (v, u))
+    wave = _ACROSS[nearest]
+    crossed, share = wave[:, :1] * x + wave[:, 1:] * y, np.sum(wave * normals, axis=1)
+    return np.column_stack(
+        [
+            np.where(np.isin(nearest, own), share * np.mean(np.exp(2j * np.pi * cycles * crossed), axis=1), 0.0)
+            for own, every in _CYCLES
+            for cycles in every
+        ]
+    )
