@@ -32,7 +32,7 @@ from ceres_cal.effects.aside import (
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import column_of, some_views, thinned_by_key
+from ceres_cal.observations.sights import column_of, shown_rows, some_views, thinned_by_key
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals, write_equations
@@ -317,10 +317,7 @@ def compared_part(every: Subproblem) -> Subproblem:
     observations, sights = every.observations, every.problem.sights
     if len(sights.point_rows) + len(sights.curve_rows) <= _MOST_ASKED:
         return every
-    points = len(observations.points)
-    there = np.zeros(points + len(observations.curves), dtype=bool)
-    there[sights.point_rows] = there[points + sights.curve_rows] = True
-    view = column_of(observations, "view")
+    there, view = shown_rows(observations, sights), column_of(observations, "view")
     chosen = np.zeros(len(observations.views), dtype=bool)
     chosen[some_views(np.bincount(view[there], minlength=len(chosen)), _MOST_ASKED, _FEWEST_ASKED)] = True
     for groups in every.kinds:
@@ -328,7 +325,7 @@ def compared_part(every: Subproblem) -> Subproblem:
         chosen |= views_compared(groups, every.end, there, groups.among(worst) & there)
     there &= chosen[view]
     rows = np.flatnonzero(there)[:: max(1, int(np.count_nonzero(there)) // (2 * _MOST_ASKED))]
-    return _part(every, rows, int(np.searchsorted(rows, points)))
+    return _part(every, rows, int(np.searchsorted(rows, len(observations.points))))
 
 
 def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
