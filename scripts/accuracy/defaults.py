@@ -245,6 +245,10 @@ def lengths(runs: int) -> Iterator[Row]:
             yield Row(name, "called trusted", trusted, most=0.0 if off else 1.0)
 
 
-_cases = {name: partial(decentred, name) for name in DECENTRED}
-_cases |= {"round": round_lens, "stated": stated, "lengths": lengths}
+_cases: dict[str, Callable[[int], Iterator[Row]]] = {
+    **{name: partial(decentred, name) for name in DECENTRED},
+    "round": round_lens,
+    "stated": stated,
+    "lengths": lengths,
+}
 main = script(_cases, __doc__, (200, "scenes of each case"))
