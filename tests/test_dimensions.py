@@ -70,6 +70,21 @@ def solved() -> tuple[Observations, Calibration]:
     return observations, calibrate(observations, Options(lens="radial", dimensions=BOTH))
 
 
+@pytest.mark.parametrize("name", TRUE)
+def test_a_field_that_is_not_as_long_or_wide_as_drawn_is_named(name: str) -> None:
+    """1 % is drawn too much; measured 8.999 ± 0.007 m and 6.000 ± 0.004 m."""
+    true = FIELD.dimensions[name]
+    painted = field_scene(FIELD, {"a": CAMERA}, {"s": Station("a", overhead_pose(0.2, -0.15, 5.0, 9.0, -6.0))})
+    observations = simulate(painted, Disturbance(0.2, 0.2), 1).observations
+    assert not diagnose(calibrate(observations, Options(lens="radial")), observations).findings
+    observations = replace(observations, targets={"field": ssl_field("B", **{name: 1.01 * true})})
+    findings = diagnose(calibrate(observations, Options(lens="radial")), observations).findings
+    found = next(one for one in findings if one.subject == f"field/{name}")
+    assert found.kind == "other length" and f"--estimate field.{name}" in found.advice
+    (by,) = found.amounts
+    assert abs(1.01e3 * true + by.value - 1e3 * true) < 4.0 * by.sd < 40.0
+
+
 def test_a_field_of_odd_size_from_its_circle() -> None:
     _, calibration = solved()
     target = calibration.targets["field"]

@@ -3,9 +3,9 @@
 Scenes of one camera over a division B field, calibrated by the defaults. Its lens is Brown's, with decentring that is
 drawn from the range of real lenses, or the paper's, without any. Of the first: how often 95 % intervals of places at
 0 and 150 mm hold (90 to 99 % asked), and that no number called "known" is over 5 standard deviations off. Of the
-second: what the default costs, as the error at 150 mm over that of the named lens. Then a stated height that is 5 % or
-2 % wrong, and one that is right: how often a contradiction is named. Exits with 1 when a figure is missed by more than
-two of its standard errors.
+second: what the default costs, as the error at 150 mm over that of the named lens. Then a stated height or phi that is
+5 % or 2 % wrong, and ones that are right, and fields that are longer or wider than their drawing: how often that is
+named. Exits with 1 when a figure is missed by more than two of its standard errors.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from runner import Row, mean_and_error, over, script, share_error
 from accuracy.odd_scenes import farthest
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -168,45 +169,86 @@ def round_lens(runs: int) -> Iterator[Row]:
         yield Row(name, "recognised", float(paper.mean()), share_error(float(paper.mean()), runs), 0.95)
 
 
-def _accused(off: float, tilt_deg: float, seed: int) -> tuple[bool, bool, float]:
-    """Whether a height is said to be contradicted, whether that or that it may be wrong, and by how many standard
-    deviations what the true lens alone says contradicts it.
+def _accused(quantity: str, off: float, tilt_deg: float, seed: int) -> tuple[bool, bool, float]:
+    """Whether a stated height or phi is said to be contradicted, whether that or that it may be wrong, and by how many
+    standard deviations what the true lens alone says contradicts it.
     """
     lens = "brown" if seed % 2 else "radial"
     scene = _scene(seed, _brown if seed % 2 else _round, (tilt_deg,))
-    height_m = float(scene.camera_at("s0").position[2])
-    taped = height_m * (1.0 + off) + (0.0 if off else 0.005 * np.random.default_rng([seed, 7]).standard_normal())
+    owner, name = ("station", "s0") if quantity == "height" else ("camera", "c")
+    true = float(scene.camera_at("s0").position[2] if quantity == "height" else scene.camera_at("s0").phi)
+    sigma = _TAPED_M if quantity == "height" else _OF_PHI * true
+    stated = true * (1.0 + off) + (0.0 if off else sigma * np.random.default_rng([seed, 7]).standard_normal())
     seen = observed(scene, 1, seed)
-    alone = calibrate(seen, Options(lens=lens)).uncertainty.verdict("station", "s0", "height").sd
-    apart = float(abs(taped - height_m) / np.hypot(alone, 0.005))
+    alone = calibrate(seen, Options(lens=lens)).uncertainty.verdict(owner, name, quantity).sd
+    apart = float(abs(stated - true) / np.hypot(alone, sigma))
+    prior = Prior(owner, name, "height_m" if quantity == "height" else quantity, (stated,), (sigma,))
     try:
-        calibration = calibrate(seen, Options(priors=(Prior("station", "s0", "height_m", (taped,), (0.005,)),)))
+        calibration = calibrate(seen, Options(priors=(prior,)))
     except CalibrationError:
         return off != 0.0, off != 0.0, apart
-    named = any(one.quantity == "height" for one in calibration.conflicts)
-    return named, named or any("stated height" in said for said in calibration.warnings), apart
+    named = any(one.quantity == quantity for one in calibration.conflicts)
+    return named, named or any(f"stated {quantity}" in said for said in calibration.warnings), apart
 
 
+_TAPED_M, _OF_PHI = 0.005, 0.002  # standard deviations of a stated height, and of a stated phi, of itself
 _WRONG = (
-    (0.05, 12.0, 0.95, 1.0),
-    (0.05, 20.0, 0.95, 1.0),
-    (-0.2, 20.0, 0.95, 1.0),
-    (0.02, 20.0, 0.95, 1.0),
-    (0.0, 12.0, 0.0, 0.005),
+    ("height", 0.05, 12.0, 0.95, 1.0),
+    ("height", 0.05, 20.0, 0.95, 1.0),
+    ("height", -0.2, 20.0, 0.95, 1.0),
+    ("height", 0.02, 20.0, 0.95, 1.0),
+    ("height", 0.0, 12.0, 0.0, 0.005),
+    ("phi", 0.05, 20.0, 0.95, 1.0),
+    ("phi", 0.0, 12.0, 0.0, 0.005),
 )
-"""By how much the height is wrong, the tilt, deg, and how often a contradiction may be named."""
+"""What is stated, by how much it is wrong, the tilt, deg, and how often a contradiction may be named."""
 
 
-def heights(runs: int) -> Iterator[Row]:
-    """How often a stated height is said to be contradicted."""
-    for off, tilt_deg, least, most in _WRONG:
-        named, said, apart = zip(*over(partial(_accused, off, tilt_deg), range(runs)), strict=True)
-        name = f"a height {100.0 * off:g} % wrong, {tilt_deg:g} deg" if off else "a height that is right"
+def stated(runs: int) -> Iterator[Row]:
+    """How often a stated height or phi is said to be contradicted."""
+    for quantity, off, tilt_deg, least, most in _WRONG:
+        named, said, apart = zip(*over(partial(_accused, quantity, off, tilt_deg), range(runs)), strict=True)
+        name = f"a {quantity} {100.0 * off:g} % wrong, {tilt_deg:g} deg" if off else f"a {quantity} that is right"
         note = f"by the true lens alone it is off by {np.median(apart):.1f} sd, the median"
         share = float(np.mean(named))
         yield Row(name, "contradiction named", share, share_error(share, runs), least, most, note)
         yield Row(name, "contradicted, or said to be in doubt", float(np.mean(said)))
 
 
-_cases = {name: partial(decentred, name) for name in DECENTRED} | {"round": round_lens, "heights": heights}
+def _drawn(dimension: str, off: float, tilt_deg: float, seed: int) -> tuple[bool, bool, bool]:
+    """Of a field that is drawn with another length: whether that is named, whether it or another length is, and whether
+    the calibration is called trusted.
+    """
+    observations = observed(_scene(seed, _brown if seed % 2 else _round, (tilt_deg,)), 1, seed)
+    field = observations.targets["field"]
+    drawn = ssl_field("B", **{dimension: (1.0 + off) * field.dimensions[dimension]})
+    observations = replace(observations, targets={"field": drawn})
+    try:
+        quality = quality_of(calibrate(observations), observations)
+    except CalibrationError as error:
+        return dimension in str(error), True, False
+    # A finding names beside itself what these data do not distinguish it from.
+    said = " ".join(one.sentence for one in (quality.diagnosis.findings if quality.diagnosis else ()))
+    other = any(f"field/{one}" in said for one in field.dimensions)
+    return f"field/{dimension}" in said, other, judge_quality(quality).level == "good"
+
+
+def lengths(runs: int) -> Iterator[Row]:
+    """How often a field that is drawn otherwise than it is painted is found out."""
+    for off, tilt_deg in ((0.02, 7.0), (0.02, 12.0), (0.02, 20.0), (0.01, 12.0), (0.0, 12.0)):
+        for dimension in ("field_length_m", "field_width_m")[: 2 if off else 1]:
+            own, some, trusted = np.mean(list(over(partial(_drawn, dimension, off, tilt_deg), range(runs))), axis=0)
+            name = f"{dimension} {100.0 * off:g} % wrong, {tilt_deg:g} deg" if off else "a field that is as drawn"
+            least, most = (0.95, 1.0) if off else (0.0, 0.01)
+            yield Row(name, "named", own, share_error(own, runs), least, most)
+            yield Row(name, "it or another length named", some)
+            yield Row(name, "called trusted", trusted, most=0.0 if off else 1.0)
+
+
+_cases: dict[str, Callable[[int], Iterator[Row]]] = {
+    **{name: partial(decentred, name) for name in DECENTRED},
+    "round": round_lens,
+    "stated": stated,
+    "lengths": lengths,
+}
 main = script(_cases, __doc__, (200, "scenes of each case"))

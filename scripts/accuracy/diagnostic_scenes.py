@@ -224,6 +224,12 @@ def bump(seed: int) -> Observations:
     return _on_floor(seed, lambda place: 0.02 * np.exp(-2.0 * np.sum((place - (-2.0, 3.0)) ** 2, axis=1) / 0.25))
 
 
+def drawn_longer(seed: int) -> Observations:
+    """A field that is drawn 45 mm longer than it is painted."""
+    seen = simulate(overhead(), NOISE, seed).observations
+    return replace(seen, targets={**seen.targets, "field": ssl_field("B", field_length_m=9.045)})
+
+
 FAULTS: dict[str, tuple[Problem, str, str]] = {
     "polynomial too short (r^2)": (
         Problem(short_polynomial, Options(powers=(3,), usual_camera=False)),
@@ -243,6 +249,7 @@ FAULTS: dict[str, tuple[Problem, str, str]] = {
     "tangential displacement of 1 px": (Problem(decentred, RADIAL), "decentring", "overhead"),
     "floor bowed by 15 mm": (Problem(bowed_floor, RADIAL), "floor bowed", "field"),
     "bump of 20 mm": (Problem(bump, RADIAL), "floor uneven", "field at x -2.0, y 3.0 m"),
+    "a field drawn 45 mm longer": (Problem(drawn_longer, RADIAL), "other length", "field/field_length_m"),
     "neighbours along lines agree": (Problem(agreeing, RADIAL), "correlated", "curves"),
 }
 """Name -> problem, and kind and subject of the one finding it must give."""

@@ -159,12 +159,15 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
         here: (n, n). coupling: (m, n). others: (m, m), their limits (m,) see `Spread.of`.
     """
     residue = 1e-11  # what a Schur complement leaves of a direction that is unknown, relative to what went in
-    left = here - coupling.T @ known_inverses(others, limits) @ coupling
-    diagonal = np.diagonal(here)
-    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
-    values, vectors = np.linalg.eigh(0.5 * (left + left.T) * scale[:, None] * scale)
-    root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) / scale[:, None]  # the rest is rounding
-    return np.asarray(root @ root.T)
+    told = np.flatnonzero(np.diagonal(here) > 0.0)  # of the others nothing is known
+    coupling = coupling[:, told]
+    left = here[np.ix_(told, told)] - coupling.T @ known_inverses(others, limits) @ coupling
+    scale = np.sqrt(np.diagonal(here)[told])
+    values, vectors = np.linalg.eigh(0.5 * (left + left.T) / scale[:, None] / scale)
+    root = vectors * np.sqrt(np.where(values > residue, values, 0.0)) * scale[:, None]  # the rest is rounding
+    whole = np.zeros_like(here)
+    whole[np.ix_(told, told)] = root @ root.T
+    return whole
 
 
 def thin_root(information: Array, sd: Array) -> Array:
@@ -172,13 +175,13 @@ def thin_root(information: Array, sd: Array) -> Array:
     (n,): a Cholesky factor, the row that tells most first.
     """
     negligible = 1e-9  # of what is known of a number
-    left, rows = np.diagonal(information).copy(), np.empty((0, len(sd)))
-    for _ in range(len(sd)):
-        most = int(np.argmax(left * sd**2))
-        if left[most] * sd[most] ** 2 <= negligible:
-            break
-        row = (information[most] - rows[:, most] @ rows) / np.sqrt(left[most])
-        rows, left = np.vstack([rows, row]), left - row**2
+    left, rows, variances = np.diagonal(information).copy(), np.empty((len(sd), len(sd))), sd**2
+    for count in range(len(sd)):
+        most = int(np.argmax(left * variances))
+        if left[most] * variances[most] <= negligible:
+            return rows[:count]
+        rows[count] = (information[most] - rows[:count, most] @ rows[:count]) / np.sqrt(left[most])
+        left -= rows[count] ** 2
     return rows
 
 

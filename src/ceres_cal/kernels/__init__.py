@@ -153,6 +153,18 @@ def plane_homographies(
     core().plane_homographies(bounds, plane, offsets, profile, unit, wrong, homographies, errors)
 
 
+def radial_alignment(
+    bounds: Indices, plane: Array, offsets: Array, unit: float, rounds: int, profile: Array, errors: Array, usual: Array
+) -> None:
+    """Coefficients (terms,) of the profile under which sights of points are pictures of planes.
+
+    Args:
+        bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px. unit: px.
+        errors: (N,) of each point, over `unit`. usual: (N,) what is usual at that distance from the centre.
+    """
+    core().radial_alignment(bounds, plane, offsets, unit, rounds, profile, errors, usual)
+
+
 # ---- residuals and their derivatives --------------------------------------------------------------------------------
 
 

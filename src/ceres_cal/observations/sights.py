@@ -20,7 +20,6 @@ from operator import itemgetter
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.frozen import Frozen, cached_property, replace
@@ -249,9 +248,11 @@ def _left(stays: Mask, bounds: Indices) -> tuple[_Rows, Indices]:
     return list(map(slice, [0, *(gone + 1).tolist()], [*gone.tolist(), len(stays)])), sizes
 
 
-def bounds_of(sizes: ArrayLike) -> Indices:
+def bounds_of(sizes: Sequence[int] | AnyArray) -> Indices:
     """(S + 1,) where each of so many rows begins, one after the other, and where the last one ends."""
-    return np.concatenate([[0], np.cumsum(sizes)])
+    bounds = np.zeros(len(sizes) + 1, dtype=np.int64)
+    np.cumsum(sizes, out=bounds[1:])
+    return bounds
 
 
 def ranges(bounds: Indices, numbers: Indices) -> Indices:
@@ -357,6 +358,13 @@ def is_bulk(observations: Observations) -> bool:
 def column_of(observations: Observations, name: str) -> AnyArray:
     """(N + M,) one column of the points, then of the curves."""
     return np.concatenate([getattr(observations.points, name), getattr(observations.curves, name)])
+
+
+def shown_rows(content: Content, sights: Sights) -> Mask:
+    """(N + M,) the observations that sights show, points by row and then curves by row."""
+    rows = np.zeros(len(content.points) + len(content.curves), dtype=bool)
+    rows[sights.point_rows] = rows[len(content.points) + sights.curve_rows] = True
+    return rows
 
 
 def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:

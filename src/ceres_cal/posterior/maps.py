@@ -107,14 +107,9 @@ def located_by(station: str, pixels: Array, height_m: float) -> Functional:
     )
 
 
-class RadiusMap:
-    """What maps of 95 % radii have in common: how they show themselves."""
-
-    __repr__ = brief
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
-        return drawn("plot_map", self, ax)
+def _plot(self: FieldMap | ImageMap, ax: Any = None) -> Any:
+    """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+    return drawn("plot_map", self, ax)
 
 
 class FieldGrid(Frozen):
@@ -156,7 +151,7 @@ class ErrorMap(FieldGrid, ABC):
         return float(np.max(visible)) if len(visible) else np.nan
 
 
-class FieldMap(RadiusMap, ErrorMap):
+class FieldMap(ErrorMap):
     """How well one station locates points at one height, over a grid.
 
     Attributes:
@@ -167,6 +162,7 @@ class FieldMap(RadiusMap, ErrorMap):
     station: str
     sd_mm: Array
     radius_95_mm: Array
+    __repr__, plot = brief, _plot
 
     @property
     def errors_mm(self) -> Array:
@@ -210,7 +206,7 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
 _STEPS = 32  # along the longer side
 
 
-class ImageMap(Frozen, RadiusMap):
+class ImageMap(Frozen):
     """How well one camera knows its image, over a grid.
 
     Attributes:
@@ -222,6 +218,7 @@ class ImageMap(Frozen, RadiusMap):
     x_px: Array
     y_px: Array
     radius_95_px: Array
+    __repr__, plot = brief, _plot
 
 
 class Picture(Frozen):

@@ -389,11 +389,10 @@ class PriorCost(CachedCost):
 
 def _bent(residuals: Array) -> tuple[Array, Array]:
     """(R,) residuals whose squares are Cauchy's loss of these, and their derivatives by them: each for itself."""
-    near = 1e-6  # residuals that Cauchy's loss leaves as they are
-    weight = 1.0 / (1.0 + (residuals / USUAL_BENDS) ** 2)
-    bent = USUAL_BENDS * np.sign(residuals) * np.sqrt(np.log1p((residuals / USUAL_BENDS) ** 2))
-    far = np.abs(residuals) > near
-    return bent, np.where(far, weight * residuals / np.where(far, bent, 1.0), 1.0)
+    least = 1e-12  # over where it bends: Cauchy's loss leaves that as it is
+    squares = np.maximum((residuals / USUAL_BENDS) ** 2, least**2)
+    lengths = np.sqrt(np.log1p(squares))
+    return USUAL_BENDS * np.copysign(lengths, residuals), np.sqrt(squares) / (lengths * (1.0 + squares))
 
 
 def _parts(

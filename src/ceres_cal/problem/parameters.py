@@ -6,6 +6,7 @@ be of order one) and one 6-vector (rotation vector, translation) per free statio
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -185,7 +186,7 @@ def intrinsic_names(lens: Lens) -> tuple[str, ...]:
 
 def unit_px(camera: Camera) -> float:
     """Half the image diagonal: the unit of radius in which the solver's coefficients are of order one."""
-    return 0.5 * float(np.hypot(*camera.image_size))
+    return 0.5 * math.hypot(*camera.image_size)
 
 
 def intrinsics_vector(camera: Camera) -> Array:

@@ -180,8 +180,8 @@ def layout_of(keys: Sequence[Key], estimate: Estimate, placements: Iterable[str]
     """The layout of the problem whose shared numbers are the keys, and of placements besides."""
     free = {}
     for name, camera in estimate.cameras.items():
-        names = intrinsic_names(camera.lens)
-        numbers = sorted(names.index(key.quantity) for key in keys if key[:2] == ("camera", name))
+        place = {quantity: number for number, quantity in enumerate(intrinsic_names(camera.lens))}
+        numbers = sorted(place[key.quantity] for key in keys if key[:2] == ("camera", name))
         free[name] = np.array(numbers, dtype=np.int64)
     stations, shared = (frozenset(key.owner for key in keys if key.kind == kind) for kind in ("station", "placement"))
     return Layout(free, stations, shared | frozenset(placements))

@@ -222,7 +222,9 @@ class _InformationSums:
             if len(station):  # the placement makes up for whatever its station does
                 gain = np.concatenate([gain, back @ from_station(poses, world)], axis=2)
             stacks.append((own, inverse, gain))
-        self._matrices[:, lead[:, None], lead] += reduced
+        for whole, own in zip(self._matrices, reduced, strict=True):
+            if own.any():
+                whole[lead[:, None], lead] += own
         own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
         names = tuple(str(key.placement) for key in sights.keys)
         return Eliminated(

@@ -15,12 +15,12 @@ from collections.abc import Container, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
-from ceres_cal.kernels import plane_homographies
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
 
@@ -180,54 +180,9 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
     Returns:
         The profile, and each point's error: (N,) px, and in units of what is usual at that distance from the centre.
     """
-    (a, b), sizes = data.offsets.T / unit_px, np.diff(data.bounds)
-    r2 = a * a + b * b
-    r = np.sqrt(r2)
-
-    def summed(values: Array) -> Array:
-        """(..., S) over each sight of (..., N)."""
-        return np.add.reduceat(values, data.bounds[:-1], axis=-1)
-
-    def sent(h: Array) -> Array:
-        """(N,) h . X with each sight's own (S, 3)."""
-        return np.asarray((h.T.take(own, axis=1) * x).sum(axis=0))
-
-    own = np.repeat(np.arange(len(sizes)), sizes)
-    plane = data.plane.T - (summed(data.plane.T) / sizes).take(own, axis=1)
-    spread = np.sqrt(summed(np.sum(plane * plane, axis=0)) / sizes) + 1e-12
-    x = np.vstack([plane / spread.take(own), np.ones_like(a)])  # of unit size each
-    aligned = np.array([b * b, -a * b, a * a])[:, None, None] * x[:, None] * x
-    normal, powers = np.empty((len(sizes), 6, 6)), r2 ** np.arange(1, terms + 1)[:, None]
-    usual, weights = np.empty_like(a), np.ones_like(a)
-    order, counts = _rings(r)
-    for _ in range(rounds):
-        normal[:, :3, :3], normal[:, 3:, :3], normal[:, 3:, 3:] = summed(weights * aligned).transpose(0, 3, 1, 2)
-        h12 = np.linalg.eigh(normal)[1][:, :, 0]  # of the lower triangle
-        u, v = sent(h12[:, :3]), sent(h12[:, 3:])
-        agree = summed(weights * (u * a + v * b))
-        scale = (summed(weights * r2) / np.where(np.abs(agree) > 1e-12, agree, 1e-12)).take(own)
-        u, v = scale * u, scale * v
-        q = (u * a + v * b) / np.maximum(r, 1e-9)
-        rows = np.vstack([r * x, -q * powers, q])
-        depths = summed(weights * rows[:, None] * rows).transpose(2, 0, 1)
-        depths[:, :3, :3] += 1e-12 * np.trace(depths[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        shares = np.linalg.solve(depths[:, :3, :3], depths[:, :3, 3:])
-        reduced = np.sum(depths[:, 3:, 3:] - np.swapaxes(shares, 1, 2) @ depths[:, :3, 3:], axis=0)
-        c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
-        depth = sent(shares[:, :, terms] - shares[:, :, :terms] @ c)
-        across = r * (a * v - b * u) / np.maximum(np.hypot(u, v), 1e-9)
-        errors = np.hypot(across, r - q * (1.0 + c @ powers) / np.where(np.abs(depth) > 1e-9, depth, 1e-9))
-        parts = np.split(errors[order], np.cumsum(counts)[:-1])
-        usual[order] = np.repeat([max(median(part), 1e-12) for part in parts], counts)
-        weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
-    return RadialProfile(tuple(c.tolist()), unit_px), errors * unit_px, errors / usual
-
-
-def _rings(radius: Array) -> tuple[Indices, Indices]:
-    """Points (N,) by rings around the centre, and how many are in each: profiles fit worst where lenses bend most."""
-    rings = min(max(len(radius) // 200, 1), 16)  # with few points in a ring its outliers would be the usual there
-    ring = np.minimum(radius * rings / (np.max(radius, initial=0.0) + 1e-300), rings - 1).astype(np.int16)
-    return np.argsort(ring, kind="stable"), np.bincount(ring, minlength=rings)
+    profile, (errors, usual) = np.empty(terms), np.empty((2, len(data.plane)))
+    kernels.radial_alignment(data.bounds, data.plane, data.offsets, unit_px, rounds, profile, errors, usual)
+    return RadialProfile(tuple(profile.tolist()), unit_px), errors * unit_px, errors / usual
 
 
 def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Array, Array]:
@@ -241,7 +196,9 @@ def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Arr
 
     def solve(first: int, last: int) -> None:
         bounds, part = data.bounds[first : last + 1], homographies[first:last]
-        plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, _WRONG, part, errors)
+        kernels.plane_homographies(
+            bounds, data.plane, data.offsets, coefficients, profile.unit_px, _WRONG, part, errors
+        )
 
     run_parts(solve, parts_of(len(homographies), len(errors), point_ns))
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px

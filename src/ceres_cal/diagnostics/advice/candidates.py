@@ -112,7 +112,7 @@ class Ground(Frozen):
         priors = (*stated, *tolerances(estimate.structure, self.keys))
         problem = Problem(gather_sights(observations, predicted=True), layout, priors, self.weighting)
         told = information(problem, estimate)  # without how smooth a lens is, which is known already
-        return (told.points + told.curves + told.stated + told.built).marginal(self.keys)
+        return told.points.beside_all([told.curves, told.stated, told.built]).marginal(self.keys)
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
         """The estimate with what the measurement brings along; of the placements those that are still free."""

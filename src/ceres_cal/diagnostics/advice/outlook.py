@@ -81,14 +81,17 @@ class Outlook(Frozen):
             return [self.after(known + one) for one in informations]
         slopes = np.zeros((*self.slopes.shape[:2], len(whole.keys)))
         slopes[:, :, whole.columns(self.keys)] = self.slopes
-        along = np.tensordot(slopes, spread.covariance, axes=1)
+        along, sd = np.tensordot(slopes, spread.covariance, axes=1), spread.sd
         variances = np.sum(along * slopes, axis=(1, 2))
+        along = along.reshape(-1, len(whole.keys))
 
         def after(added: Information) -> Errors:
-            root = thin_root(added.matrix, spread.sd)
-            half = np.linalg.inv(np.linalg.cholesky(np.eye(len(root)) + root @ spread.covariance @ root.T))
-            taken = np.sum((along @ (half @ root).T) ** 2, axis=(1, 2))
-            return _errors_of(variances - taken)
+            told = np.flatnonzero(np.diagonal(added.matrix))  # of many nodes of a surface a measurement sees a few
+            root = thin_root(added.matrix[np.ix_(told, told)], sd[told])
+            covariance = spread.covariance[np.ix_(told, told)]
+            half = np.linalg.inv(np.linalg.cholesky(np.eye(len(root)) + root @ covariance @ root.T))
+            taken = np.sum((along[:, told] @ (half @ root).T) ** 2, axis=1)
+            return _errors_of(variances - np.sum(taken.reshape(len(variances), -1), axis=1))
 
         return list(map(after, informations))
 

@@ -237,8 +237,7 @@ def _next(
     """What brings most after the first, of another kind; None where nothing does, or the first is good enough."""
     kind = candidates[first].kind
     others = [number for number, candidate in enumerate(candidates) if candidate.kind != kind]
-    promises = [
-        Promise(candidates[number], outlook.after(informations[first] + informations[number])) for number in others
-    ]
+    after = outlook.after_each(informations[first], [informations[number] for number in others])
+    promises = [Promise(candidates[number], one) for number, one in zip(others, after, strict=True)]
     chosen = _chosen(promises, outlook.after(informations[first]), enough_mm) if promises else None
     return None if chosen is None else promises[chosen]

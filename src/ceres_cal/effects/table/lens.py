@@ -96,8 +96,8 @@ def _outward(camera: Camera, pixels: Array) -> tuple[Array, Array]:
 def _growing(camera: Camera, pixels: Array, powers: Sequence[int]) -> Array:
     """(N, 2, powers) px per unit of coefficients more in the lens's polynomial, scaled to be of order one."""
     offsets, outward = camera.offsets(pixels), _outward(camera, pixels)[1]
-    growth = [camera.lens.radial_change(offsets, camera.phi, unit_px(camera), power) for power in powers]
-    return np.stack([outward * one[:, None] for one in growth], axis=2)
+    growth = camera.lens.radial_change(offsets, camera.phi, unit_px(camera), np.array(powers))
+    return np.asarray(outward[:, :, None] * growth[:, None])
 
 
 def _waves(case: Case, camera: str, pixels: Array) -> Array:

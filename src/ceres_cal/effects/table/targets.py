@@ -16,7 +16,7 @@ from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.effects.evidence import FLOOR_OFF, SizePrior
 from ceres_cal.observations import Observations
-from ceres_cal.problem.structure import WARP
+from ceres_cal.problem.structure import WARP, dimension_slopes, dimensions_of
 from ceres_cal.scene.targets import Arc, Segment
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
@@ -129,6 +129,30 @@ class PointAside(_StructureTest):
             f"({evidence.size})",
             f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
             amounts("xy", mm, sd, "mm"),
+        )
+
+
+class OtherLength(Effect):
+    """A length that a target is drawn by is another one: many of its lines and points lie elsewhere, in proportion."""
+
+    kind = "other length"
+
+    def columns(self, case: Case) -> Iterator[EffectColumns]:
+        structure, targets = case.whole_structure, case.observations.targets
+        asked = [name for name in dimensions_of(targets) if name not in case.estimate.structure.dimensions]
+        slopes = dimension_slopes(structure.names, targets, asked)[1]
+        for name, moved in zip(asked, case.equations.built_along(structure, slopes).T, strict=True):
+            yield EffectColumns(self.kind, moved[:, None], np.where(moved != 0.0, 0, -1), (name,))
+
+    def words(self, evidence: Evidence) -> Words:
+        name = evidence.score.subject
+        target, _, dimension = name.partition("/")
+        drawn_m = evidence.case.observations.targets[target].dimensions[dimension]
+        by, sd = evidence.score.amount, evidence.score.sd
+        return Words(
+            f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says ({evidence.size})",
+            f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}",
+            amounts((dimension,), 1e3 * by, 1e3 * sd, "mm"),
         )
 
 
@@ -287,4 +311,4 @@ def _extent(places: Array) -> tuple[Array, float]:
     return 0.5 * (low + high), max(0.5 * float(np.max(high - low)), 1e-9)
 
 
-EFFECTS = (FloorBowed(), FloorUneven(), FieldSheared(), CurveAside(), PointAside(), BoardBent())
+EFFECTS = (FloorBowed(), FloorUneven(), FieldSheared(), OtherLength(), CurveAside(), PointAside(), BoardBent())

@@ -51,6 +51,36 @@ inline void substitute(int size, const double* upper, double* x, int columns = 1
     for (int k = size - 1; k >= 0; --k) finish(k, k + 1, size, 1, upper + size * k);
 }
 
+// A symmetric matrix (size, size) turned into its eigenvalues, on its diagonal; eigenvectors are the columns of `vectors`.
+inline void eigen(int size, double* matrix, double* vectors) {
+    constexpr int MOST = 50;  // rounds of Jacobi's rotations: some eight are enough
+    constexpr double ROUNDING = 1e-32;
+    const auto rotate = [&](double* a, int p, int q, int next, double sine, double cosine) {
+        for (int k = 0; k < size; ++k) {
+            double &one = a[p + next * k], &other = a[q + next * k], before = one;
+            one = cosine * before - sine * other, other = sine * before + cosine * other;
+        }
+    };
+    std::fill_n(vectors, size * size, 0.0);
+    for (int k = 0; k < size; ++k) vectors[(size + 1) * k] = 1.0;
+    for (int round = 0; round < MOST; ++round) {
+        double off = 0.0, whole = 0.0;
+        for (int k = 0; k < size * size; ++k) (k % (size + 1) == 0 ? whole : off) += matrix[k] * matrix[k];
+        if (!(off > ROUNDING * whole)) break;
+        for (int p = 0; p < size; ++p)
+            for (int q = p + 1; q < size; ++q) {
+                const double between = matrix[size * p + q];
+                if (between == 0.0) continue;
+                const double half = 0.5 * (matrix[(size + 1) * q] - matrix[(size + 1) * p]) / between;
+                const double tangent = std::copysign(1.0, half) / (std::abs(half) + std::sqrt(half * half + 1.0));
+                const double cosine = 1.0 / std::sqrt(tangent * tangent + 1.0), sine = tangent * cosine;
+                rotate(matrix, p, q, size, sine, cosine);
+                rotate(matrix, size * p, size * q, 1, sine, cosine);
+                rotate(vectors, p, q, size, sine, cosine);
+            }
+    }
+}
+
 // out (rows, columns) = a (rows, inner) b (inner, columns), their rows so many numbers apart.
 inline void multiply(int rows, int inner, int columns, const double* a, int a_apart, const double* b, int b_apart,
                      double* out, int out_apart) {

@@ -39,6 +39,21 @@ void plane_homographies(const Bounds& bounds, const Read<N, 2>& plane, const Rea
     });
 }
 
+void radial_alignment(const Bounds& bounds, const Read<N, 2>& plane, const Read<N, 2>& offsets, double unit, int rounds,
+                      const Filled<N>& profile, const Filled<N>& errors, const Filled<N>& usual) {
+    const size_t rows = plane.shape(0), terms = profile.size();
+    require(offsets.shape(0) == rows && errors.size() == rows && usual.size() == rows,
+            "plane, offsets, errors and usual are of as many points");
+    require(bounds.size() > 0 && bounds.data()[0] == 0, "bounds: they begin with 0");
+    require(terms > 0 && terms <= Alignment::MOST_TERMS, "profile: one to four coefficients");
+    const int64_t sights = static_cast<int64_t>(bounds.size()) - 1;
+    check_bounds(bounds, 0, sights, rows);
+    unlocked([&] {
+        Alignment alignment(sights, bounds.data(), plane.data(), offsets.data(), unit, whole(terms));
+        for (int round = 0; round < rounds; ++round) alignment.fit(profile.data(), errors.data(), usual.data());
+    });
+}
+
 void factor(const Read<N, N>& normal, const Filled<N, N>& upper) {
     const size_t size = normal.shape(0);
     require(normal.shape(1) == size && upper.shape(0) == size && upper.shape(1) == size, "normal and upper are (K, K)");
@@ -215,6 +230,7 @@ bool has_avx2() {
 NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("has_avx2", &has_avx2);
     m.def("plane_homographies", &plane_homographies);
+    m.def("radial_alignment", &radial_alignment);
     m.def("cholesky", &factor);
     m.def("loss_weights", &loss_weights);
     m.def("evaluate_block", &block);

@@ -17,13 +17,13 @@ inline double median(std::vector<double>& values) {
 }
 
 // The unit vector that `normal` (SIZE squared, lower triangle) shrinks most, by inverse iteration from h.
-inline void least_direction(double* normal, double* h) {
-    constexpr int SIZE = 9;
+template <int SIZE>
+void least_direction(double* normal, double* h, int rounds) {
     double upper[SIZE * SIZE], trace = 0.0;
     for (int i = 0; i < SIZE; ++i) trace += normal[(SIZE + 1) * i];
     for (int i = 0; i < SIZE; ++i) normal[(SIZE + 1) * i] += 1e-13 * trace;
     cholesky(SIZE, normal, SIZE, upper);
-    for (int round = 0; round < 4; ++round) {
+    for (int round = 0; round < rounds; ++round) {
         substitute(SIZE, upper, h);
         double squared = 0.0;
         for (int i = 0; i < SIZE; ++i) squared += h[i] * h[i];
@@ -48,7 +48,7 @@ class Homographies {
         for (int i = 0; i < 9; ++i) h[i] = 1.0 + 0.1 * i;  // anything: what the moments shrink more vanishes soon
         for (int round = 0; round < PATIENCE; ++round) {
             add_moments(n, normal);
-            least_direction(normal, h);
+            least_direction<9>(normal, h, 4);
             judge(n, h, errors);
             ordered_.assign(errors, errors + n);
             const double usual = median(ordered_), worst = *std::max_element(errors, errors + n);
@@ -122,6 +122,156 @@ class Homographies {
     int terms_;
     double unit_, wrong_;
     std::vector<double> x_, y_, a_, b_, c_, weights_, ordered_;
+};
+
+// The profile of a lens from sights of points, whatever it is: `closed_forms.radial_alignment` has the equations.
+class Alignment {
+  public:
+    // bounds (sights + 1), offsets in units of what profiles are of.
+    Alignment(int64_t sights, const int64_t* bounds, const double* plane, const double* offsets, double unit, int terms)
+        : sights_(sights), bounds_(bounds), terms_(terms), size_(4 + terms) {
+        const size_t count = static_cast<size_t>(bounds[sights]);
+        for (std::vector<double>* one : {&x_, &y_, &a_, &b_, &r_, &u_, &v_, &q_}) one->resize(count);
+        weights_.assign(count, 1.0);
+        depths_.resize(static_cast<size_t>(sights * 3 * (terms + 1)));
+        double farthest = 0.0;
+        for (size_t i = 0; i < count; ++i) {
+            a_[i] = offsets[2 * i] / unit, b_[i] = offsets[2 * i + 1] / unit;
+            r_[i] = std::sqrt(a_[i] * a_[i] + b_[i] * b_[i]);
+            farthest = std::max(farthest, r_[i]);
+        }
+        // With few points in a ring its outliers would be the usual there.
+        rings_.resize(std::min<size_t>(std::max<size_t>(count / 200, 1), 16));
+        const double rings = static_cast<double>(rings_.size());
+        for (size_t i = 0; i < count; ++i)
+            rings_[static_cast<size_t>(std::min(r_[i] * rings / (farthest + 1e-300), rings - 1.0))].push_back(i);
+        for (int64_t g = 0; g < sights; ++g) load(bounds[g], bounds[g + 1], plane);
+    }
+
+    // One round: c (terms) of the profile, each point's error, in units, and what is usual there; and weights by it.
+    void fit(double* c, double* errors, double* usual) {
+        double reduced[MOST * MOST] = {}, vectors[MOST * MOST];
+        for (int64_t g = 0; g < sights_; ++g)
+            if (bounds_[g] < bounds_[g + 1]) align(g, reduced);
+        // Least squares without the directions that nothing tells.
+        double right[MOST], largest = 0.0;
+        for (int j = 0; j < terms_; ++j) right[j] = reduced[(terms_ + 1) * j + terms_], c[j] = 0.0;
+        for (int j = 1; j < terms_; ++j)
+            for (int k = 0; k < terms_; ++k) reduced[terms_ * j + k] = reduced[(terms_ + 1) * j + k];
+        eigen(terms_, reduced, vectors);
+        for (int j = 0; j < terms_; ++j) largest = std::max(largest, reduced[(terms_ + 1) * j]);
+        for (int j = 0; j < terms_; ++j) {
+            if (!(reduced[(terms_ + 1) * j] > NOTHING * largest)) continue;
+            double along = 0.0;
+            for (int k = 0; k < terms_; ++k) along += vectors[terms_ * k + j] * right[k];
+            for (int k = 0; k < terms_; ++k) c[k] += vectors[terms_ * k + j] * along / reduced[(terms_ + 1) * j];
+        }
+        for (int64_t g = 0; g < sights_; ++g) judge(g, c, errors);
+        for (const std::vector<size_t>& ring : rings_) {
+            if (ring.empty()) continue;
+            ordered_.clear();
+            for (const size_t i : ring) ordered_.push_back(errors[i]);
+            const double here = std::max(median(ordered_), 1e-12);
+            for (const size_t i : ring) {
+                const double far = errors[i] / (1.5 * here);
+                usual[i] = here, weights_[i] = 1.0 / (1.0 + far * far);
+            }
+        }
+    }
+
+    static constexpr int MOST_TERMS = 4;
+
+  private:
+    static constexpr int MOST = 4 + MOST_TERMS;
+    static constexpr double NOTHING = 1e-10;
+
+    // x and y: the plane's points with their centroid at 0 and unit spread.
+    void load(int64_t first, int64_t last, const double* plane) {
+        const double n = static_cast<double>(last - first);
+        double centre[2] = {}, spread = 0.0;
+        for (int64_t i = first; i < last; ++i) centre[0] += plane[2 * i] / n, centre[1] += plane[2 * i + 1] / n;
+        for (int64_t i = first; i < last; ++i) {
+            const double x = plane[2 * i] - centre[0], y = plane[2 * i + 1] - centre[1];
+            x_[static_cast<size_t>(i)] = x, y_[static_cast<size_t>(i)] = y, spread += x * x + y * y;
+        }
+        spread = std::sqrt(spread / n) + 1e-12;
+        for (size_t i = static_cast<size_t>(first); i < static_cast<size_t>(last); ++i) x_[i] /= spread, y_[i] /= spread;
+    }
+
+    // h1 and h2 of a sight, its u, v and q; how its depth follows c; and what it says of these, added to `reduced`.
+    void align(int64_t g, double* reduced) {
+        const size_t first = static_cast<size_t>(bounds_[g]), last = static_cast<size_t>(bounds_[g + 1]);
+        double normal[36] = {}, h[6], agree = 0.0, whole = 0.0;
+        for (size_t i = first; i < last; ++i) {
+            const double w = weights_[i], row[6] = {-b_[i] * x_[i], -b_[i] * y_[i], -b_[i],
+                                                    a_[i] * x_[i],  a_[i] * y_[i],  a_[i]};
+            add_outer(6, w, row, normal);
+        }
+        for (int j = 0; j < 6; ++j) h[j] = 1.0 + 0.1 * j;  // anything, as above
+        least_direction<6>(normal, h, 8);
+        for (size_t i = first; i < last; ++i) {
+            u_[i] = h[0] * x_[i] + h[1] * y_[i] + h[2], v_[i] = h[3] * x_[i] + h[4] * y_[i] + h[5];
+            agree += weights_[i] * (u_[i] * a_[i] + v_[i] * b_[i]), whole += weights_[i] * r_[i] * r_[i];
+        }
+        const double scale = whole / (std::abs(agree) > 1e-12 ? agree : 1e-12);
+        double depths[MOST * MOST] = {}, upper[9], held[9], trace = 0.0;
+        for (size_t i = first; i < last; ++i) {
+            u_[i] *= scale, v_[i] *= scale;
+            q_[i] = (u_[i] * a_[i] + v_[i] * b_[i]) / std::max(r_[i], 1e-9);
+            double row[MOST] = {r_[i] * x_[i], r_[i] * y_[i], r_[i]}, power = -q_[i];
+            for (int k = 0; k < terms_; ++k) row[3 + k] = power *= r_[i] * r_[i];
+            row[3 + terms_] = q_[i];
+            add_outer(size_, weights_[i], row, depths);
+        }
+        mirror(size_, depths);
+        for (int j = 0; j < 3; ++j) trace += depths[(size_ + 1) * j];
+        for (int j = 0; j < 3; ++j)
+            for (int k = 0; k < 3; ++k) held[3 * j + k] = depths[size_ * j + k] + (j == k ? 1e-12 * trace : 0.0);
+        cholesky(3, held, 3, upper);
+        double* shares = depths_.data() + g * 3 * (terms_ + 1);
+        for (int j = 0; j < 3; ++j) std::copy_n(depths + size_ * j + 3, terms_ + 1, shares + (terms_ + 1) * j);
+        substitute(3, upper, shares, terms_ + 1);
+        for (int j = 0; j <= terms_; ++j)
+            for (int k = 0; k <= terms_; ++k) {
+                double left = depths[size_ * (3 + j) + 3 + k];
+                for (int m = 0; m < 3; ++m) left -= shares[(terms_ + 1) * m + j] * depths[size_ * m + 3 + k];
+                reduced[(terms_ + 1) * j + k] += left;
+            }
+    }
+
+    void judge(int64_t g, const double* c, double* errors) const {
+        const double* shares = depths_.data() + g * 3 * (terms_ + 1);
+        double third[3];
+        for (int j = 0; j < 3; ++j) {
+            third[j] = shares[(terms_ + 1) * j + terms_];
+            for (int k = 0; k < terms_; ++k) third[j] -= shares[(terms_ + 1) * j + k] * c[k];
+        }
+        for (size_t i = static_cast<size_t>(bounds_[g]); i < static_cast<size_t>(bounds_[g + 1]); ++i) {
+            const double depth = third[0] * x_[i] + third[1] * y_[i] + third[2], r = r_[i];
+            const double seen = std::sqrt(u_[i] * u_[i] + v_[i] * v_[i]);
+            const double across = r * (a_[i] * v_[i] - b_[i] * u_[i]) / std::max(seen, 1e-9);
+            double lift = 0.0;
+            for (int k = terms_ - 1; k >= 0; --k) lift = (lift + c[k]) * r * r;
+            const double along = r - q_[i] * (1.0 + lift) / (std::abs(depth) > 1e-9 ? depth : 1e-9);
+            errors[i] = std::sqrt(across * across + along * along);
+        }
+    }
+
+    // w row row^T, added to the lower triangle; and that mirrored.
+    static void add_outer(int size, double w, const double* row, double* to) {
+        for (int j = 0; j < size; ++j)
+            for (int k = 0; k <= j; ++k) to[size * j + k] += w * row[j] * row[k];
+    }
+    static void mirror(int size, double* matrix) {
+        for (int j = 0; j < size; ++j)
+            for (int k = 0; k < j; ++k) matrix[size * k + j] = matrix[size * j + k];
+    }
+
+    int64_t sights_;
+    const int64_t* bounds_;
+    int terms_, size_;
+    std::vector<double> x_, y_, a_, b_, r_, u_, v_, q_, weights_, depths_, ordered_;
+    std::vector<std::vector<size_t>> rings_;
 };
 
 }  // namespace ceres_cal

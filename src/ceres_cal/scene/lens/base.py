@@ -22,7 +22,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import no_such
@@ -257,9 +257,9 @@ class Lens(ABC):
         """
         return {}, np.zeros_like(measured)
 
-    def radial_change(self, offsets: Array, phi: float, unit_px: float, power: int) -> Array:
-        """(N,) px by which offsets (N, 2) grow with one more term of the power, of a size of order one."""
-        return np.asarray(unit_px * (np.hypot(offsets[:, 0], offsets[:, 1]) / unit_px) ** power)
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
+        """(N, P) px by which offsets (N, 2) grow with one more term of each power, of a size of order one."""
+        return np.asarray(unit_px * (np.hypot(offsets[:, :1], offsets[:, 1:]) / unit_px) ** powers)
 
     # ---- for the solve -----------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.scene.lens.base import LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Decentred
 
@@ -53,9 +53,9 @@ class Brown(Decentred):
         u = ideal / phi
         return {name: u**power for name, power in (("k1", 3), ("k2", 5), ("k3", 7))}, measured / phi - u
 
-    def radial_change(self, offsets: Array, phi: float, unit_px: float, power: int) -> Array:
-        rays = np.nan_to_num(self.undistort(offsets, phi))
-        return np.asarray(phi * (np.linalg.norm(rays[:, :2], axis=1) / np.maximum(rays[:, 2], 0.05)) ** power)
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
+        x, y, z = np.nan_to_num(self.undistort(offsets, phi)).T[:, :, None]
+        return np.asarray(phi * (np.hypot(x, y) / np.maximum(z, 0.05)) ** powers)
 
     @property
     def form(self) -> Array:
@@ -102,9 +102,9 @@ class KannalaBrandt(Decentred):
         columns = {name: angle**power for name, power in zip(self.above, self.orders, strict=False)}
         return columns, measured / phi - angle
 
-    def radial_change(self, offsets: Array, phi: float, unit_px: float, power: int) -> Array:
-        rays = np.nan_to_num(self.undistort(offsets, phi))
-        return np.asarray(phi * np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]) ** power)
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
+        x, y, z = np.nan_to_num(self.undistort(offsets, phi)).T[:, :, None]
+        return np.asarray(phi * np.arctan2(np.hypot(x, y), z) ** powers)
 
     @property
     def form(self) -> Array:

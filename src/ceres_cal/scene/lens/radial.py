@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import cached_property
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
@@ -160,12 +160,12 @@ class Radial(Lens):
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         return {name: measured**power for name, power in zip(self.names, self.powers, strict=False)}, ideal - measured
 
-    def radial_change(self, offsets: Array, phi: float, unit_px: float, power: int) -> Array:
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, powers: Indices) -> Array:
         # The ideal radius grows by r^k: the measured one shrinks by the polynomial's slope.
-        radius = np.hypot(offsets[:, 0], offsets[:, 1]) / unit_px
+        radius = np.hypot(offsets[:, :1], offsets[:, 1:]) / unit_px
         scaled = (np.asarray(self.values) * self.scales(unit_px))[: len(self.powers)]
         slope = 1.0 + sum(k * a * radius ** (k - 1) for k, a in zip(self.powers, scaled, strict=True))
-        return np.asarray(unit_px * radius**power / np.maximum(slope, 0.05))
+        return np.asarray(unit_px * radius**powers / np.maximum(slope, 0.05))
 
     @property
     def form(self) -> Array:
