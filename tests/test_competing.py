@@ -25,7 +25,6 @@ from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import difference
 from ceres_cal.robust import competing
-from ceres_cal.robust import subproblem as compared
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Segment
@@ -129,12 +128,14 @@ def test_of_very_many_observations_a_part_is_asked_and_all_of_a_whole_is_taken_o
 ) -> None:
     observations = moved_aside(simulate(half_field(24), NOISE, 4).observations, "HalfwayLine", 4.0, frame)
     of_all = calibrate(observations, RADIAL)
-    monkeypatch.setattr(compared, "_MOST_ASKED", 1_000)
-    monkeypatch.setattr(compared, "_FEWEST_ASKED", 4)
-    parts: list[compared.Subproblem] = []
+    monkeypatch.setattr(competing, "_MOST_ASKED", 1_000)
+    monkeypatch.setattr(competing, "_FEWEST_ASKED", 4)
+    parts: list[competing.Subproblem] = []
 
-    def spied(every: compared.Subproblem) -> compared.Subproblem:
-        parts.append(compared.compared_part(every))
+    compared_part = competing.compared_part
+
+    def spied(every: competing.Subproblem) -> competing.Subproblem:
+        parts.append(compared_part(every))
         return parts[0]
 
     monkeypatch.setattr(competing, "compared_part", spied)

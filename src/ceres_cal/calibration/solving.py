@@ -36,12 +36,11 @@ from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
-from ceres_cal.robust.competing import compete
+from ceres_cal.robust.competing import Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.robust.subproblem import Subproblem
 from ceres_cal.robust.unsteady import Unsteady, find_unsteady
 from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens

@@ -17,42 +17,39 @@ if TYPE_CHECKING:
     from ceres_cal.diagnostics.advice import Advice, Measurement, Promise
 
 
-class AdviseArguments(QuietArguments):
-    """What is to be reached, and by which means."""
-
-    calibration: Path = arguments.calibration_argument()
-    height_mm: float = arguments.height_option("height of what is to be located; default: 150, a robot's top", 150.0)
-    station: str | None = arguments.station_option("whose map; may be left out where there is only one")
-    good_enough_mm: float | None = option(
-        "the worst error that will do; nothing is advised where it is reached", "MM", read=arguments.length("mm")
-    )
-    board: tuple[int, int, float] | None = option(
-        "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
-        "calibration's own, or that one",
-        "COLUMNSxROWSxMM",
-        read=arguments.parse_board,
-    )
-
-
 @command(
     "advise",
     "what to measure next, and what it would bring in mm",
     "calibration.json --good-enough-mm 2",
     "calibration.json --board 9x6x50mm --height-mm 150",
 )
-def _run(args: AdviseArguments) -> Document:
-    enough = args.good_enough_mm
+def _run(
+    args: QuietArguments,
+    calibration: Path = arguments.calibration_argument(),
+    height_mm: float = arguments.height_option("height of what is to be located; default: 150, a robot's top", 150.0),
+    station: str | None = arguments.station_option("whose map; may be left out where there is only one"),
+    good_enough_mm: float | None = option(
+        "the worst error that will do; nothing is advised where it is reached", "MM", read=arguments.length("mm")
+    ),
+    board: tuple[int, int, float] | None = option(
+        "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
+        "calibration's own, or that one",
+        "COLUMNSxROWSxMM",
+        read=arguments.parse_board,
+    ),
+) -> Document:
+    enough = good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
     from ceres_cal.diagnostics.advice import advise
     from ceres_cal.scene.targets import checkerboard
 
-    calibration = read_calibration(args.calibration)
-    station = station_of(args.calibration, args.station, calibration)
-    with naming(args.calibration), progress_bar(args) as bar:
-        board = None if args.board is None else checkerboard(*args.board)
-        advice = advise(calibration, station, arguments.metres(args.height_mm), enough, board, bar.update)
-    weak = [direction.words for direction in calibration.uncertainty.weak_directions]
+    known = read_calibration(calibration)
+    name = station_of(calibration, station, known)
+    with naming(calibration), progress_bar(args.silent) as bar:
+        shown = None if board is None else checkerboard(*board)
+        advice = advise(known, name, arguments.metres(height_mm), enough, shown, bar.update)
+    weak = [direction.words for direction in known.uncertainty.weak_directions]
     return Document(tuple(_sections(advice, weak)))
 
 

@@ -30,50 +30,47 @@ _LEVELS = {"failed": "no"}
 _MOST_REASONS = 4
 
 
-class BatchArguments(QuietArguments):
-    """The jobs, and where their results go."""
-
-    plan: Path = argument(
-        "PLAN",
-        "a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
-        "files named from its folder; or a folder: each file of observations in it is calibrated, those of a folder "
-        "inside it together",
-    )
-    output: Path = output_option(
-        f"results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
-        "and unchanged inputs, are not done again",
-        metavar="DIR",
-    )
-    options: str = option("arguments that every calibrate job gets besides", "'...'", "")
-    jobs: int = jobs_option("jobs", 0)
-    reports: bool = switch("a report of each calibrate and refit, too")
-
-
 @command(
     "batch",
     "many calibrations, checks and refits, resumable, with one page that ranks them",
     "plan.toml -o results/ --jobs 4",
     "rooms/ -o results/ --options '--lens auto --prior height_m=4.02:20mm' --reports",
 )
-def _run(args: BatchArguments) -> Document:
+def _run(
+    args: QuietArguments,
+    plan: Path = argument(
+        "PLAN",
+        "a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
+        "files named from its folder; or a folder: each file of observations in it is calibrated, those of a folder "
+        "inside it together",
+    ),
+    output: Path = output_option(
+        f"results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
+        "and unchanged inputs, are not done again",
+        metavar="DIR",
+    ),
+    options: str = option("arguments that every calibrate job gets besides", "'...'", ""),
+    jobs: int = jobs_option("jobs", 0),
+    reports: bool = switch("a report of each calibrate and refit, too"),
+) -> Document:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
     from ceres_cal.cli.jobs import run_jobs
 
-    jobs = plan_jobs(args.plan, args.output, args.options, reports=args.reports)
-    make_folder(args.output)
+    planned = plan_jobs(plan, output, options, reports=reports)
+    make_folder(output)
     outcomes, again = [], 0
-    with processes(args.jobs if len(jobs) > 1 else 1) as executor:
-        for outcome, is_old in run_jobs(jobs, work, args.output, executor):
+    with processes(jobs if len(planned) > 1 else 1) as executor:
+        for outcome, is_old in run_jobs(planned, work, output, executor):
             outcomes.append(outcome)
             again += is_old
-            if not (args.quiet or args.json):
-                print(_line(outcome, len(outcomes), len(jobs), is_old), file=sys.stdout, flush=True)
-    pages = {job.name: file.name for job in jobs for file in job.outputs if file.suffix == ".html" and file.exists()}
-    title = printable(args.plan.resolve().name)
-    write_bytes(args.output / _SUMMARY, summary_page(title, outcomes, pages).encode())
+            if not args.silent:
+                print(_line(outcome, len(outcomes), len(planned), is_old), file=sys.stdout, flush=True)
+    pages = {job.name: file.name for job in planned for file in job.outputs if file.suffix == ".html" and file.exists()}
+    page = output / _SUMMARY
+    write_bytes(page, summary_page(printable(plan.resolve().name), outcomes, pages).encode())
     worst = min(outcomes, key=lambda one: one.order).level
-    return Document(_sections(args, outcomes, again), _EXIT_CODES.get(worst, 0))
+    return Document(_sections(str(page), outcomes, again), _EXIT_CODES.get(worst, 0))
 
 
 # ---- jobs -----------------------------------------------------------------------------------------------------------
@@ -176,13 +173,12 @@ def _line(outcome: Outcome, number: int, total: int, is_old: bool) -> str:
     return f"{outcome.level:10}{number:{width}} of {total}  {outcome.job}: {outcome.line}{before}"
 
 
-def _sections(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> tuple[Section, ...]:
+def _sections(page: str, outcomes: Sequence[Outcome], again: int) -> tuple[Section, ...]:
     count = Counter(one.level for one in outcomes)
     levels = ", ".join(f"{count[level]} {level}" for level in ("good", "care", "no", "failed") if count[level])
     before = f"; {again} from before" if again else ""
     ranked = sorted(outcomes, key=lambda one: one.order)
     said = f"{plural(len(outcomes), 'job')}: {levels}{before}"
-    page = str(args.output / _SUMMARY)
     return (
         Section("jobs", [said], {"jobs": ranked, "from_before": again}),
         Section("written", [page], {"output": page}),

@@ -135,7 +135,7 @@ def _run(args: CalibrateArguments) -> Document:
     observations = files.read_observations(args.observations)
     photographs = files.report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
-    with progress_bar(args) as bar, _client(args.scheduler) as client:
+    with progress_bar(args.silent) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
         from ceres_cal.diagnostics.labels import mended, renamings
 

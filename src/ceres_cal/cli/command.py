@@ -1,8 +1,9 @@
 """What every command has: a name, arguments, and a document that it answers, for people or for scripts.
 
-The options of a command: fields of a subclass of `Arguments`, each with its help, from which the parser is made.
+The arguments of a command are the parameters of its function, each with its help, from which the parser is made; and,
+where it shares them with others or hands all of them on, fields of a subclass of `Arguments`, which it takes as `args`.
 
-A field is made by `option`, `switch` or `argument`; its type says the rest: an argument that is a tuple takes any
+A parameter is made by `option`, `switch` or `argument`; its type says the rest: an argument that is a tuple takes any
 number, of a Literal one is chosen, and Path, int and float are read as such.
 """
 
@@ -17,7 +18,7 @@ from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, LazyTable, field
+from ceres_cal.base.frozen import Frozen, LazyTable, cached_property, field
 from ceres_cal.base.words import did_you_mean, sentence
 from ceres_cal.report.document import Document
 
@@ -82,6 +83,11 @@ class QuietArguments(Arguments):
     """Of a command that shows how far it is."""
 
     quiet: bool = switch("no progress")
+
+    @property
+    def silent(self) -> bool:
+        """Whether nothing is shown on the way."""
+        return self.quiet or self.json
 
 
 def add_options(parser: argparse.ArgumentParser, kind: type[Arguments]) -> None:
@@ -219,26 +225,38 @@ class Command(Frozen, eq=True):
     Attributes:
         name: as it is typed, such as "detect board".
         summary: one line for the help.
-        run: does the work; raises CalibrationError. Its argument `args` is annotated with the dataclass that it takes.
-        examples: of its use, without "ceres-cal" and the name, for the help.
+        work: does it; raises CalibrationError. Its parameters are its arguments, but for `args`, which is annotated
+            with the dataclass of others.
+        examples: of its use, without "ceres-cal" and the name, for the help. preset: what need not be typed.
     """
 
     name: str
     summary: str
-    run: Callable[[Any], Document]
+    work: Callable[..., Document]
     examples: tuple[str, ...] = ()
+    preset: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def arguments(self) -> type[Arguments]:
-        """The dataclass that it takes."""
-        kind: type[Arguments] = get_type_hints(self.run)["args"]
-        return kind
+        """The dataclass of what is typed."""
+        from inspect import signature
+
+        types = get_type_hints(self.work)
+        shared: type[Arguments] = types.get("args", Arguments)
+        own = {name: one.default for name, one in signature(self.work).parameters.items() if name != "args"}
+        annotated = {name: types[name] for name in own}
+        return type("Typed", (shared,), {"__annotations__": annotated, **own}) if own else shared
+
+    def run(self, args: Arguments) -> Document:
+        """What it answers to its arguments."""
+        names = get_type_hints(self.work).keys() - {"return"}
+        return self.work(**{name: args if name == "args" else getattr(args, name) for name in names})
 
     def parse(self, arguments: Sequence[str]) -> Any:
         """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
         parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
         self.fill(parser)
-        args = filled(self.arguments, parser.parse_intermixed_args(arguments))
+        args = filled(self.arguments, parser.parse_intermixed_args([*self.preset, *arguments]))
         _require_beside(args)
         return args
 
@@ -267,9 +285,9 @@ class Command(Frozen, eq=True):
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
 
 
-def command(name: str, summary: str, *examples: str) -> Callable[[Callable[[Any], Document]], Command]:
+def command(name: str, summary: str, *examples: str) -> Callable[[Callable[..., Document]], Command]:
     """Makes a command of the function that does its work."""
-    return lambda run: Command(name, summary, run, examples)
+    return lambda work: Command(name, summary, work, examples)
 
 
 # ---- the table ------------------------------------------------------------------------------------------------------

@@ -8,27 +8,23 @@ from collections.abc import Mapping
 from typing import Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import COMMANDS, Arguments, Command, Parser, argument, command
+from ceres_cal.cli.command import COMMANDS, Command, Parser, argument, command
 from ceres_cal.report.document import Document, Section
 
 _FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 _EXAMPLES = ("bash > ~/.local/share/bash-completion/completions/ceres-cal", "zsh > ~/.zfunc/_ceres-cal")
 
 
-class CompletionArguments(Arguments):
-    """Whose."""
-
-    shell: Literal["bash", "zsh", "tcsh"] = argument("SHELL", "whose; what is printed goes into a file that it reads")
-
-
 @command("completion", "what a shell needs to complete commands, options and files", *_EXAMPLES)
-def _run(args: CompletionArguments) -> Document:
+def _run(
+    shell: Literal["bash", "zsh", "tcsh"] = argument("SHELL", "whose; what is printed goes into a file that it reads"),
+) -> Document:
     try:
         import shtab
     except ImportError:
         raise InputError("completion needs shtab: pip install 'ceres-cal[completion]'") from None
-    script = shtab.complete(whole_parser(COMMANDS), shell=args.shell)
-    return Document((Section("", [script], {"shell": args.shell, "script": script}),))
+    script = shtab.complete(whole_parser(COMMANDS), shell=shell)
+    return Document((Section("", [script], {"shell": shell, "script": script}),))
 
 
 def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:

@@ -82,7 +82,7 @@ def _run_board(args: BoardArguments) -> Document:
     same = ("camera", "station", "corner_fit", "charuco", "legacy", "frames")
     how: dict[str, Any] = {name: getattr(args, name) for name in same}
     how |= {"marker_m": args.marker, "folder": args.output.parent}
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         detections = detected(
             args.timeout, partial(detect_board, args.images, _board(args), **how, progress=bar.update)
         )
@@ -140,45 +140,42 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-class RingsArguments(DetectArguments):
-    """A photograph of rings, and the rings."""
-
-    image: str = argument("IMAGE", "photograph of the rings, taken about from the front")
+@command("detect rings", "edges of concentric rings in a photograph", "rings.png --radii 10mm:360mm:10mm -o rings.json")
+def _run(
+    args: DetectArguments,
+    image: str = argument("IMAGE", "photograph of the rings, taken about from the front"),
     radii: tuple[float, ...] = option(
         "radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
         "such as 0.01:0.36:0.01",
         "M,M,...",
         REQUIRED,
         read=_radii,
-    )
-
-
-@command("detect rings", "edges of concentric rings in a photograph", "rings.png --radii 10mm:360mm:10mm -o rings.json")
-def _run(args: RingsArguments) -> Document:
-    require_observations_output(args.output, [args.image])
+    ),
+) -> Document:
+    require_observations_output(args.output, [image])
     from ceres_cal.detect.rings import detect_rings
 
-    detection = detected(args.timeout, partial(detect_rings, args.image, args.radii, args.camera, args.station))
+    detection = detected(args.timeout, partial(detect_rings, image, radii, args.camera, args.station))
     save(args.output, detection.observations)
-    return _rings_document(detection, args)
+    return _rings_document(detection, image, len(radii), args.output)
 
 
-def _rings_document(detection: RingsDetection, args: RingsArguments) -> Document:
+def _rings_document(detection: RingsDetection, image: str, asked: int, output: Path) -> Document:
     a1, a2, a3 = detection.polynomial.tolist()
     (x, y), edges, lens = detection.centre.tolist(), len(detection.observations.curves), {"a2": a2 / a1, "a3": a3 / a1}
     lines = [
-        f"{detection.rings} of {len(args.radii)} rings around ({x:.1f}, {y:.1f}), "
+        f"{detection.rings} of {asked} rings around ({x:.1f}, {y:.1f}), "
         f"{edges} edges, blurred by {detection.blur_px:.2f} px",
         "the paper's polynomial r' = a1 r + a2 r^2 + a3 r^3, px, the first ring being as large as it is seen:",
         *(f"    {name} {value!r}" for name, value in (("a1", a1), ("a2", a2), ("a3", a3))),
         f"    with a1 = 1, as a lens has it: a2 {lens['a2']!r}, a3 {lens['a3']!r}; rms {detection.rms_px:.3f} px",
-        f"written to {args.output}",
+        f"written to {output}",
     ]
     data = {
-        "image": args.image,
-        "output": str(args.output),
+        "image": image,
+        "output": str(output),
         "rings": detection.rings,
-        "radii_given": len(args.radii),
+        "radii_given": asked,
         "observations": edges,
         "centre": [x, y],
         "polynomial": {"a1": a1, "a2": a2, "a3": a3},

@@ -100,7 +100,7 @@ def _run(args: FieldArguments) -> Document:
         target = field_of(start)
     if target is None:
         raise InputError("name the field with --target, such as --target ssl-b")
-    bar, merged = progress_bar(args), {}
+    bar, merged = progress_bar(args.silent), {}
 
     def pictures() -> list[Path]:
         if one is not None:

@@ -10,51 +10,43 @@ from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.report.document import Document
 
 
-class DiagnoseArguments(arguments.ReportArguments):
-    """A calibration, observations, and how they are tested."""
-
-    calibration: Path = arguments.calibration_argument()
-    observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order")
-    output: Path | None = arguments.output_option("the residual of every observation (.csv, .json or .npz)", None)
-    new_data: bool = switch("the observations are others than those it was made from")
-    held_out: bool = switch("say, too, which lens predicts held-out parts best, as `calibrate` does")
-    strict: bool = switch("exit with 1 for any finding, also one that does no harm")
-    false_alarms: float = option(
-        "probability of any finding where nothing is wrong", "P", 0.01, read=arguments.number("--false-alarms")
-    )
-
-
 @command(
     "diagnose",
     "what the residuals say: faults by name, noise, outliers",
     "calibration.json field.json board.json",
     "calibration.json field.json board.json --held-out --report report.html",
 )
-def _run(args: DiagnoseArguments) -> Document:
-    _require_fitting(args)
+def _run(
+    args: arguments.ReportArguments,
+    calibration: Path = arguments.calibration_argument(),
+    observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order"),
+    output: Path | None = arguments.output_option("the residual of every observation (.csv, .json or .npz)", None),
+    new_data: bool = switch("the observations are others than those it was made from"),
+    held_out: bool = switch("say, too, which lens predicts held-out parts best, as `calibrate` does"),
+    strict: bool = switch("exit with 1 for any finding, also one that does no harm"),
+    false_alarms: float = option(
+        "probability of any finding where nothing is wrong", "P", 0.01, read=arguments.number("--false-alarms")
+    ),
+) -> Document:
+    files.require_outputs(args, [calibration, *observations])
+    files.require_ending(output, "the table is", ".csv", ".json", ".npz")
+    if not 0.0 < false_alarms < 1.0:
+        raise InputError(f"--false-alarms must lie between 0 and 1, not {false_alarms:g}")
+    if held_out and new_data:
+        raise InputError("--held-out calibrates the observations anew: leave out --new-data")
     from ceres_cal.calibration.calibrating import lens_by_held_out
     from ceres_cal.diagnostics import diagnose
 
-    calibration, observations = files.read_calibration(args.calibration), files.read_observations(args.observations)
-    photographs = files.report_photographs(args, observations)
-    diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=args.false_alarms)
-    choice = lens_by_held_out(observations, calibration.options) if args.held_out else None
-    page, unmade = files.report_page(args, calibration, observations, photographs, diagnosis, choice)
+    solved, seen = files.read_calibration(calibration), files.read_observations(observations)
+    photographs = files.report_photographs(args, seen)
+    diagnosis = diagnose(solved, seen, new_data=new_data, false_alarm_rate=false_alarms)
+    choice = lens_by_held_out(seen, solved.options) if held_out else None
+    page, unmade = files.report_page(args, solved, seen, photographs, diagnosis, choice)
     from ceres_cal.report.findings import diagnosis_sections
     from ceres_cal.report.grounds import is_against
 
     # Wrong labels that were taken out do no harm, and a noise is estimated.
-    against = [finding for finding in diagnosis.findings if args.strict or is_against(finding)]
-    answer = tuple(diagnosis_sections(diagnosis, choice, calibration.options))
+    against = [finding for finding in diagnosis.findings if strict or is_against(finding)]
+    answer = tuple(diagnosis_sections(diagnosis, choice, solved.options))
     sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))
     return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)
-
-
-def _require_fitting(args: DiagnoseArguments) -> None:
-    """Raise InputError for options that do not fit."""
-    files.require_outputs(args, [args.calibration, *args.observations])
-    files.require_ending(args.output, "the table is", ".csv", ".json", ".npz")
-    if not 0.0 < args.false_alarms < 1.0:
-        raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms:g}")
-    if args.held_out and args.new_data:
-        raise InputError("--held-out calibrates the observations anew: leave out --new-data")

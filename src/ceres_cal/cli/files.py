@@ -281,7 +281,7 @@ def report_page(
         return None, Section()
     from ceres_cal.report import make_report
 
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         make = partial(make_report, calibration, observations, diagnosis, choice, photographs, bar.update)
         return attempted("report", make)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import replace
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
 from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch
 from ceres_cal.cli.files import read_calibration, require_ending, require_output, save
@@ -41,25 +42,6 @@ def _listed(forms: Iterable[ExportFormat | ImportFormat]) -> str:
     return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
 
 
-class TableArguments(Arguments):
-    """What is written of a calibration, and how much of it may be lost."""
-
-    calibration: Path = calibration_argument()
-    output: Path = output_option("the export; its ending is one of the format's")
-    station: tuple[str, ...] = option(
-        "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
-    )
-    max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm"))
-    options: Mapping[str, str] = options_of(lambda: [_export_forms()["table"]])
-
-
-class ExportArguments(TableArguments):
-    """The same, of a format that is named."""
-
-    to: str = option(lambda: _listed(_export_forms().values()), "FORMAT", REQUIRED)
-    options: Mapping[str, str] = options_of(lambda: _export_forms().values())
-
-
 @command(
     "export",
     "a calibration in a format that others read, and what that loses",
@@ -67,28 +49,38 @@ class ExportArguments(TableArguments):
     "calibration.json --to opencv -o camera.yml",
     "calibration.json --to table -o table.npz --error-mm 0.05",
 )
-def _export(args: ExportArguments) -> Document:
-    return _exported(args, args.to)
-
-
-@command("export-table", "a look-up table from pixels to the field (NPZ)", "calibration.json -o table.npz")
-def _export_table(args: TableArguments) -> Document:
-    return _exported(args, "table")
-
-
-def _exported(args: TableArguments, name: str) -> Document:
+def export(
+    calibration: Path = calibration_argument(),
+    output: Path = output_option("the export; its ending is one of the format's"),
+    station: tuple[str, ...] = option(
+        "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
+    ),
+    max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm")),
+    to: str = option(lambda: _listed(_export_forms().values()), "FORMAT", REQUIRED),
+    options: Mapping[str, str] = options_of(lambda: _export_forms().values()),
+) -> Document:
+    """A calibration in another format."""
     from ceres_cal.formats import export_format, prepare_export
 
-    form = export_format(name)
+    form = export_format(to)
     if form.endings:
-        require_output(args.output, [args.calibration])
-    options = _typed(args.options, [form])
-    exported = prepare_export(read_calibration(args.calibration), form.name, args.output, args.station or None, options)
-    exported.require_loss_mm(args.max_loss_mm)
-    save(args.output, exported)
-    about = {"format": form.name, "output": str(args.output), **exported.facts}
-    first = Section(form.name, [f"{exported.words}, written to {args.output}"], about)
+        require_output(output, [calibration])
+    typed = _typed(options, [form])
+    exported = prepare_export(read_calibration(calibration), form.name, output, station or None, typed)
+    exported.require_loss_mm(max_loss_mm)
+    save(output, exported)
+    about = {"format": form.name, "output": str(output), **exported.facts}
+    first = Section(form.name, [f"{exported.words}, written to {output}"], about)
     return Document((first, *_losses(exported)))
+
+
+export_table = replace(
+    export,
+    name="export-table",
+    summary="a look-up table from pixels to the field (NPZ)",
+    examples=("calibration.json -o table.npz",),
+    preset=("--to", "table"),
+)
 
 
 def _typed(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
@@ -130,26 +122,22 @@ def _losses(exported: Exported) -> Iterator[Section]:
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-class ForeignArguments(Arguments):
-    """A file of another program."""
-
-    file: Path = argument("FILE", "of another program")
-    form: str | None = option(
+def from_option() -> Any:
+    """The option --from FORMAT."""
+    return option(
         lambda: f"default: by ending and content. {_listed(_import_forms().values())}", "FORMAT", flags=("--from",)
     )
-    options: Mapping[str, str] = options_of(lambda: _import_forms().values())
 
 
-def typed_options(args: ForeignArguments) -> dict[str, Any]:
+def import_options() -> Any:
+    """The options of the formats that are read."""
+    return options_of(lambda: _import_forms().values())
+
+
+def typed_options(given: Mapping[str, str], form: str | None) -> dict[str, Any]:
     """What was given of the options of the format that is named, or of any."""
     forms = _import_forms().values()
-    return _typed(args.options, [one for one in forms if one.name == args.form] or list(forms))
-
-
-class ImportArguments(ForeignArguments):
-    """The same, and what it becomes."""
-
-    output: Path = output_option("the calibration or the observations (.json; observations also .npz)")
+    return _typed(given, [one for one in forms if one.name == form] or list(forms))
 
 
 @command(
@@ -158,14 +146,19 @@ class ImportArguments(ForeignArguments):
     "camera.yml -o calibration.json",
     "corners.csv --from csv -o observations.json",
 )
-def _import(args: ImportArguments) -> Document:
+def _import(
+    file: Path = argument("FILE", "of another program"),
+    form: str | None = from_option(),
+    output: Path = output_option("the calibration or the observations (.json; observations also .npz)"),
+    options: Mapping[str, str] = import_options(),
+) -> Document:
     from ceres_cal.formats import read_foreign
     from ceres_cal.observations import Observations
 
-    require_output(args.output, [args.file])
-    given = read_foreign(args.file, args.form, **typed_options(args))
-    save(args.output, given)
-    path, place = str(args.output), f"written to {args.output}"
+    require_output(output, [file])
+    given = read_foreign(file, form, **typed_options(options, form))
+    save(output, given)
+    path, place = str(output), f"written to {output}"
     if isinstance(given, Observations):
         sizes = {name: len(getattr(given, name)) for name in ("points", "curves", "views")}
         counts = "{points} points and {curves} curve observations in {views} views".format(**sizes)
@@ -193,33 +186,30 @@ def _group(args: GroupArguments) -> Group:
     return Group(args.address, args.port, args.interface)
 
 
-class PublishArguments(GroupArguments):
-    """What is sent, and how often."""
-
-    calibration: Path = calibration_argument()
-    station: tuple[str, ...] = option("default: all", "NAME", repeatable=True)
-    camera_id: str = option("of the stations; default: the number that each name ends in", "ID,...", "")
-    geometry: Path | None = option("with the field, and other cameras: .pb or geometry.yml", "FILE")
-    once: bool = switch("one packet, not one every 3 s until Ctrl-C")
-    max_loss_mm: float | None = option(
-        "refuse what the message would get wrong by more on the field", "MM", read=length("mm")
-    )
-
-
 @command(
     "publish",
     "send a calibration to those who see the field, by the league's multicast",
     "calibration.json --camera-id 0",
     "calibration.json --geometry geometry.yml --once",
 )
-def _publish(args: PublishArguments) -> Document:
+def _publish(
+    args: GroupArguments,
+    calibration: Path = calibration_argument(),
+    station: tuple[str, ...] = option("default: all", "NAME", repeatable=True),
+    camera_id: str = option("of the stations; default: the number that each name ends in", "ID,...", ""),
+    geometry: Path | None = option("with the field, and other cameras: .pb or geometry.yml", "FILE"),
+    once: bool = switch("one packet, not one every 3 s until Ctrl-C"),
+    max_loss_mm: float | None = option(
+        "refuse what the message would get wrong by more on the field", "MM", read=length("mm")
+    ),
+) -> Document:
     from ceres_cal.base.files import read_bytes
     from ceres_cal.formats import publish, ssl_packet
 
-    before = None if args.geometry is None else read_bytes(args.geometry)
-    packet, exported = ssl_packet(read_calibration(args.calibration), args.station or None, args.camera_id, before)
-    exported.require_loss_mm(args.max_loss_mm)
-    sent = publish(packet, _group(args), 1 if args.once else None)
+    before = None if geometry is None else read_bytes(geometry)
+    packet, exported = ssl_packet(read_calibration(calibration), station or None, camera_id, before)
+    exported.require_loss_mm(max_loss_mm)
+    sent = publish(packet, _group(args), 1 if once else None)
     words = f"{exported.words}, {len(packet)} bytes, {sent} times to {args.address}:{args.port}"
     lost = [
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
@@ -228,50 +218,43 @@ def _publish(args: PublishArguments) -> Document:
     return Document((Section("published", [words], data), *_losses(exported)))
 
 
-class ListenArguments(GroupArguments):
-    """What is written, and how long to wait for it."""
-
-    output: Path = output_option("the field as a target (.json), or the whole geometry (.pb, .yml)")
-    seconds: float = option("how long to wait", "S", 10.0)
-
-
 @command(
     "listen",
     "the field, or all geometry, out of the league's multicast",
     "-o field.json",
     "-o geometry.yml --seconds 30",
 )
-def _listen(args: ListenArguments) -> Document:
+def _listen(
+    args: GroupArguments,
+    output: Path = output_option("the field as a target (.json), or the whole geometry (.pb, .yml)"),
+    seconds: float = option("how long to wait", "S", 10.0),
+) -> Document:
     from ceres_cal.formats import geometry_content, received_geometry
 
-    require_output(args.output, [])
-    require_ending(args.output, "a field is", ".json", ".pb", ".yml", ".yaml")
-    heard = received_geometry(_group(args), args.seconds)
-    if args.output.suffix == ".json":
-        return _write_target(heard.field, args.output, heard.sender)
-    save(args.output, geometry_content(heard.geometry, args.output.suffix))
+    require_output(output, [])
+    require_ending(output, "a field is", ".json", ".pb", ".yml", ".yaml")
+    heard = received_geometry(_group(args), seconds)
+    if output.suffix == ".json":
+        return _write_target(heard.field, output, heard.sender)
+    save(output, geometry_content(heard.geometry, output.suffix))
     ids = [entry["camera_id"] for entry in heard.geometry.get("calib", [])]
-    words = f"a field and cameras {ids} from {heard.sender}, written to {args.output}"
-    data = {"output": str(args.output), "camera_ids": ids, "sender": heard.sender}
+    words = f"a field and cameras {ids} from {heard.sender}, written to {output}"
+    data = {"output": str(output), "camera_ids": ids, "sender": heard.sender}
     return Document((Section("heard", [words], data),))
 
 
 # ---- targets --------------------------------------------------------------------------------------------------------
 
 
-class TargetsImportArguments(Arguments):
-    """A file with a field in it."""
-
-    file: Path = argument("FILE", "geometry.yml, a packet (.pb), or robocup-ssl.xml")
-    output: Path = output_option("the target (.json), as `detect field --target` takes it")
-
-
 @command("targets import", "a field out of ssl-vision's or vision-processor's files", "geometry.yml -o field.json")
-def _targets_import(args: TargetsImportArguments) -> Document:
+def _targets_import(
+    file: Path = argument("FILE", "geometry.yml, a packet (.pb), or robocup-ssl.xml"),
+    output: Path = output_option("the target (.json), as `detect field --target` takes it"),
+) -> Document:
     from ceres_cal.formats import read_ssl_target
 
-    require_output(args.output, [args.file])
-    return _write_target(read_ssl_target(args.file), args.output)
+    require_output(output, [file])
+    return _write_target(read_ssl_target(file), output)
 
 
 def _write_target(target: Target, path: Path, sender: str = "") -> Document:

@@ -5,7 +5,7 @@ against another calibration; exit code 0 yes, 1 no, so that cron may ask.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import HEIGHTS_M, at_height, fixed
 from ceres_cal.cli import arguments
-from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, option, switch
+from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
 from ceres_cal.cli.files import (
     read_calibration,
     read_observations,
@@ -22,7 +22,7 @@ from ceres_cal.cli.files import (
     require_output,
     save,
 )
-from ceres_cal.cli.foreign import ForeignArguments, typed_options
+from ceres_cal.cli.foreign import from_option, import_options, typed_options
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section, wrapped
@@ -42,39 +42,34 @@ def _share(text: str) -> float:
     return value
 
 
-class CheckArguments(InputArguments):
-    """What is held against a calibration, and how sure the answer is to be."""
-
-    false_alarms: float = option(
-        "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
-    )
-    checks: int = option(
-        "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
-        "N",
-        1,
-        read=arguments.whole(1),
-    )
-
-
 @command(
     "check",
     "does a calibration still hold? exit code 0 yes, 1 no",
     "calibration.json now.png",
     "calibration.json incoming/ --checks 720 --json",
 )
-def _check(args: CheckArguments) -> Document:
+def _check(
+    args: InputArguments,
+    false_alarms: float = option(
+        "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
+    ),
+    checks: int = option(
+        "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
+        "N",
+        1,
+        read=arguments.whole(1),
+    ),
+) -> Document:
     images = photographs_in(args)
     detections = None
     if images:
-        answer, detections = _photographed(args, images)
+        answer, detections = _photographed(args, images, false_alarms, checks)
     else:
         from ceres_cal.moves.checks import check
 
-        answer = check(
-            read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
-        )
+        answer = check(read_calibration(args.calibration), read_observations(args.inputs), false_alarms, checks)
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
-    rate = f"({100.0 * args.false_alarms:g} % false alarms{often})"
+    rate = f"({100.0 * false_alarms:g} % false alarms{often})"
     holds = f"{'yes' if answer.holds else 'no'} {rate}"
     headline = f"The calibration {'holds' if answer.holds else 'no longer holds'} {rate}."
     stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
@@ -82,17 +77,19 @@ def _check(args: CheckArguments) -> Document:
     return Document((Section("check", [holds], stated), shown(detections), *stations), answer.exit_code, headline)
 
 
-def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Agreements, KnownDetections]:
+def _photographed(
+    args: InputArguments, images: list[Path], false_alarms: float, checks: int
+) -> tuple[Agreements, KnownDetections]:
     from ceres_cal.detect.photographs import check_photographs
 
     calibration, not_painted = read_calibration(args.calibration), arguments.parse_names(args.not_painted)
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         return check_photographs(
             calibration,
             images,
             args.station,
-            args.false_alarms,
-            checks=args.checks,
+            false_alarms,
+            checks=checks,
             not_painted=not_painted,
             progress=bar.update,
         )
@@ -128,38 +125,33 @@ def _checked_station(one: Agreement) -> Section:
 # ---- how well new boards or fields are predicted, poses alone at their best ------------------------------------------
 
 
-class ScoreArguments(Arguments):
-    """A calibration, new observations, and how they are weighed."""
-
-    calibration: Path = arguments.calibration_argument()
-    observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together")
-    hold_stations: bool = switch(
-        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too"
-    )
-    loss: arguments.Loss | None = option("default: the calibration's")
-    reject_sigma: float | None = option(
-        "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
-        "trivial the rms is the one that other programs state",
-        "SIGMA",
-    )
-
-
 @command(
     "score",
     "how well a calibration predicts new boards or fields: intrinsics held",
     "calibration.json new.json",
     "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf",
 )
-def _score(args: ScoreArguments) -> Document:
-    require_different(args.observations)
+def _score(
+    calibration: Path = arguments.calibration_argument(),
+    observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together"),
+    hold_stations: bool = switch(
+        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too"
+    ),
+    loss: arguments.Loss | None = option("default: the calibration's"),
+    reject_sigma: float | None = option(
+        "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
+        "trivial the rms is the one that other programs state",
+        "SIGMA",
+    ),
+) -> Document:
+    require_different(observations)
     from ceres_cal.base.frozen import replace
     from ceres_cal.moves.scores import score
 
-    calibration = read_calibration(args.calibration)
-    asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
-    options = replace(calibration.options, **asked)
-    observations = read_observations(args.observations)
-    return _scored(score(calibration, observations, options=options, hold_stations=args.hold_stations), calibration)
+    before = read_calibration(calibration)
+    asked = {name: value for name, value in (("loss", loss), ("reject_sigma", reject_sigma)) if value is not None}
+    options = replace(before.options, **asked)
+    return _scored(score(before, read_observations(observations), options=options, hold_stations=hold_stations), before)
 
 
 def _scored(answer: Agreements, before: Calibration) -> Document:
@@ -208,30 +200,26 @@ def _left(one: Agreement) -> str:
 # ---- may the calibration of another program be trusted ---------------------------------------------------------------
 
 
-class AuditArguments(ForeignArguments):
-    """A calibration, and what is held against it."""
-
-    file: Path = argument("FILE", "a calibration of ours or of another program")
-    observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True)
-
-
 @command(
     "audit",
     "may another program's calibration be trusted? exit code 0 yes, 1 no",
     "opencv.yml --observations field.json",
     "geometry.yml --observations field.json --observations more.json",
 )
-def _audit(args: AuditArguments) -> Document:
+def _audit(
+    file: Path = argument("FILE", "a calibration of ours or of another program"),
+    form: str | None = from_option(),
+    observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True),
+    options: Mapping[str, str] = import_options(),
+) -> Document:
     from ceres_cal.base.files import read_bytes
     from ceres_cal.calibration import Calibration
     from ceres_cal.formats import import_calibration
     from ceres_cal.moves.audits import audit
 
-    ours = (
-        args.form is None and args.file.suffix == ".json" and b"ceres-cal/calibration" in read_bytes(args.file)[:4096]
-    )
-    given = Calibration.load(args.file) if ours else import_calibration(args.file, args.form, **typed_options(args))
-    stations = audit(given, read_observations(args.observations))
+    ours = form is None and file.suffix == ".json" and b"ceres-cal/calibration" in read_bytes(file)[:4096]
+    given = Calibration.load(file) if ours else import_calibration(file, form, **typed_options(options, form))
+    stations = audit(given, read_observations(observations))
     return Document(
         (
             Section(
@@ -267,53 +255,47 @@ def _audited_station(one: Agreement) -> Section:
 # ---- where two calibrations differ, on the field in mm or over the image in px ---------------------------------------
 
 
-class CompareArguments(Arguments):
-    """Two calibrations, and where to compare them."""
-
-    a: Path = argument("A", "one calibration")
-    b: Path = argument("B", "the other")
-    height_mm: float | None = arguments.height_option("of the map above the floor; default: 0")
-    station: str | None = arguments.station_option("only this one; default: all that both have")
-    picture: Path | None = option("draw the map there (of one station)", "SVG")
-    over_image: bool = switch("intrinsics, over the image in px; default where there is no field")
-    without_turn: bool = switch("the same without the turn that brings them nearest to each other")
-
-
 @command(
     "compare",
     "where two calibrations differ, on the field in mm or over the image in px",
     "old.json new.json --height-mm 150",
     "old.json new.json --over-image --without-turn",
 )
-def _compare(args: CompareArguments) -> Document:
-    require_output(args.picture, [args.a, args.b])
-    require_ending(args.picture, "pictures are", ".svg")
-    first, second = read_calibration(args.a), read_calibration(args.b)
-    if args.over_image or args.without_turn or all(target.movable for target in first.targets.values()):
-        return _over_image(args, first, second)
-    return _over_field(args, first, second)
-
-
-def _over_image(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
-    if args.picture is not None or args.station is not None:
+def _compare(
+    a: Path = argument("A", "one calibration"),
+    b: Path = argument("B", "the other"),
+    height_mm: float | None = arguments.height_option("of the map above the floor; default: 0"),
+    station: str | None = arguments.station_option("only this one; default: all that both have"),
+    picture: Path | None = option("draw the map there (of one station)", "SVG"),
+    over_image: bool = switch("intrinsics, over the image in px; default where there is no field"),
+    without_turn: bool = switch("the same without the turn that brings them nearest to each other"),
+) -> Document:
+    require_output(picture, [a, b])
+    require_ending(picture, "pictures are", ".svg")
+    first, second = read_calibration(a), read_calibration(b)
+    if not (over_image or without_turn or all(target.movable for target in first.targets.values())):
+        return _over_field(first, second, arguments.metres(height_mm), station, picture)
+    if picture is not None or station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
     from ceres_cal.moves.comparisons import compare_cameras
 
-    comparisons = compare_cameras(first, second, without_turn=args.without_turn)
+    comparisons = compare_cameras(first, second, without_turn=without_turn)
     return Document(tuple(section for one in comparisons.values() for section in _compared_camera(one)))
 
 
-def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
+def _over_field(
+    first: Calibration, second: Calibration, height_m: float, station: str | None, picture: Path | None
+) -> Document:
     from ceres_cal.moves.comparisons import compare
 
-    comparisons = compare(first, second, arguments.metres(args.height_mm), args.station)
-    if args.picture is not None:
+    comparisons = compare(first, second, height_m, station)
+    if picture is not None:
         if len(comparisons) > 1:
             names = " or ".join(comparisons)
             raise InputError(f"--picture shows one station: name it with --station {names}")
         from ceres_cal.report.maps import comparison_svg
 
-        save(args.picture, comparison_svg(next(iter(comparisons.values())), first).encode())
+        save(picture, comparison_svg(next(iter(comparisons.values())), first).encode())
     return Document(tuple(section for one in comparisons.values() for section in _compared_station(one)))
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
-from ceres_cal.cli.command import Arguments, argument, command, option
+from ceres_cal.cli.command import argument, command, option
 from ceres_cal.cli.files import read_observations, require_different, require_observations_output, save
 from ceres_cal.report.document import Document, Section, wrapped
 
@@ -18,35 +18,31 @@ if TYPE_CHECKING:
     from ceres_cal.start.same_labels import Labels
 
 
-class JoinArguments(Arguments):
-    """What goes together."""
-
-    observations: tuple[str, ...] = argument("OBS", "files of observations, of all cameras")
-    same_frame: str | None = option(
-        "which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
-        "camera), or within:0.01 (frames are named by time stamps); default: those of one name",
-        "RULE",
-    )
-    output: Path = output_option("the joined observations (.json or .npz)")
-
-
 @command(
     "join",
     "a rig's observations as one: same frames, same labels",
     "left.json right.json --same-frame 'left*,right*' -o rig.json",
 )
-def _run(args: JoinArguments) -> Document:
-    require_different(args.observations)
-    require_observations_output(args.output, args.observations)
-    observations = read_observations(args.observations)
+def _run(
+    observations: tuple[str, ...] = argument("OBS", "files of observations, of all cameras"),
+    same_frame: str | None = option(
+        "which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
+        "camera), or within:0.01 (frames are named by time stamps); default: those of one name",
+        "RULE",
+    ),
+    output: Path = output_option("the joined observations (.json or .npz)"),
+) -> Document:
+    require_different(observations)
+    require_observations_output(output, observations)
+    seen = read_observations(observations)
     from ceres_cal.observations.same_frame import with_same_frames
     from ceres_cal.start.same_labels import with_same_labels
 
-    if args.same_frame is not None:
-        observations = with_same_frames(observations, args.same_frame)
-    labels = with_same_labels(observations)
-    save(args.output, labels.observations)
-    return Document(tuple(_sections(labels, args)))
+    if same_frame is not None:
+        seen = with_same_frames(seen, same_frame)
+    labels = with_same_labels(seen)
+    save(output, labels.observations)
+    return Document((*_sections(labels, same_frame), Section("written", [str(output)], {"output": str(output)})))
 
 
 def _moments(observations: Observations) -> Counter[int]:
@@ -57,11 +53,11 @@ def _moments(observations: Observations) -> Counter[int]:
     return Counter(len(seen) for seen in cameras.values())
 
 
-def _sections(labels: Labels, args: JoinArguments) -> Iterator[Section]:
+def _sections(labels: Labels, same_frame: str | None) -> Iterator[Section]:
     from ceres_cal.start.same_labels import open_words
 
     by_count = sorted(_moments(labels.observations).items())
-    rule = "of one name" if args.same_frame is None else f"by {args.same_frame!r}"
+    rule = "of one name" if same_frame is None else f"by {same_frame!r}"
     seen = ", ".join(f"{number} seen by {plural(count, 'camera')}" for count, number in reversed(by_count))
     moments = {str(count): number for count, number in by_count}
     yield Section("moments", wrapped(f"{seen} (frames {rule})"), {"moments_by_cameras": moments})
@@ -70,4 +66,3 @@ def _sections(labels: Labels, args: JoinArguments) -> Iterator[Section]:
     yield Section("labels", turned, {"turned": labels.turned, "open": labels.open})
     for station in labels.open:
         yield Section("warning", wrapped(open_words(station)))
-    yield Section("written", [str(args.output)], {"output": str(args.output)})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,29 +11,13 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option, prior_option, whole
-from ceres_cal.cli.command import Arguments, argument, command, option, switch
+from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import json_object, require_folder, require_shown
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.cli.page.session import Session
     from ceres_cal.cli.page.state import Sitting
-
-
-class OpenArguments(Arguments):
-    """What is looked at, and where results go."""
-
-    files: tuple[str, ...] = argument(
-        "PHOTO|CALIBRATION",
-        "photographs of one camera at one station, or folders of them; and a calibration to start from, or two to be "
-        "compared over one picture",
-    )
-    target: str | None = option("the field, as of `detect field`; the page has a list of them, too", "TARGET")
-    board: str | None = option("a chessboard, as of `run`", "COLUMNSxROWSxMM")
-    prior: tuple[str, ...] = prior_option()
-    output: Path = output_option("what is made", Path("camera"), "FOLDER")
-    port: int = option("of the page's address; default: one that is free", "N", 0, read=whole(0, 65535))
-    browser: bool = switch("print the address alone, and open no browser", default=True, flags=("--no-browser",))
 
 
 @command(
@@ -44,25 +28,37 @@ class OpenArguments(Arguments):
     "calibration.json new.png",
     "old.json calibration.json new.png",
 )
-def _run(args: OpenArguments) -> Document:
+def _run(
+    files: tuple[str, ...] = argument(
+        "PHOTO|CALIBRATION",
+        "photographs of one camera at one station, or folders of them; and a calibration to start from, or two to be "
+        "compared over one picture",
+    ),
+    target: str | None = option("the field, as of `detect field`; the page has a list of them, too", "TARGET"),
+    board: str | None = option("a chessboard, as of `run`", "COLUMNSxROWSxMM"),
+    prior: tuple[str, ...] = prior_option(),
+    output: Path = output_option("what is made", Path("camera"), "FOLDER"),
+    port: int = option("of the page's address; default: one that is free", "N", 0, read=whole(0, 65535)),
+    browser: bool = switch("print the address alone, and open no browser", default=True, flags=("--no-browser",)),
+) -> Document:
     try:
         import aiohttp  # noqa: F401 what `ceres_cal.cli.page.server` serves with
     except ImportError:
         raise InputError("open needs aiohttp: pip install 'ceres-cal[page]'") from None
-    require_shown((), args.target, args.board, args.prior)
-    require_folder(args.output)
-    sitting = _sitting(args)
-    require_shown(sitting.photographs, None, None, args.prior)
+    require_shown((), target, board, prior)
+    require_folder(output)
+    sitting = _sitting(files, output, target or "")
+    require_shown(sitting.photographs, None, None, prior)
     from ceres_cal.cli.page.session import opened
     from ceres_cal.cli.page.state import State
 
-    state = State(target=args.target or "", board=args.board or "", priors=args.prior)
+    state = State(target=target or "", board=board or "", priors=prior)
     session = opened(sitting, state)
-    _serve(session, args)
+    _serve(session, port, browser)
     return Document(tuple(_sections(session)))
 
 
-def _serve(session: Session, args: OpenArguments) -> None:
+def _serve(session: Session, port: int, browser: bool) -> None:
     import asyncio
     import webbrowser
 
@@ -70,19 +66,19 @@ def _serve(session: Session, args: OpenArguments) -> None:
 
     def show(address: str) -> None:
         print(f"{address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
-        if args.browser:
+        if browser:
             webbrowser.open(address)
 
-    asyncio.run(serve(session, args.port, show))
+    asyncio.run(serve(session, port, show))
 
 
-def _sitting(args: OpenArguments) -> Sitting:
+def _sitting(files: Sequence[str], folder: Path, target: str) -> Sitting:
     """What was named, each file once: nothing else is read later."""
     most_calibrations = 2
     from ceres_cal.cli.page.state import Sitting
     from ceres_cal.detect.images import read_colour
 
-    named = image_files(args.files)
+    named = image_files(files)
     calibrations = [path for path in named if path.suffix.lower() == ".json"]
     photographs = tuple(dict.fromkeys(path for path in named if path not in calibrations))
     for path in calibrations:
@@ -98,7 +94,7 @@ def _sitting(args: OpenArguments) -> Sitting:
     if different := next((n for n, size in enumerate(sizes) if size != sizes[0]), None):
         (a, b), (c, d) = sizes[different], sizes[0]
         raise InputError(f"{photographs[different]}: {a} x {b} px, and the first has {c} x {d}: one camera at a time")
-    return Sitting(photographs, sizes, args.output, args.target or "", *calibrations)
+    return Sitting(photographs, sizes, folder, target, *calibrations)
 
 
 def _sections(session: Session) -> Iterator[Section]:

@@ -90,5 +90,5 @@ def _photographed(args: RefitArguments, calibration: Calibration, images: list[P
             f"--moved {sorted(strange)[0]}: the photographs are of station {station!r}: name that, or none"
         )
     not_painted = parse_names(args.not_painted)
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         return detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)

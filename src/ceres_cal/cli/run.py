@@ -111,7 +111,7 @@ def _step(
 ) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
     typed = COMMANDS[name].typed(arguments)
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         bar.say(f"now       {_short(typed)}")
     answer = COMMANDS[name].answer(arguments, quiet=args.quiet or args.json)
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
@@ -130,7 +130,7 @@ def _photographs(args: RunArguments) -> list[Path]:
     from ceres_cal.detect.video import frames_of_videos
 
     images, videos = images_and_videos(args.images)
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         return [*images, *frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 

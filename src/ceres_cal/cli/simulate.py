@@ -8,21 +8,12 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option, whole
-from ceres_cal.cli.command import Arguments, argument, command, option, switch
+from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import finishing, require_folder
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
-
-
-class SimulateArguments(Arguments):
-    """A scene, and where its observations go."""
-
-    scene: str | None = argument("SCENE", "name of a built-in scene, or a scene file (.json)", None)
-    output: Path | None = output_option("observations.json and truth.json; made if missing", None, "DIR")
-    seed: int = option("the same seed gives the same observations", "N", 0, read=whole(0))
-    list: bool = switch("list the built-in scenes")
 
 
 @command(
@@ -32,25 +23,29 @@ class SimulateArguments(Arguments):
     "two-cameras -o try/ --seed 3",
     "--list",
 )
-def _run(args: SimulateArguments) -> Document:
+def _run(
+    scene: str | None = argument("SCENE", "name of a built-in scene, or a scene file (.json)", None),
+    output: Path | None = output_option("observations.json and truth.json; made if missing", None, "DIR"),
+    seed: int = option("the same seed gives the same observations", "N", 0, read=whole(0)),
+    list: bool = switch("list the built-in scenes"),
+) -> Document:
     from ceres_cal.simulate import built_in_scene, load_scene, scene_names, simulate, write_simulation
 
     scenes = scene_names()
-    if args.list:
+    if list:
         width = max(map(len, scenes))
         lines = [f"{name:{width}}  {text}" for name, text in scenes.items()]
         return Document((Section("", lines, {"scenes": scenes}),))
-    if args.scene is None or args.output is None:
+    if scene is None or output is None:
         raise InputError(
             "name a scene and a folder, as in `ceres-cal simulate ssl-field -o DIR`; --list shows the scenes"
         )
-    require_folder(args.output)
-    is_file = args.scene not in scenes and (Path(args.scene).exists() or args.scene.endswith(".json"))
-    scene, disturbance = load_scene(args.scene) if is_file else built_in_scene(args.scene)
-    simulation = simulate(scene, disturbance, args.seed)
+    require_folder(output)
+    is_file = scene not in scenes and (Path(scene).exists() or scene.endswith(".json"))
+    simulation = simulate(*(load_scene(scene) if is_file else built_in_scene(scene)), seed)
     with finishing():
-        write_simulation(simulation, args.output)
-    data = _data(simulation, args.scene, args.output)
+        write_simulation(simulation, output)
+    data = _data(simulation, scene, output)
     return Document((Section("", _lines(data), data),))
 
 

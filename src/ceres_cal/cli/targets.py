@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import output_option, parse_board
-from ceres_cal.cli.command import Arguments, argument, command, option
+from ceres_cal.cli.command import argument, command, option
 from ceres_cal.cli.files import require_ending, require_output, save, spelled_target
 from ceres_cal.report.document import Document, Section
 
@@ -29,13 +29,6 @@ def _help() -> str:
     )
 
 
-class TargetsArguments(Arguments):
-    """What to list."""
-
-    target: str | None = argument("TARGET", _help, None)
-    picture: Path | None = option("draw the target there, with the names of its lines", "SVG")
-
-
 @command(
     "targets",
     "the kinds of targets and the names of their features",
@@ -43,20 +36,23 @@ class TargetsArguments(Arguments):
     "vss-3 --picture vss-3.svg",
     "observations.json",
 )
-def _run(args: TargetsArguments) -> Document:
+def _run(
+    target: str | None = argument("TARGET", _help, None),
+    picture: Path | None = option("draw the target there, with the names of its lines", "SVG"),
+) -> Document:
     from ceres_cal.scene.targets import TARGET_KINDS
 
-    if args.picture is not None:
-        require_output(args.picture, [])
-        require_ending(args.picture, "pictures are", ".svg")
-        if args.target is None:
+    if picture is not None:
+        require_output(picture, [])
+        require_ending(picture, "pictures are", ".svg")
+        if target is None:
             raise InputError("--picture draws one target: name it, such as vss-3")
-    if args.target is None:
+    if target is None:
         kinds = {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}
         return Document((Section("", _kinds_text().splitlines(), {"kinds": kinds}),))
-    targets = _targets(args.target)
-    if args.picture is not None:
-        _draw(targets, args.target, args.picture)
+    targets = _targets(target)
+    if picture is not None:
+        _draw(targets, target, picture)
     data = {"targets": {name: _target_data(target) for name, target in targets.items()}}
     text = "\n\n".join(_target_text(name, target) for name, target in targets.items())
     return Document((Section("", text.splitlines(), data),))
@@ -71,32 +67,28 @@ def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
     save(picture, target_svg(target, name).encode())
 
 
-class PrintArguments(Arguments):
-    """What to print."""
-
-    target: str = argument("BOARD", 'such as 9x6x25mm, as `ceres-cal targets` has it, or {"kind": ...} as in files')
-    output: Path = output_option("the sheet (.pdf)")
-
-
 @command(
     "targets print",
     "a board as a PDF to print to scale, with a ruler on it",
     "9x6x25mm -o board.pdf",
     '\'{"kind": "rings", "radii_m": [0.05, 0.1]}\' -o rings.pdf',
 )
-def _print(args: PrintArguments) -> Document:
-    require_output(args.output, [])
-    require_ending(args.output, "sheets are", ".pdf")
+def _print(
+    target: str = argument("BOARD", 'such as 9x6x25mm, as `ceres-cal targets` has it, or {"kind": ...} as in files'),
+    output: Path = output_option("the sheet (.pdf)"),
+) -> Document:
+    require_output(output, [])
+    require_ending(output, "sheets are", ".pdf")
     import json
 
     from ceres_cal.report.target_pictures import sheet_pdf
 
-    targets = _targets(args.target)
+    targets = _targets(target)
     if len(targets) > 1:
-        raise InputError(f"{args.target}: it has several targets: {', '.join(targets)}: give the description of one")
-    (target,) = targets.values()
-    save(args.output, sheet_pdf(target, json.dumps(target.spec)))
-    return Document((Section("written", [str(args.output)], {"output": str(args.output), "spec": target.spec}),))
+        raise InputError(f"{target}: it has several targets: {', '.join(targets)}: give the description of one")
+    (board,) = targets.values()
+    save(output, sheet_pdf(board, json.dumps(board.spec)))
+    return Document((Section("written", [str(output)], {"output": str(output), "spec": board.spec}),))
 
 
 def _targets(wanted: str) -> dict[str, Target]:

@@ -23,7 +23,7 @@ from typing import Any, NoReturn, TextIO, cast
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError, noting
 from ceres_cal.base.words import did_you_mean, first_of
-from ceres_cal.cli.command import COMMANDS, Command, QuietArguments
+from ceres_cal.cli.command import COMMANDS, Command
 from ceres_cal.report.document import Document
 
 _BOLD, _RED, _GREEN, _YELLOW, _PLAIN = "\x1b[1m", "\x1b[31m", "\x1b[32m", "\x1b[33m", "\x1b[0m"
@@ -63,9 +63,9 @@ def _title(found: re.Match[str]) -> str:
 # ---- progress -------------------------------------------------------------------------------------------------------
 
 
-def progress_bar(args: QuietArguments) -> ProgressBar:
+def progress_bar(silent: bool) -> ProgressBar:
     """The bar of a command: nothing with --quiet or --json."""
-    return ProgressBar(silent=args.quiet or args.json)
+    return ProgressBar(silent=silent)
 
 
 class ProgressBar:

@@ -109,7 +109,7 @@ def _run(args: UndistortArguments) -> Document:
     lines: list[str] = []
     written: list[dict[str, Any]] = []
     about = args.output / f"{kind}.json"
-    with progress_bar(args) as bar:
+    with progress_bar(args.silent) as bar:
         for number, (path, output) in enumerate(outputs.items(), start=1):
             picture, own, line = make(path)
             _write(output, picture)

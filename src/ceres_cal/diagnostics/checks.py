@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -168,18 +167,6 @@ class TestResults(Frozen):
     rate: float
 
 
-class Check(NamedTuple):
-    """A kind of finding that is no column over the equations.
-
-    Attributes:
-        findings: those whose probability is at most the selection's level. tests: how many tests it makes of a case:
-            they share the rate of false alarms with the effects.
-    """
-
-    findings: Callable[[TestResults], Iterator[Finding]]
-    tests: Callable[[DiagnosisCase], int]
-
-
 def wrong_labels(tested: TestResults) -> Iterator[Finding]:
     """Labels that stand for another feature, over all its frames."""
     groups: dict[tuple[bool, str, int, int], list[Mislabelled]] = defaultdict(list)
@@ -294,12 +281,14 @@ def does_not_hold(tested: TestResults) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-CHECKS = {
-    "wrong label": Check(wrong_labels, lambda case: case.labels_tried),
-    "noise": Check(partial(_of_noise, "noise", larger), lambda case: 2),
-    "correlated": Check(partial(_of_noise, "correlated", correlated), lambda case: 2),
-    "does not hold": Check(does_not_hold, lambda case: 1),
+CHECKS: dict[str, tuple[Callable[[TestResults], Iterator[Finding]], Callable[[DiagnosisCase], int]]] = {
+    "wrong label": (wrong_labels, lambda case: case.labels_tried),
+    "noise": (partial(_of_noise, "noise", larger), lambda case: 2),
+    "correlated": (partial(_of_noise, "correlated", correlated), lambda case: 2),
+    "does not hold": (does_not_hold, lambda case: 1),
 }
+"""Kinds of findings that are no columns over the equations: those whose probability is at most the selection's level,
+and how many tests are made of a case: they share the rate of false alarms with the effects."""
 
 
 def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:

@@ -152,8 +152,8 @@ def _findings(tested: TestResults) -> Iterator[Finding]:
         for one in tested.case.as_built:
             if one.kind == effect.built and one.probability >= 1.0 - tested.rate:
                 yield solved_for(effect.kind, one, tested)
-    for check in CHECKS.values():
-        yield from check.findings(tested)
+    for findings, _ in CHECKS.values():
+        yield from findings(tested)
 
 
 def _solved(case: DiagnosisCase) -> set[tuple[str, str, str | None]]:
@@ -216,7 +216,7 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
 def _tested(case: DiagnosisCase, rate: float) -> TestResults:
     """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
     alternatives = [EffectSums.of(case.model, columns) for columns in columns_of_all(case)]
-    extra = sum(one.tests(case) for one in CHECKS.values())
+    extra = sum(tests(case) for _, tests in CHECKS.values())
     selection = select(case.model, alternatives, rate, extra)
     noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
     level = selection.log_level

@@ -257,7 +257,6 @@ class SparseColumns(Frozen):
 
 # ---- score tests ----------------------------------------------------------------------------------------------------
 
-_LN_10 = float(np.log(10.0))
 # Nats of log p: alternatives nearer than that are told apart by luck. Of what is planted the right name is first by 20.
 _ALIKE = 7.0
 # Of the first cause's statistic: below it the error of its linear picture speaks. At half of it one of seven planted
@@ -358,7 +357,7 @@ class Selection(Frozen):
 
     def log10_p(self, log_p: float) -> float:
         """Decimal logarithm of a probability after Bonferroni."""
-        return min(0.0, (log_p + float(np.log(self.tests))) / _LN_10)
+        return min(0.0, (log_p + float(np.log(self.tests))) / float(np.log(10.0)))
 
 
 def select(

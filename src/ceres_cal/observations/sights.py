@@ -360,6 +360,13 @@ def column_of(observations: Observations, name: str) -> AnyArray:
     return np.concatenate([getattr(observations.points, name), getattr(observations.curves, name)])
 
 
+def shown_rows(content: Content, sights: Sights) -> Mask:
+    """(N + M,) the observations that sights show, points by row and then curves by row."""
+    rows = np.zeros(len(content.points) + len(content.curves), dtype=bool)
+    rows[sights.point_rows] = rows[len(content.points) + sights.curve_rows] = True
+    return rows
+
+
 def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """Names of the frames that show anything, and (N + M,) the frame's number of each observation."""
     views = column_of(observations, "view")

@@ -107,14 +107,9 @@ def located_by(station: str, pixels: Array, height_m: float) -> Functional:
     )
 
 
-class RadiusMap:
-    """What maps of 95 % radii have in common: how they show themselves."""
-
-    __repr__ = brief
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
-        return drawn("plot_map", self, ax)
+def _plot(self: FieldMap | ImageMap, ax: Any = None) -> Any:
+    """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
+    return drawn("plot_map", self, ax)
 
 
 class FieldGrid(Frozen):
@@ -156,7 +151,7 @@ class ErrorMap(FieldGrid, ABC):
         return float(np.max(visible)) if len(visible) else np.nan
 
 
-class FieldMap(RadiusMap, ErrorMap):
+class FieldMap(ErrorMap):
     """How well one station locates points at one height, over a grid.
 
     Attributes:
@@ -167,6 +162,7 @@ class FieldMap(RadiusMap, ErrorMap):
     station: str
     sd_mm: Array
     radius_95_mm: Array
+    __repr__, plot = brief, _plot
 
     @property
     def errors_mm(self) -> Array:
@@ -210,7 +206,7 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
 _STEPS = 32  # along the longer side
 
 
-class ImageMap(Frozen, RadiusMap):
+class ImageMap(Frozen):
     """How well one camera knows its image, over a grid.
 
     Attributes:
@@ -222,6 +218,7 @@ class ImageMap(Frozen, RadiusMap):
     x_px: Array
     y_px: Array
     radius_95_px: Array
+    __repr__, plot = brief, _plot
 
 
 class Picture(Frozen):
@@ -324,7 +321,6 @@ def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
 # One path for places on the field, pixels, and the seam of two cameras: where each component of the mixture shows it,
 # and how sure it is of that.
 
-_ROUND = 2.447 / np.sqrt(2.0)  # radius that 95 % of errors alike in all directions lie within, over their rms length
 _LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley widens out there
 
 
@@ -361,6 +357,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     Args:
         camera: which alone it depends on; "" where it depends on several.
     """
+    of_round = 2.447 / np.sqrt(2.0)  # 95 % of errors alike in all directions lie within, over their rms length
     mixture, width = posterior.mixture(camera), posterior.half_width
     values, covariances = _of_components(mixture, estimate, shown, width)
     _show_lenses(values, mixture, posterior.lenses, shown)
@@ -380,7 +377,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     low, high = np.where(lost[:, None], -np.inf, low), np.where(lost[:, None], np.inf, high)
     covariance[open_] = np.diag([np.inf, np.inf])
     sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    sd = np.minimum(sd, radius / _ROUND) if mixture.is_followed else sd
+    sd = np.minimum(sd, radius / of_round) if mixture.is_followed else sd
     return Reading(low, high, covariance, radius, sd)
 
 

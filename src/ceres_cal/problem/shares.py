@@ -20,7 +20,7 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
-from ceres_cal.observations.sights import SightKey, Sights, sights_of
+from ceres_cal.observations.sights import SightKey, Sights, shown_rows, sights_of
 from ceres_cal.problem.costs import Run, SightCost
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
@@ -345,10 +345,7 @@ class Share:
 
 def _rows_in(content: Content, sights: Sights) -> Mask:
     """(n + m,) the rows that the sights of the world show."""
-    rows = np.zeros(len(content.points) + len(content.curves), dtype=bool)
-    world = sights.take(sights.numbers(placements=(None,)))
-    rows[world.point_rows] = rows[len(content.points) + world.curve_rows] = True
-    return rows
+    return shown_rows(content, sights.take(sights.numbers(placements=(None,))))
 
 
 def owners_of(key: SightKey, slots: Sequence[int]) -> list[tuple[str, str]]:

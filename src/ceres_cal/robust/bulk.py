@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import SightKey, some_views
+from ceres_cal.observations.sights import SightKey, shown_rows, some_views
 from ceres_cal.problem.bundle import Progress, Solution, solve
 from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
 from ceres_cal.problem.parameters import Estimate, Layout
@@ -233,9 +233,8 @@ class _SumRounds(Rounds[_SumRound]):
         self._problem, self._progress = problem, progress
         placed = np.flatnonzero([key.placement is not None for key in problem.sights.keys])
         self._core = problem.sights.take(placed)
-        masks = np.zeros(len(self._few.points), dtype=bool), np.zeros(len(self._few.curves), dtype=bool)
-        masks[0][self._core.point_rows] = masks[1][self._core.curve_rows] = True
-        self._placed, self._before = masks, end
+        points, curves = np.split(shown_rows(self._few, self._core), [len(self._few.points)])
+        self._placed, self._before = (points, curves), end
         self._along: tuple[tuple[str, Estimate], ...] = ()
         self._unknowns = problem.unknowns(end.solution.estimate)
 

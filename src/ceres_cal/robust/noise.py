@@ -81,17 +81,13 @@ class Inliers(Frozen):
         """Whether nothing worth another solve changed: scales by no more than `relative`, and rows by none, or by a few
         of very many where that is no strict comparison.
         """
-        changed = np.count_nonzero(self.points != other.points) + np.count_nonzero(self.curves != other.curves)
-        few = SAME * (len(self.points) + len(self.curves)) ** 0.5 if relative >= SAME else 0.0
+        changed = self.rows != other.rows
+        few = SAME * len(changed) ** 0.5 if relative >= SAME else 0.0
         return bool(
-            changed <= few
+            np.count_nonzero(changed) <= few
             and abs(self.point_scale - other.point_scale) <= relative * other.point_scale
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
-
-    def same_rows(self, other: Inliers) -> bool:
-        """Whether the same observations take part."""
-        return np.array_equal(self.points, other.points) and np.array_equal(self.curves, other.curves)
 
     @classmethod
     def by_noise(cls, points: Array, curves: Array, noise: NoiseScales) -> Inliers:
@@ -102,9 +98,8 @@ class Inliers(Frozen):
 
     def of_rows(self, points: Indices, curves: Indices) -> Inliers:
         """Those of some of the observations, as if there were no others."""
-        sigmas = self.point_sigmas[points], self.curve_sigmas[curves]
-        both = Inliers(self.points[points], self.curves[curves], self.point_scale, self.curve_scale, *sigmas)
-        return replace(both, degrees_of_freedom=self.degrees_of_freedom, bound=self.bound)
+        own = {"points": points, "curves": curves, "point_sigmas": points, "curve_sigmas": curves}
+        return replace(self, **{name: getattr(self, name)[rows] for name, rows in own.items()})
 
     def weighting(self, options: Options) -> Weighting:
         """Of the observations at these noise scales."""
@@ -139,9 +134,7 @@ def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
 
 def median_scales(points: Array, curves: Array) -> tuple[float, float]:
     """Noise scales by the medians of lengths of points and of curves in their stated sigmas."""
-    both = (EachLength(points), _RAYLEIGH_MEDIAN), (EachLength(curves), _NORMAL_MEDIAN)
-    p, c = (_median_scale(lengths, median_of_one) for lengths, median_of_one in both)
-    return p, c
+    return _median_scale(EachLength(points), _RAYLEIGH_MEDIAN), _median_scale(EachLength(curves), _NORMAL_MEDIAN)
 
 
 def _median_scale(lengths: Lengths, median_of_one: float) -> float:

@@ -337,7 +337,7 @@ class _RowRounds(Rounds[RobustSolution]):
     def _with(self, inliers: Inliers, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
         """The state with the problem that the inliers make; rows are not moved where the last ones were the same."""
         last = self._last
-        if last is None or not inliers.same_rows(last[0]):
+        if last is None or not np.array_equal(inliers.rows, last[0].rows):
             self._last = last = inliers, self._problem.sights.used(inliers.points, inliers.curves)
         weighting = inliers.weighting(self._problem.options)
         problem = replace(self._problem, sights=last[1], weighting=weighting, feet=there.feet)

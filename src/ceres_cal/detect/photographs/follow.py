@@ -45,6 +45,7 @@ _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX, _NEARLY_PX = 0.02, 0.3  # the second where it is only asked whether this is the field
+_NO_NEARER = 0.8  # of the last step: lines that are taken in turns, or none that fit, come to no rest
 _SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
 
 
@@ -121,6 +122,7 @@ class _Tracker:
     free: FreeIntrinsics
     missing: tuple[str, ...] = ()
     reached: list[Followed] = field(default_factory=list)
+    rested: list[tuple[Camera, tuple[object, ...], Followed]] = field(default_factory=list)
     rest_px: float = _AT_REST_PX
 
     def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
@@ -206,20 +208,26 @@ class _Tracker:
         return next((one for one in alike if moved_px(one.camera, camera, one.lines.course.pixels) < _SAME_PX), None)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
-        """Measured and refitted, with these intrinsics free, until nothing moves any more."""
-        tracker, lines, moved = self, self.measured(camera), np.inf
+        """Measured and refitted, with these intrinsics free, until nothing moves any more, or no less than before."""
+        asked = names, tuple(self.curves), self.target.spec
+        for start, what, came in self.rested:  # other dimensions are tried from the same cameras, time and again
+            if start is camera and what == asked:
+                return came
+        tracker, lines, moved, there = self, self.measured(camera), np.inf, camera
         for _ in range(_ROUNDS):
             if np.count_nonzero(lines.found) < _FEWEST:
                 break
-            refitted = tracker._refitted(camera, tracker._observed(lines, camera), names)
+            refitted = tracker._refitted(there, tracker._observed(lines, there), names)
             if refitted is None:
                 break
-            before, (tracker, there) = camera, refitted
+            last, before, (tracker, there) = moved, there, refitted
             moved = moved_px(before, there, lines.course.pixels)
-            camera, lines = there, tracker.measured(there, is_even=lines.is_even)
-            if moved < self.rest_px:
+            lines = tracker.measured(there, is_even=lines.is_even)
+            if moved < self.rest_px or moved > _NO_NEARER * last:
                 break
-        return tracker.followed(camera, lines, moved)
+        came = tracker.followed(there, lines, moved)
+        self.rested.append((camera, asked, came))
+        return came
 
     def refined(self, followed: Followed) -> Followed:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""

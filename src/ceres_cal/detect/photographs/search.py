@@ -42,6 +42,8 @@ _SURE = 0.9
 # Of the best one's likelihood: another way to see the picture that is as good makes it ambiguous. Of a circle and a
 # cross a quarter turn that is wrong has 1.1 times as much as the right one.
 _AS_GOOD = 0.87
+# The likeliest candidates, which a lens of another kind may suit: of 41 pictures that show the field one needs two.
+_MOST_REFINED = 2
 _NO_LINES = (
     "no lines at right angles that could be this field's, two one way and one across: "
     "check the target's dimensions, or start from corners"
@@ -140,7 +142,7 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
     """What may be the field, by candidates from some strokes; else the best there is, and what speaks against it."""
     good: list[Followed] = []
     seen: Followed | None = None
-    reason = _NO_LINES
+    reason, refined = _NO_LINES, 0
     for camera, grid in candidates(among):
         if problem.is_out_of_time:
             break
@@ -149,7 +151,8 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
         if any(followed is one for one in problem.refused):
             continue
         against = objection(problem, followed)
-        if against and (followed.holds or followed.share >= SURE_SHARE):
+        if against and refined < _MOST_REFINED and (followed.holds or followed.share >= SURE_SHARE):
+            refined += 1
             free = _free(own.target, auto, followed.camera)
             followed = refine(problem.grey, own.target, followed.camera, problem.curves, free, followed.lacks_wholly)
             against = objection(problem, followed)
