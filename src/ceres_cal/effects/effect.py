@@ -250,7 +250,7 @@ class Effect(ABC):
             for it where it is likely, and states no number better than with it in doubt.
     """
 
-    kind: ClassVar[str]
+    kind: str
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
     built: ClassVar[str] = ""
