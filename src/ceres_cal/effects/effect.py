@@ -253,7 +253,7 @@ class Effect(ABC):
     kind: str
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
-    built: ClassVar[str] = ""
+    built: str = ""
     prior: ClassVar[SizePrior | None] = None
 
     def concerns(self, observations: Observations) -> bool:
