@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from runner import mean_and_error, over
 
-from accuracy.scenes import Problem
+from accuracy.scenes import Problem, without_noise
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration import Calibration
@@ -61,16 +61,10 @@ def make_trial(problem: Problem, disturbance: Disturbance, seed: int) -> Trial:
     return Trial(
         replace(simulation.observations, priors=drawn),
         true_estimate(simulation, problem.options),
-        replace(_without_noise(simulation), priors=problem.priors),
+        replace(without_noise(simulation), priors=problem.priors),
         lambda sights: sights.used(simulation.points.flag == CLEAN, simulation.curves.flag == CLEAN),
         problem.options,
     )
-
-
-def _without_noise(simulation: Simulation) -> Observations:
-    found = simulation.observations
-    points = replace(found.points, pixels=simulation.points.pixels)
-    return replace(found, points=points, curves=replace(found.curves, pixels=simulation.curves.pixels))
 
 
 def true_estimate(simulation: Simulation, options: Options) -> Estimate:

@@ -15,7 +15,8 @@ import numpy as np
 from runner import Row, over, script, share_error
 
 from accuracy.dependent_errors import along_lines
-from accuracy.moves import ALARMS, DAY, HOME, NOISE, calibrated, clean, seen, thinned, truth_of
+from accuracy.moves import ALARMS, DAY, HOME, NOISE, calibrated, seen, thinned, truth_of
+from accuracy.scenes import without_noise
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
@@ -47,7 +48,7 @@ class Kind:
         observations = simulation.observations
         sigma_px = observations.curves.sigma_px / self.sigma
         if self.together:
-            observations = along_lines(clean(simulation), simulation.scene, seed, REACH_M)
+            observations = along_lines(without_noise(simulation), simulation.scene, seed, REACH_M)
         curves = replace(observations.curves, sigma_px=sigma_px)
         return thinned(replace(observations, curves=curves), (), self.count, seed)
 

@@ -15,7 +15,7 @@ from photos.auto import FACING, VIEWS, near, outcome, searched, take_view
 from photos.shots import Shot, clicks, distances_px, floor_error_mm, hidden_places, off_by, take, turned, varied
 from rendering.photograph import frames, photograph
 
-from accuracy.accuracy import mirrored_count
+from accuracy.accuracy import mirrored_small
 from accuracy.bound import attempts, efficiency
 from accuracy.diagnostic_scenes import CLEAN, FAULTS
 from accuracy.false_alarms import diagnosed
@@ -38,7 +38,7 @@ from accuracy.moves import (
     thinned,
     truth_of,
 )
-from accuracy.scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, small_boards, tilted
+from accuracy.scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, tilted
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
@@ -88,19 +88,12 @@ def calibrations(runs: int, folder: Path) -> Figures:
         failed += found.failed
     figures["taken out, clean boards"] = efficiency(PROBLEMS["boards, brown"](), CLEAN_NOISE, range(2)).rejected
     figures["refused"] = failed
-    figures["poses mirrored or lost"] = sum(_mirrored(seed, False) for seed in range(max(runs // 4, 1)))
-    figures["the same, 20 % outliers"] = sum(_mirrored(seed, True) for seed in range(max(runs // 4, 1)))
+    for name, noise in {"poses mirrored or lost": CLEAN_NOISE, "the same, 20 % outliers": GROSS_NOISE}.items():
+        figures[name] = sum(mirrored_small(100, noise, seed) for seed in range(max(runs // 4, 1)))
     figures["fisheye boards, 30 % outliers, wrong"] = sum(_lost(seed) for seed in range(max(runs // 2, 1)))
     figures["few corners, error in sigmas"] = _few_corners(2 * runs)
     figures["shuffled labels not refused"] = sum(not _answer(partial(_shuffled, seed)) for seed in range(runs))
     return figures
-
-
-def _mirrored(seed: int, gross: bool) -> int:
-    simulation = simulate(small_boards(100, seed), GROSS_NOISE if gross else CLEAN_NOISE, seed)
-    calibration = calibrate(simulation.observations, Options(lens="brown"))
-    rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
-    return mirrored_count(calibration, simulation.observations, rotations)
 
 
 def _lost(seed: int) -> int:

@@ -23,7 +23,7 @@ from rendering.photograph import frames, photograph
 from runner import Row, script, share_error
 
 from accuracy.accuracy import map_errors_mm
-from accuracy.scenes import FIELD, field_places
+from accuracy.scenes import FIELD, field_places, without_noise
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
@@ -188,7 +188,7 @@ def bound_case(runs: int) -> Iterator[Row]:
         calibration = calibrated(seed)
         simulation = seen(TILTED, NOISE, seed, spacing_m=0.12)
         few = thinned(simulation.observations, CORNERS, 30, seed)
-        pixels = thinned(clean(simulation), CORNERS, 30, seed)
+        pixels = thinned(without_noise(simulation), CORNERS, 30, seed)
         result = refit(calibration, few)
         truth = truth_of(calibration, TILTED)
         keys, covariance = bound_of(calibration, pixels, TILTED)
@@ -212,12 +212,6 @@ def bound_case(runs: int) -> Iterator[Row]:
     gain = float(np.median(scratch) / np.median(ours))
     note = f"mean error {np.median(ours):.2f} mm against {np.median(scratch):.2f} mm (medians)"
     yield Row("30 line points, 4 corners", "smaller than from scratch, 150 mm", gain, least=3.0, note=note)
-
-
-def clean(simulation: Simulation) -> Observations:
-    found = simulation.observations
-    points = replace(found.points, pixels=simulation.points.pixels)
-    return replace(found, points=points, curves=replace(found.curves, pixels=simulation.curves.pixels))
 
 
 def _from_scratch(observations: Observations, seed: int) -> Calibration | None:

@@ -10,7 +10,7 @@ show as several. Exits with 1 when a figure is missed by more than two of its st
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
-from ceres_cal.scene.targets import checkerboard
+from ceres_cal.scene.targets import Target, checkerboard
 
 Project = Callable[[Array], Array]
 """Directions (N, 3) -> pixels (N, 2)."""
@@ -104,10 +104,17 @@ def observed(lens: Project, reach_deg: float, views: int, seed: int) -> Observat
     """The corners of a board in so many views, as a lens shows them."""
     rng = np.random.default_rng(seed)
     pixels, features = zip(*(_view(lens, np.deg2rad(reach_deg), rng) for _ in range(views)), strict=True)
-    numbers = np.repeat(np.arange(views, dtype=np.int32), [len(each) for each in features])
-    names = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(views))
+    return board_views(_BOARD, _SIZE, pixels, features)
+
+
+def board_views(
+    board: Target, size: tuple[int, int], pixels: Sequence[Array], features: Sequence[Array]
+) -> Observations:
+    """Observations of a board by one camera: in each view pixels, and the corners that they show."""
+    numbers = np.repeat(np.arange(len(pixels), dtype=np.int32), [len(each) for each in features])
+    names = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(len(pixels)))
     points = Points(numbers, np.concatenate(features), np.concatenate(pixels), np.ones(len(numbers)))
-    return Observations({"board": _BOARD}, {"camera": _SIZE}, names, points, NO_CURVES)
+    return Observations({"board": board}, {"camera": size}, names, points, NO_CURVES)
 
 
 def _view(lens: Project, reach: float, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -19,11 +19,11 @@ import numpy as np
 from halves import agreement, halves, seen_grid
 from runner import Row, mean_and_error, root_and_error, script
 
-from accuracy.other_lenses import off_over_stated
+from accuracy.other_lenses import board_views, off_over_stated
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.observations import NO_CURVES, Observations, Points, View
+from ceres_cal.observations import Observations
 from ceres_cal.scene.targets import checkerboard
 
 _SIZE, _CENTRE, _PHI, _REACH_DEG = (6016, 4016), np.array([3021.3, 1997.8]), 1900.0, 86.0
@@ -84,10 +84,7 @@ def observed(lens: Rough, seed: int) -> Observations:
     pixels, features = zip(
         *(_view(lens, seed, places, np.linalg.cholesky(agree), rng) for _ in range(_VIEWS)), strict=True
     )
-    numbers = np.repeat(np.arange(_VIEWS, dtype=np.int32), [len(each) for each in features])
-    names = tuple(View(f"{n:03d}", "camera", "camera", "board", f"{n:03d}") for n in range(_VIEWS))
-    points = Points(numbers, np.concatenate(features), np.concatenate(pixels), np.ones(len(numbers)))
-    return Observations({"board": _BOARD}, {"camera": _SIZE}, names, points, NO_CURVES)
+    return board_views(_BOARD, _SIZE, pixels, features)
 
 
 def _view(lens: Rough, seed: int, board: Array, agree: Array, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from ceres_cal.simulate import (
     BoardRanges,
     Disturbance,
     Scene,
+    Simulation,
     Station,
     board_scene,
     field_scene,
@@ -255,3 +256,10 @@ def painted_by_two_cameras(seed: int, heights_known: bool) -> Painted:
     scene = field_scene(custom({}, curves), cameras, stations, points=(), spacing_m=0.1)
     priors = tuple(_height(scene, name, 0.005) for name in stations) if heights_known else ()
     return _observed(scene, offsets_m, seed, priors)
+
+
+def without_noise(simulation: Simulation) -> Observations:
+    """What was simulated, at its true pixels."""
+    found = simulation.observations
+    points = replace(found.points, pixels=simulation.points.pixels)
+    return replace(found, points=points, curves=replace(found.curves, pixels=simulation.curves.pixels))

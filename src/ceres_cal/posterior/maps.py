@@ -321,7 +321,6 @@ def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
 # One path for places on the field, pixels, and the seam of two cameras: where each component of the mixture shows it,
 # and how sure it is of that.
 
-_ROUND = 2.447 / np.sqrt(2.0)  # radius that 95 % of errors alike in all directions lie within, over their rms length
 _LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley widens out there
 
 
@@ -358,6 +357,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     Args:
         camera: which alone it depends on; "" where it depends on several.
     """
+    of_round = 2.447 / np.sqrt(2.0)  # 95 % of errors alike in all directions lie within, over their rms length
     mixture, width = posterior.mixture(camera), posterior.half_width
     values, covariances = _of_components(mixture, estimate, shown, width)
     _show_lenses(values, mixture, posterior.lenses, shown)
@@ -377,7 +377,7 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     low, high = np.where(lost[:, None], -np.inf, low), np.where(lost[:, None], np.inf, high)
     covariance[open_] = np.diag([np.inf, np.inf])
     sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    sd = np.minimum(sd, radius / _ROUND) if mixture.is_followed else sd
+    sd = np.minimum(sd, radius / of_round) if mixture.is_followed else sd
     return Reading(low, high, covariance, radius, sd)
 
 

@@ -12,8 +12,10 @@ from msgspec import Struct
 
 from ceres_cal.base.arrays import median
 from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
+from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
+from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.observations.validation import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
@@ -113,14 +115,26 @@ def _largest_mm(findings: list[Finding]) -> float:
     return float(np.nanmax([0.0, *(finding.effect_mm for finding in findings)]))
 
 
+def of_the_solve(calibration: Calibration, table: ResidualTable | None = None) -> Iterator[tuple[str, str]]:
+    """Level and line of what speaks against it; nothing where nothing was solved. `table`: of other observations."""
+    many_outliers = 0.3
+    out = len(calibration.outliers)
+    share = out / max(calibration.fit.points + calibration.fit.curves + out, 1)
+    if table is not None and len(table):
+        share = float(np.mean(table.outlier))
+    if calibration.rounds and not calibration.converged:
+        yield "no", "the solve did not converge: raise --max-iterations"
+    if calibration.rounds and share > many_outliers:
+        yield "care", f"{100.0 * share:.0f} % of the observations were taken out: check labels, dimensions and the lens"
+
+
 def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     """Level and line of each."""
-    many_outliers = 0.3
-    calibration, diagnosis = quality.calibration, quality.diagnosis
+    calibration = quality.calibration
     if calibration.converged:
         yield "good", "The solve converged."
-    elif calibration.rounds:
-        yield "no", "The solve did not converge: raise --max-iterations."
+    table = None if quality.diagnosis is None else quality.diagnosis.table
+    yield from ((level, f"{sentence(text)}.") for level, text in of_the_solve(calibration, table))
     if quality.undiagnosed:
         yield "care", f"{sentence(_UNJUDGED)}. So it is not known whether the model is right: {quality.undiagnosed}."
     yield from _of_findings(quality)
@@ -133,9 +147,6 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
             f"The noise is {short(noise_ratio(quality))} times the stated sigma: check the lens, the labels and the "
             "dimensions.",
         )
-    out = float(np.mean(diagnosis.table.outlier)) if diagnosis is not None and len(diagnosis.table) else 0.0
-    if out > many_outliers:
-        yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
     yield from _of_knowledge(quality)
     known = [conflict.words for conflict in calibration.conflicts]
     for text in calibration.warnings:

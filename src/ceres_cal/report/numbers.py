@@ -27,6 +27,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.problem.parameters import anchored_stations
 from ceres_cal.report.document import Piece, Section, Table, Text, wrapped
+from ceres_cal.report.grounds import of_the_solve
 from ceres_cal.report.quality import Quality
 from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.camera import Camera
@@ -113,17 +114,11 @@ def stopped(calibration: Calibration) -> Section:
 
 def warnings(calibration: Calibration) -> Iterator[str]:
     """What to know of it, and what may be wrong with the observations."""
-    many_outliers, large_scale = 0.3, 4.0  # from where on a warning is due
+    large_scale = 4.0  # from where on a warning is due
     yield from calibration.warnings
-    if not calibration.rounds:  # nothing was solved
-        return
-    if not calibration.converged:
-        yield "the solve did not converge: raise --max-iterations"
-    out = len(calibration.outliers)
-    if out > many_outliers * (calibration.fit.points + calibration.fit.curves + out):
-        yield "many observations were taken out: check labels, target dimensions and the lens"
-    scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
-    if scale > large_scale:
+    yield from (text for _, text in of_the_solve(calibration))
+    scale = max(calibration.fit.scales)
+    if calibration.rounds and scale > large_scale:
         yield (
             f"the residuals are {scale:.0f} times the stated sigmas: the lens may not suit the camera, or labels and "
             "target dimensions may be wrong"
