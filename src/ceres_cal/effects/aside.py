@@ -104,7 +104,7 @@ class FeatureGroups(ObservationGroups):
     kind = "feature aside"
     prior = FEATURE_ASIDE
     most_views = 8
-    remedy = "check the label, and where it is painted"
+    remedy = "check the label, where it is painted, and the target's dimensions"
 
     def modes(self, equations: Equations, group: Indices) -> Array:
         every = np.zeros((len(equations), 3))

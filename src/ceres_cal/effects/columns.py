@@ -148,6 +148,9 @@ class EffectSums(Frozen):
         return np.cumsum(squares, axis=0)[:-1]
 
 
+_MOST_ENTRIES = 4_000_000  # of a matrix: 32 MB
+
+
 class SparseColumns(Frozen):
     """Columns of Q numbers over E equations, in standard deviations.
 
@@ -193,13 +196,22 @@ class SparseColumns(Frozen):
     @cached_property
     def _matrix(self) -> Array | None:
         """(E, Q) the same as one matrix; None where sums one by one take less time, or less memory."""
-        most, few, many = 4_000_000, 2, 30  # entries, 32 MB; times as many numbers as move an equation
-        equations, width = self.slots.shape
-        if self.size > (many if equations * self.size <= most else few) * width:
-            return None
-        at = np.arange(equations)[:, None] * (self.size + 1) + self.slots
-        whole = np.bincount(at.ravel(), self.values.ravel(), minlength=equations * (self.size + 1))
-        return np.asarray(whole.reshape(equations, -1)[:, :-1])
+        few, (equations, width) = 2, self.slots.shape
+        small = self._has_few and equations * self.size <= _MOST_ENTRIES
+        return self._rows(slice(None)) if small or self.size <= few * width else None
+
+    @property
+    def _has_few(self) -> bool:
+        """Whether sums of many columns at once take less time as products of a matrix, its zeros and all."""
+        many = 40  # times as many numbers as move an equation
+        return bool(self.size <= many * self.slots.shape[1])
+
+    def _rows(self, rows: slice) -> Array:
+        """(E, Q) the same of some equations as a matrix."""
+        slots, values = self.slots[rows], self.values[rows]
+        at = np.arange(len(slots))[:, None] * (self.size + 1) + slots
+        whole = np.bincount(at.ravel(), values.ravel(), minlength=len(slots) * (self.size + 1))
+        return np.asarray(whole.reshape(len(slots), -1)[:, :-1])
 
     def products(self) -> Array:
         """(Q, Q) X^T X."""
@@ -228,6 +240,13 @@ class SparseColumns(Frozen):
         """(P, Q) what the shared numbers take of them."""
         if self._matrix is not None:
             return np.asarray(model.shared.T @ self._matrix)
+        if self._has_few:
+            step = _MOST_ENTRIES // max(self.size, 1)
+            parts = (slice(first, first + step) for first in range(0, len(self.slots), step))
+            taken = np.zeros((model.shared.shape[1], self.size))
+            for part in parts:
+                taken += model.shared[part].T @ self._rows(part)
+            return taken
         return np.array([self.summed(column) for column in model.shared.T]).reshape(-1, self.size)
 
     def left_of(self, model: Linearised) -> tuple[Array, Array, Array]:

@@ -295,7 +295,7 @@ def _solved(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
 ) -> RobustSolution | None:
     """The problem solved from where another one ended; None where it cannot be."""
-    after = solve_robustly(problem, observations, end.solution.estimate, usual)
+    after = solve_robustly(replace(problem, feet=end.residuals.feet), observations, end.solution.estimate, usual)
     return None if after.solution.failed else after
 
 

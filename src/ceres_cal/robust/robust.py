@@ -191,18 +191,18 @@ class _RowRounds(Rounds[RobustSolution]):
 
     def first(self, estimate: Estimate) -> RobustSolution:
         """The rough solve from a start."""
-        there = residuals(self._observations, self._problem.sights, estimate)
+        there = residuals(self._observations, self._problem.sights, estimate, self._problem.feet)
         return self._rough(estimate, there, visible_from(self._observations, there), 1)
 
     def at(self, estimate: Estimate) -> RobustSolution:
         """An estimate as it is, judged."""
-        there = residuals(self._observations, self._problem.sights, estimate)
+        there = residuals(self._observations, self._problem.sights, estimate, self._problem.feet)
         solution = Solution(estimate, np.nan, False, "", ())
         return self._with(self._judge(solution, there), solution, there, 0)
 
     def posed(self, estimate: Estimate) -> RobustSolution:
         """A start near the minimum, its private placements at their best."""
-        there = residuals(self._observations, self._problem.sights, estimate)
+        there = residuals(self._observations, self._problem.sights, estimate, self._problem.feet)
         visible = visible_from(self._observations, there)
         weighting = Weighting(visible.point_scale, visible.curve_scale, "cauchy", loss_scale=1.0)
         problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
