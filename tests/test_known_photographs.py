@@ -20,6 +20,8 @@ from ceres_cal.detect.photographs import check_photographs, detect_field, detect
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refits import movements, refit
 from ceres_cal.observations import Observations, combine
+from ceres_cal.report.grounds import grounds
+from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.simulate import built_in_scene
 
@@ -164,3 +166,16 @@ def test_a_folder_of_photographs_is_kept_up_with(
     assert [event["event"] for event in events] == ["holds", "suspected", "refitted", "holds", "unreadable"]
     assert "no field within" in str(events[1])
     assert floor_error_mm(knocked_truth(), Calibration.load(place).station()) < 0.5
+
+
+def test_the_report_says_what_a_photograph_says_of_its_floor() -> None:
+    """Which is flat: beforehand that it is bowed is as likely as one in five."""
+    scene, _ = built_in_scene("ssl-field")
+    seen = detect_field([NEW], scene.targets["field"], scene.camera_at("overhead")).observations
+    calibration = calibrate(seen, RADIAL)
+    floors = {one.kind: one.probability for one in calibration.effects}
+    assert floors.keys() == {"floor bowed", "field sheared"} and floors["floor bowed"] < 0.005
+    assert not any("solved for" in one for one in calibration.warnings)
+    (said,) = [line for _, line in grounds(quality_of(calibration, seen)) if "--as-drawn" in line]
+    assert "bowed" not in said  # 0.04 %
+    assert f"'field sheared by 1.5\xa0mm' is {floors['field sheared']:.0%} likely" in said  # 1 %

@@ -69,12 +69,12 @@ class AsBuilt(Frozen, eq=True):
 
 
 class EffectEstimate(Frozen, eq=True):
-    """A group of an effect that was solved for.
+    """A group of an effect that was solved for, or of a floor that is taken into the standard deviations.
 
     Attributes:
         kind, subject, frame: which, as a `Finding` has them. sigma: the standard deviation of its amounts, in their
             own unit, that they were solved for under. probability: that there is such an effect.
-        sentence: what it is, in words. amounts: what was taken off the observations.
+        sentence: what it is, in words. amounts: what was taken off the observations; of what only widens neither.
     """
 
     kind: str
@@ -250,10 +250,10 @@ class Effect(ABC):
             for it where it is likely, and states no number better than with it in doubt.
     """
 
-    kind: ClassVar[str]
+    kind: str
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
-    built: ClassVar[str] = ""
+    built: str = ""
     prior: ClassVar[SizePrior | None] = None
 
     def concerns(self, observations: Observations) -> bool:

@@ -16,7 +16,6 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.evidence import FLOOR_OFF_WORDS
 from ceres_cal.observations.validation import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
@@ -197,8 +196,12 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
         return
     if quality.uncertainty.widening:
         yield "", f"{sentence(quality.uncertainty.widening)}."
-    if quality.fields and quality.calibration.options.as_built == "estimate":
-        yield "", f"{FLOOR_OFF_WORDS}; the accuracy includes this, and --as-drawn leaves it out."
+    some = 0.005  # of a probability that is said
+    floors = [one for one in quality.calibration.effects if not one.amounts and one.probability >= some]
+    likely = [f"'{one.kind} by {mm(1e3 * one.sigma)}' is {one.probability:.0%} likely" for one in floors]
+    if likely:
+        included = "the accuracy includes this, and --as-drawn leaves it out"
+        yield "", f"By these observations {' and '.join(likely)}: {included}."
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     # What they do to places is in the maps, and what to the picture, in what is said of it.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"

@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
-from ceres_cal.effects.evidence import LIKELY, RepeatedAmounts, shifts_by
+from ceres_cal.effects.evidence import FLOOR_OFF, LIKELY, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.strands import strand_names
 from ceres_cal.effects.table import estimated
@@ -181,7 +181,7 @@ class _Amounts(Frozen):
         return off
 
     def estimates(self) -> Iterator[EffectEstimate]:
-        """Of what is solved for."""
+        """Of what is solved for, and how likely it is that a floor is off, which is not."""
         case, (amounts, covariance) = self.case, self._best
         explained = sum((self._shift(self.groups[number]) for number in self.likely), np.zeros(len(case.equations)))
         left = case.model.left_over + case.model.left_of_column(explained * case.model.weight)
@@ -191,6 +191,10 @@ class _Amounts(Frozen):
             score = ScoreTest(group.columns, group.number, float(np.sum((own / sd) ** 2)), len(own), 0.0, own, sd)
             sentence, _, mending = group.effect.words(group.effect.evidence(case, score, case.model, left))
             yield EffectEstimate(group.effect.kind, score.subject, score.frame, sigma, probability, sentence, mending)
+        for number, group in enumerate(self.groups):
+            if number not in self.likely and group.effect.prior is FLOOR_OFF:
+                subject = group.columns.subjects[group.number]
+                yield EffectEstimate(group.effect.kind, subject, None, *self.sizes[number], "", ())
 
     def shifts(self) -> Iterator[Array]:
         """(K,) each, see `EffectsEnd`."""
