@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,22 +23,12 @@ def _rows_argument(rows: str, example: str) -> Any:
     return argument(rows, f"such as {example}; - reads lines of these from standard input", ())
 
 
-class ProjectArguments(Arguments):
-    """A calibration, and places."""
+class PlacesArguments(Arguments):
+    """A calibration, and where else its places or pixels come from."""
 
     calibration: Path = calibration_argument()
-    rows: tuple[str, ...] = _rows_argument("X,Y[,Z]", "-2.5,1.0 or -2.5,1.0,0.15 (m)")
     file: str | None = option("read lines of these from a file instead", "CSV")
     station: str | None = station_option()
-
-
-class LocateArguments(ProjectArguments):
-    """The same of pixels, and the height of what they show."""
-
-    rows: tuple[str, ...] = _rows_argument("X,Y", "640.5,480.2 (px)")
-    height_mm: float | None = height_option(
-        "height of what is seen above the field, 150 or 0.15m; default: 0, the floor"
-    )
 
 
 @command(
@@ -47,13 +37,19 @@ class LocateArguments(ProjectArguments):
     "calibration.json 640,480 100,100 --height-mm 150",
     "calibration.json --file pixels.csv --json",
 )
-def _locate(args: LocateArguments) -> Document:
+def _locate(
+    args: PlacesArguments,
+    rows: tuple[str, ...] = _rows_argument("X,Y", "640.5,480.2 (px)"),
+    height_mm: float | None = height_option(
+        "height of what is seen above the field, 150 or 0.15m; default: 0, the floor"
+    ),
+) -> Document:
     import numpy as np
 
     from ceres_cal.scene.camera import in_image
 
-    pixels = _read_rows(args, (2,))
-    height = metres(args.height_mm)
+    pixels = _read_rows(rows, args.file, (2,))
+    height = metres(height_mm)
     name, camera = _station(args)
     inside = in_image(pixels, camera.image_size)
     points = np.where(inside[:, None], camera.locate(pixels, height), np.nan)  # beyond nothing was ever measured
@@ -63,8 +59,10 @@ def _locate(args: LocateArguments) -> Document:
 
 
 @command("project", "where points of the world appear in the image (px)", "calibration.json -2.5,1.0 -2.5,1.0,0.15")
-def _project(args: ProjectArguments) -> Document:
-    points = _read_rows(args, (2, 3))
+def _project(
+    args: PlacesArguments, rows: tuple[str, ...] = _rows_argument("X,Y[,Z]", "-2.5,1.0 or -2.5,1.0,0.15 (m)")
+) -> Document:
+    points = _read_rows(rows, args.file, (2, 3))
     name, camera = _station(args)
     pixels = camera.project(points)
     lost = {row: _why_not_projected(camera, points[row]) for row in _rows_without_answer(pixels)}
@@ -72,7 +70,7 @@ def _project(args: ProjectArguments) -> Document:
     return _answer({**data, "pixels": _or_null(pixels)}, pixels, lost)
 
 
-def _station(args: ProjectArguments) -> tuple[str, Camera]:
+def _station(args: PlacesArguments) -> tuple[str, Camera]:
     calibration = read_calibration(args.calibration)
     name = station_of(args.calibration, args.station, calibration)
     return name, calibration.stations[name]
@@ -81,28 +79,28 @@ def _station(args: ProjectArguments) -> tuple[str, Camera]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-def _read_rows(args: ProjectArguments, sizes: tuple[int, ...]) -> Array:
+def _read_rows(given: Sequence[str], file: str | None, sizes: tuple[int, ...]) -> Array:
     """(N, largest size) numbers from the arguments, a file or standard input; a number left out is 0."""
     import numpy as np
 
-    rows = [_numbers(text, sizes, where) for where, text in _texts(args)]
+    rows = [_numbers(text, sizes, where) for where, text in _texts(given, file)]
     if not rows:
         raise InputError("nothing was given: name at least one place, or --file")
     return np.array([row + [0.0] * (max(sizes) - len(row)) for row in rows])
 
 
-def _texts(args: ProjectArguments) -> Iterator[tuple[str, str]]:
+def _texts(given: Sequence[str], file: str | None) -> Iterator[tuple[str, str]]:
     """What to read numbers from, each with how messages name it."""
-    if args.file is not None and args.rows:
+    if file is not None and given:
         raise InputError("give places as arguments or by --file, not both")
-    if args.file == "-" or args.rows == ("-",):
+    if file == "-" or tuple(given) == ("-",):
         yield from _lines(sys.stdin, "standard input")
-    elif args.file is not None:
+    elif file is not None:
         from ceres_cal.base.files import read_bytes
 
-        yield from _lines(read_bytes(args.file).decode("utf-8-sig", errors="replace").splitlines(), args.file)
+        yield from _lines(read_bytes(file).decode("utf-8-sig", errors="replace").splitlines(), file)
     else:
-        yield from ((f"argument {text!r}", text) for text in _places(args.rows))
+        yield from ((f"argument {text!r}", text) for text in _places(given))
 
 
 def _places(arguments: Iterable[str]) -> list[str]:

@@ -22,7 +22,7 @@ from ceres_cal.effects.columns import EffectSums, least_absolute, select
 from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
 from ceres_cal.effects.table import EFFECTS, JointStep, columns_of_all, joint_step
-from ceres_cal.effects.table.targets import CurveAside, PointAside
+from ceres_cal.effects.table.targets import CURVE_ASIDE, POINT_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
@@ -246,7 +246,7 @@ def _recalled(case: DiagnosisCase) -> Mask:
     equations, weight, used = case.equations, case.model.weight, case.model.used.copy()
     open_to_it = ~_mislabelled(case)[equations.observation]
     counted = replace(case, model=replace(case.model, used=open_to_it))
-    for effect in (*CurveAside().columns(counted), *PointAside().columns(counted)):
+    for effect in (*CURVE_ASIDE.columns(counted), *POINT_ASIDE.columns(counted)):
         own = (effect.group >= 0) & open_to_it
         rejected = np.bincount(effect.group[own & ~used], minlength=len(effect.subjects))
         for number in np.flatnonzero(rejected >= _FEWEST_AGREE):

@@ -250,10 +250,10 @@ class Effect(ABC):
             for it where it is likely, and states no number better than with it in doubt.
     """
 
-    kind: ClassVar[str]
+    kind: str
     wrong: ClassVar[Wrong] = "model"
     absorbed: ClassVar[bool] = False
-    built: ClassVar[str] = ""
+    built: str = ""
     prior: ClassVar[SizePrior | None] = None
 
     def concerns(self, observations: Observations) -> bool:

@@ -4,13 +4,11 @@ shifted.
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Iterator
-from typing import ClassVar
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, numbers_of
+from ceres_cal.base.arrays import Array, numbers_of
 from ceres_cal.base.transforms import Pose, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import CameraEffect, Case, Effect, Evidence, Words, amounts
@@ -18,15 +16,11 @@ from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.quantities import pixel_slopes
 
 
-class _PoseTest(Effect):
-    """Each station turned about the camera's axes, shifted in the world."""
+class Moved(Effect):
+    """Each station turned about the camera's axes, shifted in the world: from some frame on, or in one frame alone."""
 
-    onwards: ClassVar[bool]
-    advice: ClassVar[str]
-
-    @abstractmethod
-    def groups(self, group: Indices, count: int) -> Indices:
-        """(E,) the frames of `count` that are tested."""
+    def __init__(self, kind: str, advice: str, *, onwards: bool) -> None:
+        self.kind, self._advice, self._onwards = kind, advice, onwards
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         equations = case.equations
@@ -40,9 +34,12 @@ class _PoseTest(Effect):
         columns = motion_columns(case)
         for station in case.observations.stations:
             present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
-            group, names = self.groups(group, len(present)), tuple(known[number][1] for number in present)
+            names, last = tuple(known[number][1] for number in present), len(present) - 1
+            # In the first or last frame alone is the same as from there on.
+            tested = last > 0 if self._onwards else (group > 0) & (group < last)
+            group = np.where(tested, group, -1)
             if np.any(group >= 0):
-                yield EffectColumns(self.kind, columns, group, (station,) * len(names), names, self.onwards)
+                yield EffectColumns(self.kind, columns, group, (station,) * len(names), names, self._onwards)
 
     def words(self, evidence: Evidence) -> Words:
         score, others = evidence.score, evidence.others
@@ -56,38 +53,16 @@ class _PoseTest(Effect):
         ways.sort(key=lambda way: -way[0])
         whole = max(both.decrease, 1e-300)
         how = " or ".join(f"{text} (explains {100.0 * min(part / whole, 1.0):.0f} %)" for part, text in ways)
-        when = f"after frame {score.frame!r}" if self.onwards else f"in frame {score.frame!r} alone"
+        when = f"after frame {score.frame!r}" if self._onwards else f"in frame {score.frame!r} alone"
         turns, steps = [f"turn about the camera's {axis}" for axis in "xyz"], [f"shift along {axis}" for axis in "xyz"]
         return Words(
             f"station {score.subject!r} moved {when}: {how}; {evidence.size}",
-            self.advice,
+            self._advice,
             (
                 *amounts(turns, np.degrees(score.amount[:3]), np.degrees(score.sd[:3]), "deg"),
                 *amounts(steps, 1e3 * score.amount[3:], 1e3 * score.sd[3:], "mm"),
             ),
         )
-
-
-class MovedAfter(_PoseTest):
-    """From some frame on."""
-
-    kind = "moved after"
-    onwards = True
-    advice = "give the frames after it a station of their own"
-
-    def groups(self, group: Indices, count: int) -> Indices:
-        return group if count > 1 else np.full(len(group), -1)
-
-
-class MovedIn(_PoseTest):
-    """In one frame alone."""
-
-    kind = "moved in"
-    onwards = False
-    advice = "leave this frame out, or give it a station of its own"
-
-    def groups(self, group: Indices, count: int) -> Indices:
-        return np.where((group > 0) & (group < count - 1), group, -1)  # the first or last is the same as from there on
 
 
 def motion_columns(case: Case) -> Array:
@@ -132,65 +107,51 @@ class Skew(CameraEffect):
 
 
 class HeldNumbers(CameraEffect):
-    """Numbers of the pixels that are held; places: theirs in the intrinsics vector."""
+    """Numbers of the pixels that are held, by their places in the intrinsics vector."""
 
-    places: ClassVar[list[int]]
+    def __init__(self, kind: str, places: list[int], words: Callable[[Evidence], Words]) -> None:
+        self.kind, self._places, self._words = kind, places, words
 
     def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        if set(self.places) & set(case.problem.layout.free[camera].tolist()):
+        if set(self._places) & set(case.problem.layout.free[camera].tolist()):
             return None
         one = case.estimate.cameras[camera].at(Pose.identity())
-        return pixel_slopes(one, one.rays(pixels)).intrinsics[:, :, self.places]
-
-
-class Aspect(HeldNumbers):
-    """How high pixels are beside their width."""
-
-    kind = "aspect"
-    places: ClassVar[list[int]] = [1]
+        return pixel_slopes(one, one.rays(pixels)).intrinsics[:, :, self._places]
 
     def words(self, evidence: Evidence) -> Words:
-        score = evidence.score
-        held = evidence.case.estimate.cameras[score.subject].aspect
-        return Words(
-            f"camera {score.subject!r}: its pixels are not as wide as high: aspect {held + score.amount[0]:.5f} ± "
-            f"{score.sd[0]:.5f}, not {held:g} ({evidence.size})",
-            "calibrate with --free-aspect",
-            amounts(["aspect"], score.amount, score.sd, ""),
-        )
+        return self._words(evidence)
 
 
-class PrincipalPoint(HeldNumbers):
-    """Where the optical axis meets the image."""
-
-    kind = "principal point"
-    places: ClassVar[list[int]] = [2, 3]
-
-    def words(self, evidence: Evidence) -> Words:
-        score = evidence.score
-        x, y = score.amount
-        return Words(
-            f"camera {score.subject!r}: the principal point is held, but the residuals ask for it {x:+.1f}, {y:+.1f} "
-            f"px from there ({evidence.size})",
-            "let it free",
-            amounts(["cx", "cy"], score.amount, score.sd, "px"),
-        )
+def _of_aspect(evidence: Evidence) -> Words:
+    score = evidence.score
+    held = evidence.case.estimate.cameras[score.subject].aspect
+    return Words(
+        f"camera {score.subject!r}: its pixels are not as wide as high: aspect {held + score.amount[0]:.5f} ± "
+        f"{score.sd[0]:.5f}, not {held:g} ({evidence.size})",
+        "calibrate with --free-aspect",
+        amounts(["aspect"], score.amount, score.sd, ""),
+    )
 
 
-class Phi(HeldNumbers):
-    """The focal length."""
+def _of_principal_point(evidence: Evidence) -> Words:
+    score = evidence.score
+    x, y = score.amount
+    return Words(
+        f"camera {score.subject!r}: the principal point is held, but the residuals ask for it {x:+.1f}, {y:+.1f} "
+        f"px from there ({evidence.size})",
+        "let it free",
+        amounts(["cx", "cy"], score.amount, score.sd, "px"),
+    )
 
-    kind = "phi"
-    places: ClassVar[list[int]] = [0]
 
-    def words(self, evidence: Evidence) -> Words:
-        score = evidence.score
-        return Words(
-            f"camera {score.subject!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± "
-            f"{score.sd[0]:.2f} px ({evidence.size})",
-            "let it free, or give it as a prior with a sigma",
-            amounts(["phi"], score.amount, score.sd, "px"),
-        )
+def _of_phi(evidence: Evidence) -> Words:
+    score = evidence.score
+    return Words(
+        f"camera {score.subject!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± "
+        f"{score.sd[0]:.2f} px ({evidence.size})",
+        "let it free, or give it as a prior with a sigma",
+        amounts(["phi"], score.amount, score.sd, "px"),
+    )
 
 
 _HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
@@ -221,4 +182,12 @@ class PointsShifted(Effect):
         )
 
 
-EFFECTS = (MovedAfter(), MovedIn(), Skew(), Aspect(), PrincipalPoint(), Phi(), PointsShifted())
+EFFECTS = (
+    Moved("moved after", "give the frames after it a station of their own", onwards=True),
+    Moved("moved in", "leave this frame out, or give it a station of its own", onwards=False),
+    Skew(),
+    HeldNumbers("aspect", [1], _of_aspect),
+    HeldNumbers("principal point", [2, 3], _of_principal_point),
+    HeldNumbers("phi", [0], _of_phi),
+    PointsShifted(),
+)

@@ -4,8 +4,7 @@ at one place than around it, or with a field that is painted out of square.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -27,30 +26,33 @@ _FEWEST_ON_CURVE = 8
 _FEWEST_OF_POINT = 2
 
 
-class _StructureTest(Effect):
+class StructureTest(Effect):
     """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
 
-    Attributes:
-        curves: whether of curves, or of points. places: of the numbers, as in `Equations.built`.
+    Args:
+        kind, built: see `Effect`. places: of the numbers, as in `Equations.built`. words: what a finding says.
+        curves: whether of curves, or of points.
     """
 
-    curves: ClassVar[bool] = False
-    places: ClassVar[slice]
-
-    @property
-    def _fewest(self) -> int:
-        return _FEWEST_ON_CURVE if self.curves else 2 * _FEWEST_OF_POINT
+    def __init__(
+        self, kind: str, built: str, places: slice, words: Callable[[Evidence], Words], *, curves: bool = False
+    ) -> None:
+        self.kind, self.built, self._places, self._words, self._curves = kind, built, places, words, curves
+        self._fewest = _FEWEST_ON_CURVE if curves else 2 * _FEWEST_OF_POINT
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         equations, structure = case.equations, case.whole_structure
-        slot, own = (slots[:, self.places.start] for slots in case.slots)
+        slot, own = (slots[:, self._places.start] for slots in case.slots)
         solved = (own >= 0) & (own < case.estimate.structure.own)
-        rows = (equations.is_curve == self.curves) & (slot >= 0) & ~solved
+        rows = (equations.is_curve == self._curves) & (slot >= 0) & ~solved
         numbers, group = grouped(slot, rows)
         counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
         group = np.where(counts[group] >= self._fewest, group, -1)
         names = tuple(feature_of(structure.names[number]) for number in numbers)
-        yield EffectColumns(self.kind, equations.built[:, self.places], group, names)
+        yield EffectColumns(self.kind, equations.built[:, self._places], group, names)
+
+    def words(self, evidence: Evidence) -> Words:
+        return self._words(evidence)
 
     def together(self, findings: Sequence[Finding]) -> Iterator[Finding]:
         yield from _of_each_target(findings)
@@ -86,50 +88,35 @@ def feature_of(name: str) -> str:
     return name.removesuffix("/bow")
 
 
-class CurveAside(_StructureTest):
-    """A line or an arc is not painted as drawn."""
-
-    kind = "curve aside"
-    built = "lines"
-    curves = True
-    places: ClassVar[slice] = slice(0, 3)
-
-    def words(self, evidence: Evidence) -> Words:
-        name = evidence.score.subject
-        target, _, feature = name.partition("/")
-        curve = evidence.case.observations.targets[target].curves[feature]
-        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
-        if isinstance(curve, Arc):
-            how = f"its centre x {mm[0]:+.1f}, y {mm[1]:+.1f} mm and its radius {mm[2]:+.1f} mm off"
-            sentence = f"{name} is not painted as drawn: {how} ({evidence.size})"
-            return Words(sentence, advice, amounts(("x", "y", "radius"), mm, sd, "mm"))
-        assert isinstance(curve, Segment)
-        along = np.subtract(curve.end, curve.start)[:2]
-        x, y = mm[0] * np.array([-along[1], along[0]]) / np.hypot(*along)
-        sentence = (
-            f"{name} is painted {abs(mm[0]):.1f} ± {sd[0]:.1f} mm off its nominal position (x {x:+.1f}, y {y:+.1f} mm; "
-            f"{evidence.size})"
-        )
-        return Words(sentence, advice, amounts(["left"], mm[:1], sd[:1], "mm"))
+def _of_curve(evidence: Evidence) -> Words:
+    name = evidence.score.subject
+    target, _, feature = name.partition("/")
+    curve = evidence.case.observations.targets[target].curves[feature]
+    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
+    if isinstance(curve, Arc):
+        how = f"its centre x {mm[0]:+.1f}, y {mm[1]:+.1f} mm and its radius {mm[2]:+.1f} mm off"
+        sentence = f"{name} is not painted as drawn: {how} ({evidence.size})"
+        return Words(sentence, advice, amounts(("x", "y", "radius"), mm, sd, "mm"))
+    assert isinstance(curve, Segment)
+    along = np.subtract(curve.end, curve.start)[:2]
+    x, y = mm[0] * np.array([-along[1], along[0]]) / np.hypot(*along)
+    sentence = (
+        f"{name} is painted {abs(mm[0]):.1f} ± {sd[0]:.1f} mm off its nominal position (x {x:+.1f}, y {y:+.1f} mm; "
+        f"{evidence.size})"
+    )
+    return Words(sentence, advice, amounts(["left"], mm[:1], sd[:1], "mm"))
 
 
-class PointAside(_StructureTest):
-    """A point does not lie where it is drawn."""
-
-    kind = "point aside"
-    built = "points"
-    places: ClassVar[slice] = slice(0, 2)
-
-    def words(self, evidence: Evidence) -> Words:
-        name = evidence.score.subject
-        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        return Words(
-            f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn "
-            f"({evidence.size})",
-            f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
-            amounts("xy", mm, sd, "mm"),
-        )
+def _of_point(evidence: Evidence) -> Words:
+    name = evidence.score.subject
+    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    return Words(
+        f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn "
+        f"({evidence.size})",
+        f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
+        amounts("xy", mm, sd, "mm"),
+    )
 
 
 class OtherLength(Effect):
@@ -156,29 +143,22 @@ class OtherLength(Effect):
         )
 
 
-class BoardBent(_StructureTest):
-    """A board is bowed along its sides, twisted or wavy."""
-
-    kind = "board bent"
-    built = "warp"
-    places: ClassVar[slice] = slice(2, 2 + len(WARP))
-
-    def words(self, evidence: Evidence) -> Words:
-        # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
-        clear = 2.0
-        name = evidence.score.subject
-        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        further = [
-            f"{words} {a:+.2f} ± {s:.2f} mm"
-            for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
-            if abs(a) > clear * s
-        ]
-        return Words(
-            f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
-            f"along y{''.join(f', {one}' for one in further)} ({evidence.size})",
-            f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
-            amounts(WARP, mm, sd, "mm"),
-        )
+def _of_board(evidence: Evidence) -> Words:
+    # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
+    clear = 2.0
+    name = evidence.score.subject
+    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    further = [
+        f"{words} {a:+.2f} ± {s:.2f} mm"
+        for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
+        if abs(a) > clear * s
+    ]
+    return Words(
+        f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
+        f"along y{''.join(f', {one}' for one in further)} ({evidence.size})",
+        f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
+        amounts(WARP, mm, sd, "mm"),
+    )
 
 
 class _Floor(Effect):
@@ -311,4 +291,10 @@ def _extent(places: Array) -> tuple[Array, float]:
     return 0.5 * (low + high), max(0.5 * float(np.max(high - low)), 1e-9)
 
 
-EFFECTS = (FloorBowed(), FloorUneven(), FieldSheared(), OtherLength(), CurveAside(), PointAside(), BoardBent())
+CURVE_ASIDE = StructureTest("curve aside", "lines", slice(0, 3), _of_curve, curves=True)
+"""A line or an arc is not painted as drawn."""
+POINT_ASIDE = StructureTest("point aside", "points", slice(0, 2), _of_point)
+"""A point does not lie where it is drawn."""
+BOARD_BENT = StructureTest("board bent", "warp", slice(2, 2 + len(WARP)), _of_board)
+"""A board is bowed along its sides, twisted or wavy."""
+EFFECTS = (FloorBowed(), FloorUneven(), FieldSheared(), OtherLength(), CURVE_ASIDE, POINT_ASIDE, BOARD_BENT)
