@@ -102,7 +102,6 @@ def numerical(step: str) -> Iterator[None]:
 NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
 1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
-_REGULAR = 1e8  # the inverse of such an eigenvalue; plain inverses are good to 1e-7 there
 
 
 def _nothing(count: int) -> float:
@@ -148,7 +147,8 @@ def _regular_inverses(scaled: Array) -> Array | None:
     except np.linalg.LinAlgError:  # quiet: eigenvalues are asked instead, and a direction that is unknown stays so
         return None
     sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
-    regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < _REGULAR)
+    most = 1e8  # the inverse of an eigenvalue near to being unknown; plain inverses are good to 1e-7 there
+    regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < most)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
 
 

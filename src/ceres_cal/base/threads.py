@@ -1,4 +1,4 @@
-"""Work in parts, a thread each where that pays: the kernels release Python's lock (design, section 6); and what native
+"""Work in parts, a thread each where that pays: the kernels release Python's lock (design, section 3); and what native
 libraries do to the process that loads them, and how long they may keep it.
 """
 

@@ -25,6 +25,10 @@ _WINDOWS = 150  # that tell a blur
 # windows that count as much as no direction having any.
 _SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
 
+# Of what coma draws lines aside, what is left where it is as by lateral colour, and where another shape suits better,
+# as then none suits well.
+_OF_COMA, _OF_OTHERS = 0.15, 0.4
+
 
 class Blur(Frozen):
     """What makes the lines wider at N places.
@@ -94,8 +98,11 @@ def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Bl
     return Blur(blur, smear, stretch, np.zeros(len(blur)))
 
 
-def with_coma(windows: Windows, course: Course, blur: Blur, fits: Profiles, size: tuple[int, int]) -> Blur | None:
-    """The same of a lens with coma, whose light is drawn out ever farther towards the picture's rim; None of others.
+def with_coma(
+    windows: Windows, course: Course, blur: Blur, fits: Profiles, size: tuple[int, int]
+) -> tuple[Blur, float] | None:
+    """The same of a lens with coma, whose light is drawn out ever farther towards the picture's rim, and the share of
+    what that draws lines aside that may remain, 1 where it is not told to which side; None of others.
 
     It leans outwards, or inwards: windows must say which, since what is only blurred more at the rim suits either as
     well. Then two shapes are tried, that grow with the radius or its square: what is drawn out along the radius alone,
@@ -104,8 +111,9 @@ def with_coma(windows: Windows, course: Course, blur: Blur, fits: Profiles, size
     Args:
         fits: by an even blur. size: of the picture, height and width.
     """
-    # Standard deviations; of half the diagonal; windows that tell whether it is worth while, and the length that is.
-    surely, outer, few, least_px = 4.5, 0.2, 50, 1.6
+    # Standard deviations; of the misfit; of half the diagonal; windows that tell whether it is worth while, and the
+    # length that is.
+    surely, clearly, outer, few, least_px = 4.5, 0.05, 0.2, 50, 1.6
     offsets = (course.pixels - 0.5 * (np.array(size[::-1]) - 1.0)) / (0.5 * np.hypot(*size))
     across, radius = np.sum(offsets * course.normals, axis=1), np.linalg.norm(offsets, axis=1)
     rows = _some(np.flatnonzero(np.isfinite(fits.offset_px) & (np.abs(across) > outer)))
@@ -114,13 +122,15 @@ def with_coma(windows: Windows, course: Course, blur: Blur, fits: Profiles, size
     inwards, outwards = (_drawn_out(windows, course, blur, rows, lean * across) for lean in (-1.0, 1.0))
     more = inwards[1] - outwards[1]
     told = float(np.mean(more)) / max(float(np.std(more)), 1e-9) * len(more) ** 0.5
+    even = float(np.mean(np.log(fits.noise[rows])))
     if abs(told) < surely:
-        return None
+        return (outwards[0], 1.0) if float(np.mean(outwards[1])) < even - clearly else None
     out = np.copysign(1.0, told)
     shapes = product((across, np.cbrt(across * radius**2)), (0.0, 1.0))
     every = [_drawn_out(windows, course, blur, rows, out * shape * radius**power) for shape, power in shapes]
-    coma, left = min(every, key=lambda one: float(np.mean(one[1])))
-    return coma if float(np.mean(left)) < float(np.mean(np.log(fits.noise[rows]))) else None
+    left = [float(np.mean(one)) for _, one in every]
+    best = int(np.argmin(left))
+    return (every[best][0], _OF_OTHERS if best else _OF_COMA) if left[best] < even else None
 
 
 def _drawn_out(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, Array]:

@@ -44,8 +44,6 @@ _NEARBY = 4  # places to each side that a place is compared with
 _FAR, _FAR_PX = 5.0, 0.25
 # Times the spread of its neighbours. Of line centres 0.2 % go at half of it and come at double.
 _WANDERING = 4.0
-# Of what coma draws lines aside, what is left once it is measured; all places of a line err alike.
-_OF_COMA = 0.15
 # Places between those whose scatter is looked at: on a line that is nearly level, errors follow its place in the pixel
 # and are alike over less. And what may be found of it, px.
 _APART = 3
@@ -194,19 +192,21 @@ def measure(
         if _AS_FAR * np.max(blur.blur_px) <= beyond:
             break
         beyond = _AS_FAR * float(np.max(blur.blur_px))
-    even = fits = blur.fitted(windows, course)
+    fits, drawn = blur.fitted(windows, course), np.zeros(len(course))
     coma = None if is_even else with_coma(windows, course, blur, fits, (grey.shape[0], grey.shape[1]))
     if coma is not None:
-        blur, fits = coma, coma.fitted(windows, course)
-    drawn = _OF_COMA * np.nan_to_num(fits.offset_px - even.offset_px) * np.sqrt(np.bincount(course.curve)[course.curve])
+        leaning, remains = coma[0].fitted(windows, course), coma[1]
+        alike = np.sqrt(np.bincount(course.curve)[course.curve])  # all places of a line err alike
+        drawn = remains * alike * np.nan_to_num(leaning.offset_px - fits.offset_px)
+        blur, fits = (coma[0], leaning) if remains < 1.0 else (blur, fits)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     # What is blurred along a line as well is drawn to the inside of its bend.
     offset = rough + fits.offset_px - 0.5 * blur.usual_px**2 * course.curvature
     found = _is_paint(course, fits, contrast, medians(windows.values))
     found = _goes_on(course, found, offset, fits.sigma_px)
-    aside, remains = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
+    aside, open_px = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
     offset = offset - aside
-    sigma = np.hypot(np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), drawn), remains)
+    sigma = np.hypot(np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), drawn), open_px)
     found = _goes_on(course, found, offset, sigma)
     offset = np.where(found, offset, np.nan)
     return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma is None)

@@ -94,9 +94,6 @@ def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
     return columns
 
 
-_VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
-
-
 class Information(Frozen):
     """An information matrix, symmetric, not necessarily of full rank.
 
@@ -186,8 +183,9 @@ class Information(Frozen):
 
     def less(self, other: Information) -> Information:
         """What is left without a part of it; nothing of numbers of which that part says all but rounding."""
+        told_from_rounding = 1e-12  # share of what is known of a number
         left = self.matrix - other.over(self.keys).matrix
-        visible = np.diagonal(left) > _VISIBLE * np.diagonal(self.matrix)
+        visible = np.diagonal(left) > told_from_rounding * np.diagonal(self.matrix)
         return Information(self.keys, np.where(visible[:, None] & visible, left, 0.0))
 
     def __add__(self, other: Information) -> Information:

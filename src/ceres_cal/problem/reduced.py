@@ -25,8 +25,6 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 
-_BATCH = 250_000  # numbers of normal equations worked on at once: they stay where the processor is quick
-
 
 class Eliminated(Frozen):
     """Private placements of one station: their own information, and how they follow the shared numbers.
@@ -197,7 +195,8 @@ class _InformationSums:
         }
         poses = self._estimate.pose_stack(sights.keys)
         size = len(self._problem.layout.free[sights.keys[0].camera]) + len(self._estimate.structure.values) + 6
-        batch = max(1, _BATCH // size**2)
+        most_numbers = 250_000  # of normal equations worked on at once: they stay where the processor is quick
+        batch = max(1, most_numbers // size**2)
         for first in range(0, len(sights), batch):
             last = min(first + batch, len(sights))
             yield poses[first:last], {kind: one(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}

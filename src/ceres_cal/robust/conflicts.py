@@ -51,7 +51,6 @@ from ceres_cal.robust.stated import (
 LARGEST_FREEDOM = 1e6
 """Degrees of freedom that count as infinitely many."""
 _LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
-_STATED = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
 
 
 class Rest(NamedTuple):
@@ -160,7 +159,8 @@ def _squared(off: Array, stated: Array, rest: Array) -> float:
     """off^T (M^-1 + P^-1)^-1 off: where everything else, M, says nothing beside what is stated, P, it is 0 however far
     off that seems.
     """
-    root, back = _roots(stated, _STATED)
+    least = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
+    root, back = _roots(stated, least)
     told, turn = np.linalg.eigh(back.T @ rest @ back)  # in directions in which each is stated to one
     along = off @ root @ turn
     return float(np.sum(np.where(told > _LEAST_TOLD, told / (1.0 + told), 0.0) * along**2))

@@ -109,7 +109,7 @@ def refine(
         lacking: parts that this field is known to lack.
     """
     tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
-    return tracker.told(tracker.followed(camera, tracker.measured(camera), np.inf))
+    return tracker.told(tracker.followed(camera, tracker.measured(camera)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +125,10 @@ class _Tracker:
     rested: list[tuple[Camera, tuple[object, ...], Followed]] = field(default_factory=list)
     rest_px: float = _AT_REST_PX
 
-    def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
+    def followed(self, camera: Camera, lines: Lines) -> Followed:
         """What was measured from a camera."""
         visible = visible_curves(self.grey, self.target, camera, self.curves)
-        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px, visible)
+        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, visible)
 
     def of_painted(self, camera: Camera) -> _Tracker:
         """The same without what the target may lack and this camera does not see."""
@@ -225,7 +225,7 @@ class _Tracker:
             lines = tracker.measured(there, is_even=lines.is_even)
             if moved < self.rest_px or moved > _NO_NEARER * last:
                 break
-        came = tracker.followed(there, lines, moved)
+        came = tracker.followed(there, lines)
         self.rested.append((camera, asked, came))
         return came
 
@@ -351,8 +351,7 @@ class _Tracker:
             return followed
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
-        moved = moved_px(followed.camera, camera, lines.course.pixels)
-        refined = replace(self, target=target).followed(camera, lines, moved)
+        refined = replace(self, target=target).followed(camera, lines)
         return refined if refined.may_be_worn and refined.share > followed.share - _LESS else followed
 
     def _refitted(

@@ -29,7 +29,6 @@ class Followed(Frozen):
         curves: names of those that were followed. missing: of those that the target may lack, and this field does.
         lines: what was measured there, but for curves that lie aside.
         beside: the same of the curves that lie aside.
-        moved_px: how far the last refit moved the prediction; at rest below 0.02.
         visible: names of the curves along which there is paint, whether it could be measured or not.
         built: how the curves lie, where the photograph had to tell the lens, too.
     """
@@ -39,7 +38,6 @@ class Followed(Frozen):
     curves: tuple[str, ...]
     missing: tuple[str, ...]
     lines: Lines
-    moved_px: float
     visible: tuple[str, ...]
     built: FieldAsBuilt = AS_DRAWN
     beside: Lines | None = None
