@@ -101,6 +101,24 @@ def test_rows_that_are_not_there_are_refused() -> None:
         kernels.point_residuals(0, 1, other, poses, points, np.arange(count), found)
 
 
+def test_groups_and_coefficients_that_are_not_there_are_refused() -> None:
+    shares, rows, bounds = np.array([0.5]), np.zeros((3, 2, 8)), np.array([0, 2])
+    strands = partial(kernels.strands_left, np.ones((1, 3)))
+    assert strands(bounds, np.array([0, 1]), rows, shares, np.zeros(1), np.zeros((1, 2, 2))) == 0
+    for own_bounds, group, room, words in (
+        (np.array([0, 3]), np.array([0, 1]), 2, "fewer observations"),
+        (bounds, np.array([0, -1]), 2, "from 0 on"),
+        (bounds, np.array([0]), 2, "group"),
+        (bounds, np.array([0, 1]), 3, "left"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            strands(own_bounds, group, rows, shares, np.zeros(1), np.zeros((1, room, room)))
+    plane, errors = np.zeros((6, 2)), np.zeros(6)
+    for whole, terms, words in ((np.array([1, 6]), 2, "begin with 0"), (np.array([0, 6]), 5, "one to four")):
+        with pytest.raises(ValueError, match=words):
+            kernels.radial_alignment(whole, plane, plane, 1.0, 1, np.zeros(terms), errors, errors.copy())
+
+
 @pytest.mark.parametrize("lens", scenes.EVERY_LENS)
 def test_both_builds_answer_alike(lens: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The one for every processor, and the one for those with AVX2, where the machine has it."""

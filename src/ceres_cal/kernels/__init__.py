@@ -296,7 +296,7 @@ def strands_left(
         rows: (M, S, Z) along the eigenvectors: six of private placements, those of what is shared, the residual.
         group: (S,) whose private placement it is. shares: (A,).
         logs: (A,) the determinants of all R and of what private placements are known by, added up.
-        left: (A, Z - 6, Z - 6) X^T R^-1 X, private placements eliminated, added up.
+        left: (A, Z - 6, Z - 6) sum of X^T R^-1 X of all but these, which are then eliminated from it.
 
     Returns:
         How many numbers were eliminated.

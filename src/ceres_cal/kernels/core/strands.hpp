@@ -15,16 +15,16 @@ class Strands {
     static constexpr int POSE = 6;
 
     // rows (size, strands, numbers): six of a private placement, those of what is shared, the residual. group: (strands)
-    // whose placement it is, of so many. logs (shares) and left (shares, rest, rest) are added to.
+    // whose placement it is, of so many. logs (shares) are added to, and left (shares, rest, rest) is taken from.
     Strands(int size, int strands, int numbers, const double* rows, const int64_t* group, int64_t groups, int shares,
             const double* share, double* logs, double* left)
         : size_(size), strands_(strands), numbers_(numbers), rest_(numbers - POSE), shares_(shares), groups_(groups),
           rows_(rows), share_(share), group_(group), logs_(logs), left_(left),
           placed_(static_cast<size_t>(shares * groups * POSE * numbers)) {}
 
-    // The strands from first to last, all of the same eigenvalues (size): log det R, and x^T R^-1 x.
+    // The strands from first to last, all of the same eigenvalues (size): log det R, and what private placements have to do with.
     void add(int first, int last, const double* values) {
-        const int own = POSE * numbers_, all = rest_ * rest_;
+        const int own = POSE * numbers_;
         std::vector<double> weights(static_cast<size_t>(shares_ * size_));
         for (int a = 0; a < shares_; ++a)
             for (int m = 0; m < size_; ++m) {
@@ -38,18 +38,14 @@ class Strands {
                     add_times(count, weights[static_cast<size_t>(size_ * a + m)], products.data() + count * m,
                               to + apart * a);
         };
-        rests_.assign(static_cast<size_t>(size_ * all), 0.0);
         for (int s = first; s < last; ++s) {  // strands of a group follow one another, or are added one by one
             if (s == first || group_[s] != group_[s - 1]) poses_.assign(static_cast<size_t>(size_ * own), 0.0);
             for (int m = 0; m < size_; ++m) {
                 const double* x = rows_ + (static_cast<int64_t>(m) * strands_ + s) * numbers_;
                 for (int j = 0; j < POSE; ++j) add_times(numbers_, x[j], x, poses_.data() + own * m + numbers_ * j);
-                for (int j = 0; j < rest_; ++j)
-                    add_times(rest_, x[POSE + j], x + POSE, rests_.data() + all * m + rest_ * j);
             }
             if (s + 1 == last || group_[s + 1] != group_[s]) spread(poses_, own, placed(0, group_[s]), groups_ * own);
         }
-        spread(rests_, all, left_, all);
     }
 
     // Private placements eliminated; how many numbers they are.
@@ -103,7 +99,7 @@ class Strands {
     const double *rows_, *share_;
     const int64_t* group_;
     double *logs_, *left_;
-    std::vector<double> placed_, poses_, rests_, coupling_, solved_;
+    std::vector<double> placed_, poses_, coupling_, solved_;
 };
 
 }  // namespace ceres_cal
