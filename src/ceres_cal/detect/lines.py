@@ -295,4 +295,4 @@ def _as_scattered(three: Indices, offset: Array, sigma: Array) -> Array:
     change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
     more = _SCATTER_PX[:, None]
     usual = medians(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2))
-    return np.hypot(sigma, _SCATTER_PX[np.argmin(np.abs(usual / 0.6745 - 1.0))])
+    return np.asarray(np.hypot(sigma, _SCATTER_PX[np.argmin(np.abs(usual / 0.6745 - 1.0))]))
