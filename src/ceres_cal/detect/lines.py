@@ -288,12 +288,11 @@ def _as_scattered(three: Indices, offset: Array, sigma: Array) -> Array:
     """(N,) the standard deviations, px, as what the offsets of three places on a curve tell of their scatter.
 
     Carpet, wear and compression are not white noise, which is all that a window knows; what a window in good light
-    knows best suffers from them no less, so it is added. What is less scatter than windows know is what they do not fit
-    and what is alike in all of them, as a sensor's colours: then all are smaller.
+    knows best suffers from them no less, so it is added. Places that scatter by less may err alike: none is smaller.
     """
     if len(three) < 20:
         return sigma
     change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
     more = _SCATTER_PX[:, None]
-    usual = medians(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2)) / 0.6745
-    return np.asarray(min(usual[0], 1.0) * np.hypot(sigma, _SCATTER_PX[np.argmin(np.abs(usual - 1.0))]))
+    usual = medians(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2))
+    return np.asarray(np.hypot(sigma, _SCATTER_PX[np.argmin(np.abs(usual / 0.6745 - 1.0))]))
