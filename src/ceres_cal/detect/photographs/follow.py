@@ -45,7 +45,6 @@ _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX, _NEARLY_PX = 0.02, 0.3  # the second where it is only asked whether this is the field
-_NO_NEARER = 0.8  # of the last step: lines that are taken in turns, or none that fit, come to no rest
 _SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
 
 
@@ -209,6 +208,7 @@ class _Tracker:
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more, or no less than before."""
+        no_nearer = 0.8  # of the last step: lines that are taken in turns, or none that fit, come to no rest
         asked = names, tuple(self.curves), self.target.spec
         for start, what, came in self.rested:  # other dimensions are tried from the same cameras, time and again
             if start is camera and what == asked:
@@ -223,7 +223,7 @@ class _Tracker:
             last, before, (tracker, there) = moved, there, refitted
             moved = moved_px(before, there, lines.course.pixels)
             lines = tracker.measured(there, is_even=lines.is_even)
-            if moved < self.rest_px or moved > _NO_NEARER * last:
+            if moved < self.rest_px or moved > no_nearer * last:
                 break
         came = tracker.followed(there, lines)
         self.rested.append((camera, asked, came))
