@@ -51,7 +51,8 @@ inline void substitute(int size, const double* upper, double* x, int columns = 1
     for (int k = size - 1; k >= 0; --k) finish(k, k + 1, size, 1, upper + size * k);
 }
 
-// A symmetric matrix (size, size) turned into its eigenvalues, on its diagonal; eigenvectors are the columns of `vectors`.
+// A symmetric matrix (size, size) turned into its eigenvalues, on its diagonal; eigenvectors are the columns of
+// `vectors`.
 inline void eigen(int size, double* matrix, double* vectors) {
     constexpr int MOST = 50;  // rounds of Jacobi's rotations: some eight are enough
     constexpr double ROUNDING = 1e-32;

@@ -195,7 +195,8 @@ class Alignment {
             x_[static_cast<size_t>(i)] = x, y_[static_cast<size_t>(i)] = y, spread += x * x + y * y;
         }
         spread = std::sqrt(spread / n) + 1e-12;
-        for (size_t i = static_cast<size_t>(first); i < static_cast<size_t>(last); ++i) x_[i] /= spread, y_[i] /= spread;
+        for (size_t i = static_cast<size_t>(first); i < static_cast<size_t>(last); ++i)
+            x_[i] /= spread, y_[i] /= spread;
     }
 
     // h1 and h2 of a sight, its u, v and q; how its depth follows c; and what it says of these, added to `reduced`.
@@ -203,8 +204,8 @@ class Alignment {
         const size_t first = static_cast<size_t>(bounds_[g]), last = static_cast<size_t>(bounds_[g + 1]);
         double normal[36] = {}, h[6], agree = 0.0, whole = 0.0;
         for (size_t i = first; i < last; ++i) {
-            const double w = weights_[i], row[6] = {-b_[i] * x_[i], -b_[i] * y_[i], -b_[i],
-                                                    a_[i] * x_[i],  a_[i] * y_[i],  a_[i]};
+            const double w = weights_[i],
+                         row[6] = {-b_[i] * x_[i], -b_[i] * y_[i], -b_[i], a_[i] * x_[i], a_[i] * y_[i], a_[i]};
             add_outer(6, w, row, normal);
         }
         for (int j = 0; j < 6; ++j) h[j] = 1.0 + 0.1 * j;  // anything, as above

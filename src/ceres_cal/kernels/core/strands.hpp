@@ -14,15 +14,26 @@ class Strands {
   public:
     static constexpr int POSE = 6;
 
-    // rows (size, strands, numbers): six of a private placement, those of what is shared, the residual. group: (strands)
-    // whose placement it is, of so many. logs (shares) are added to, and left (shares, rest, rest) is taken from.
+    // rows (size, strands, numbers): six of a private placement, those of what is shared, the residual. group:
+    // (strands) whose placement it is, of so many. logs (shares) are added to, and left (shares, rest, rest) is taken
+    // from.
     Strands(int size, int strands, int numbers, const double* rows, const int64_t* group, int64_t groups, int shares,
             const double* share, double* logs, double* left)
-        : size_(size), strands_(strands), numbers_(numbers), rest_(numbers - POSE), shares_(shares), groups_(groups),
-          rows_(rows), share_(share), group_(group), logs_(logs), left_(left),
+        : size_(size),
+          strands_(strands),
+          numbers_(numbers),
+          rest_(numbers - POSE),
+          shares_(shares),
+          groups_(groups),
+          rows_(rows),
+          share_(share),
+          group_(group),
+          logs_(logs),
+          left_(left),
           placed_(static_cast<size_t>(shares * groups * POSE * numbers)) {}
 
-    // The strands from first to last, all of the same eigenvalues (size): log det R, and what private placements have to do with.
+    // The strands from first to last, all of the same eigenvalues (size): log det R, and what private placements have
+    // to do with.
     void add(int first, int last, const double* values) {
         const int own = POSE * numbers_;
         std::vector<double> weights(static_cast<size_t>(shares_ * size_));
