@@ -197,7 +197,7 @@ def known_of(seen: Explained, observations: Observations, again: Again | None, w
         seen = replace(seen, end=settled.end)
     explanations = settled.explanations if settled else seen.explanations
     effects = seen.effects(observations)
-    warnings = (*(one.warning for one in explanations), *(one.warning for one in effects if one.amounts))
+    warnings = (*(one.warning for one in explanations), *(one.warning for one in effects if one.is_solved))
     posterior = None
     if assessed and watched.knows:
         seen, posterior = _known(seen, observations, conflicts, again)

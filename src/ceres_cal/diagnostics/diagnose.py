@@ -158,7 +158,7 @@ def _findings(tested: TestResults) -> Iterator[Finding]:
 
 def _solved(case: DiagnosisCase) -> set[tuple[str, str, str | None]]:
     """Effects by kind, subject and frame that the calibration solved for by itself."""
-    return {(one.kind, one.subject, one.frame) for one in case.effects if one.amounts}
+    return {(one.kind, one.subject, one.frame) for one in case.effects if one.is_solved}
 
 
 def _require_known(calibration: Calibration, observations: Observations, new_data: bool) -> None:

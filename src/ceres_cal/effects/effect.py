@@ -74,7 +74,7 @@ class EffectEstimate(Frozen, eq=True):
     Attributes:
         kind, subject, frame: which, as a `Finding` has them. sigma: the standard deviation of its amounts, in their
             own unit, that they were solved for under. probability: that there is such an effect.
-        sentence: what it is, in words. amounts: what was taken off the observations; of what only widens neither.
+        sentence: what it is, in words. amounts: what was taken off the observations; both empty of what only widens.
     """
 
     kind: str
@@ -84,6 +84,11 @@ class EffectEstimate(Frozen, eq=True):
     probability: float
     sentence: str
     amounts: tuple[Amount, ...]
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether its amounts were solved for; else what it may be is in the standard deviations alone."""
+        return bool(self.amounts)
 
     @property
     def warning(self) -> str:

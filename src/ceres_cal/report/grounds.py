@@ -197,15 +197,15 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     if quality.uncertainty.widening:
         yield "", f"{sentence(quality.uncertainty.widening)}."
     some = 0.005  # of a probability that is said
-    floors = [one for one in quality.calibration.effects if not one.amounts and one.probability >= some]
-    likely = [f"'{one.kind} by {mm(1e3 * one.sigma)}' is {one.probability:.0%} likely" for one in floors]
+    floors = [one for one in quality.calibration.effects if not one.is_solved and one.probability >= some]
+    likely = [f"'{one.kind} by {mm(1e3 * one.sigma)}' is {100.0 * one.probability:.0f} % likely" for one in floors]
     if likely:
         included = "the accuracy includes this, and --as-drawn leaves it out"
         yield "", f"By these observations {' and '.join(likely)}: {included}."
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     # What they do to places is in the maps, and what to the picture, in what is said of it.
     level = "" if quality.maps or level_of_px(quality.observed_px) == "good" else "care"
-    yield from ((level, f"{sentence(words)}.") for words in weak[:most_lines])
+    yield from ((level, f"{words}.") for words in weak[:most_lines])  # which begin with names as they are
     if len(weak) > most_lines:
         yield level, f"{len(weak) - most_lines} more such directions: see the numbers."
     if not weak and not disputed(quality):

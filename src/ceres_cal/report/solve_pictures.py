@@ -165,10 +165,10 @@ def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
 
 
 def _comparison(bundle: Calibration, closed: Calibration, curves: dict[str, Array], shares: Array) -> Table:
-    quantiles = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
+    percents = (10, 25, 50, 75, 90, 99)
     rows = [
-        (f"{q:.0%} of residuals below, px", *(fixed(float(np.interp(q, shares, c)), 3) for c in curves.values()))
-        for q in quantiles
+        (f"{p} % of residuals below, px", *(fixed(float(np.interp(p / 100.0, shares, c)), 3) for c in curves.values()))
+        for p in percents
     ]
     for name, camera in bundle.cameras.items():
         other = closed.cameras[name]
