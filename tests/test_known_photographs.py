@@ -178,4 +178,4 @@ def test_the_report_says_what_a_photograph_says_of_its_floor() -> None:
     assert not any("solved for" in one for one in calibration.warnings)
     (said,) = [line for _, line in grounds(quality_of(calibration, seen)) if "--as-drawn" in line]
     assert "bowed" not in said  # 0.04 %
-    assert f"'field sheared by 1.5\xa0mm' is {floors['field sheared']:.0%} likely" in said  # 1 %
+    assert f"'field sheared by 1.5\xa0mm' is {floors['field sheared'] * 100:.0f} % likely" in said  # 1 %
