@@ -253,11 +253,15 @@ async def serve(session: Session, port: int, opened: Callable[[str], None]) -> N
         await runner.cleanup()
         raise InputError(f"--port {port}: {error.strerror or error}: name another one, or none") from None
     server.port = runner.addresses[0][1]
+    takes_signals = threading.current_thread() is threading.main_thread()
     try:
-        if threading.current_thread() is threading.main_thread():
+        if takes_signals:
             asyncio.get_running_loop().add_signal_handler(signal.SIGINT, server.ended.set)
         opened(f"http://{HOST}:{server.port}/{server.token}/")
         await server.ended.wait()
     finally:
+        if takes_signals:  # Ctrl-C, too, says no more than that it ends, and would find a loop that is half closed
+            asyncio.get_running_loop().remove_signal_handler(signal.SIGINT)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         await server.close()
         await runner.cleanup()
