@@ -9,7 +9,7 @@ import pickle
 import runpy
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -43,6 +43,14 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.enable()
     if "hypothesis" not in sys.modules:  # which its plugin would import at the end all the same
         session.config.pluginmanager.unregister(name="hypothesispytest")
+
+
+@pytest.fixture(autouse=True)
+def _signals_kept() -> Iterator[None]:
+    """Whatever a test runs, signals go where they went: the next one's processes inherit what is ignored."""
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
 @pytest.fixture(scope="session")

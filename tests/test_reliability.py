@@ -36,7 +36,7 @@ from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.files import LIMIT, read_bytes, write_bytes
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.cli import main
+from ceres_cal.cli import main, terminal
 from ceres_cal.detect.images import read_grey
 from ceres_cal.formats import LookupTable
 from ceres_cal.observations import Observations
@@ -491,6 +491,16 @@ def test_sigterm_is_as_clean_as_ctrl_c(tmp_path: Path) -> None:
         assert (process.returncode, err, json.loads(out)["error"]) == (code, f"ceres-cal: {line}\n", line)
     late = program(*board, tmp_path / "out.json", "--timeout", "1.5")
     assert late.returncode == 2 and "--timeout: not done after 1.5 s, nothing was written" in late.stderr
+
+
+def test_sigterm_while_a_library_is_loaded(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Native modules make an ImportError of whatever comes while they begin."""
+
+    def load(arguments: list[str]) -> None:
+        raise ImportError("initialization failed") from terminal.Terminated()
+
+    monkeypatch.setattr(terminal, "chosen", load)
+    assert (main(["calibrate"]), capsys.readouterr().err) == (143, "ceres-cal: terminated: nothing was written\n")
 
 
 def test_a_solver_does_not_take_sigterm(tmp_path: Path) -> None:

@@ -69,7 +69,11 @@ def _serve(session: Session, port: int, browser: bool) -> None:
         if browser:
             webbrowser.open(address)
 
-    asyncio.run(serve(session, port, show))
+    try:
+        asyncio.run(serve(session, port, show))
+    except KeyboardInterrupt as end:  # quiet: Ctrl-C is how a page is ended, but SIGTERM is not
+        if type(end) is not KeyboardInterrupt:
+            raise
 
 
 def _sitting(files: Sequence[str], folder: Path, target: str) -> Sitting:

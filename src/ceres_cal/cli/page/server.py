@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import hmac
 import secrets
-import signal
-import threading
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
@@ -235,7 +233,7 @@ class Server:
 
 
 async def serve(session: Session, port: int, opened: Callable[[str], None]) -> None:
-    """Serve the page until somebody ends it.
+    """Serve the page until somebody ends it, or it is cancelled.
 
     Args:
         port: 0: one that is free. opened: called with the address once it answers.
@@ -253,15 +251,9 @@ async def serve(session: Session, port: int, opened: Callable[[str], None]) -> N
         await runner.cleanup()
         raise InputError(f"--port {port}: {error.strerror or error}: name another one, or none") from None
     server.port = runner.addresses[0][1]
-    takes_signals = threading.current_thread() is threading.main_thread()
     try:
-        if takes_signals:
-            asyncio.get_running_loop().add_signal_handler(signal.SIGINT, server.ended.set)
         opened(f"http://{HOST}:{server.port}/{server.token}/")
         await server.ended.wait()
     finally:
-        if takes_signals:  # Ctrl-C, too, says no more than that it ends, and would find a loop that is half closed
-            asyncio.get_running_loop().remove_signal_handler(signal.SIGINT)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
         await server.close()
         await runner.cleanup()
