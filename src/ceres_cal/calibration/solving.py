@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import attempt
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.threads import meanwhile
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
@@ -25,8 +25,8 @@ from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.posterior.assess import assess, with_doubts, with_roughness
-from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements
+from ceres_cal.posterior.assess import assess, with_doubts
+from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements, shifts_by_roughness
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress, Solution
 from ceres_cal.problem.information import Key, over
@@ -102,11 +102,12 @@ class Explained(Frozen):
     unsteady: Unsteady | None = None
     digest: Future[str] | None = None
 
-    @property
+    @cached_property
     def leaves_alike(self) -> bool:
-        """Whether the lens leaves the same in views of different placements."""
-        placed = of_placements(self.end.problem.sights)
-        return bool(len(placed)) and LeftOver.of_end(self.end, placed).asks_for_more
+        """Whether the lens leaves the same in one place of all views; one with a formula, in views of placements."""
+        rough, every = bool(self.end.problem.options.blank_lens.roughness), self.end.problem.sights
+        asked = every if rough else of_placements(every)
+        return bool(len(asked)) and LeftOver.of_end(self.end, asked).asks_for_more
 
     def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
         """See `Calibration.outlier_masks`."""
@@ -306,9 +307,10 @@ def _known(
     end, posterior = _assess(seen, observations, again)
     if again is None:
         require_lens_told(end.solution.estimate, posterior)
-    if again is None:
-        posterior = with_roughness(posterior, end, observations)
-    return replace(seen, end=end), with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
+    known = seen if end is seen.end else replace(seen, end=end)
+    if again is None and known.leaves_alike:
+        posterior = posterior.widened(*shifts_by_roughness(end, observations))
+    return known, with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
 def _assess(seen: Explained, observations: Observations, again: Again | None) -> tuple[RobustSolution, Posterior]:

@@ -1,7 +1,7 @@
 """The last step of a calibration: what is known of its numbers, and what to do where phi ran away.
 
-The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima,
-lenses rougher than their model, and other lenses.
+The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima, and
+other lenses.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.effects.effect import ShiftsAt
-from ceres_cal.observations import Observations
 from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
@@ -188,16 +187,6 @@ def with_doubts(
         return posterior
     known = posterior.by_model or posterior.information
     return posterior.with_alternatives(posterior.keys, *minima_of(others, estimate, known, posterior.half_width))
-
-
-def with_roughness(posterior: Posterior, end: RobustSolution, observations: Observations) -> Posterior:
-    """Wider by what the lens leaves in the same places of all views; one with a formula in views of placements."""
-    from ceres_cal.posterior.other_lenses import LeftOver, of_placements, shifts_by_roughness
-
-    rough, every = bool(end.problem.options.blank_lens.roughness), end.problem.sights
-    asked = every if rough else of_placements(every)
-    asks = bool(len(asked)) and LeftOver.of_end(end, asked).asks_for_more
-    return posterior.widened(*shifts_by_roughness(end, observations)) if asks else posterior
 
 
 def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:

@@ -27,7 +27,7 @@ from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import Amount, EffectEstimate
 from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RandomEffects, RepeatedAmounts
-from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
+from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model, without_shared
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
@@ -122,8 +122,8 @@ def find_unsteady(
     off = np.zeros((count, 2)) if before is None else before.displacement
     weights_of = partial(end.weights_of, observations)
 
-    def model_of(some: Problem, there: Estimate = estimate) -> Linearised:
-        return _model(observations, there, end.residuals, weights_of, off, some)
+    def model_of(some: Problem, there: Estimate = estimate, *, of_poses: bool = False) -> Linearised:
+        return _model(observations, there, end.residuals, weights_of, off, some, of_poses=of_poses)
 
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
@@ -133,7 +133,7 @@ def find_unsteady(
             continue
         few = set(some_sights(problem.sights.take(np.array(boards)), _ENOUGH).keys)
         some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
-        if before is not None or _seem_displaced(model_of(*some.built_as(estimate))):
+        if before is not None or _seem_displaced(model_of(*some.built_as(estimate), of_poses=True)):
             model = model_of(some)
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own:
@@ -166,10 +166,15 @@ def _model(
     weights_of: Callable[[Equations], Weights],
     off: Array,
     problem: Problem,
+    *,
+    of_poses: bool = False,
 ) -> Linearised:
     """Of a problem's sights, with the residuals before anything was taken off; views that were taken out as a whole
     speak again, for they may be those that are displaced most. What takes part counts whole: a robust weight is that of
     an observation whose view is displaced.
+
+    Args:
+        of_poses: whether nothing else is free, which takes half the time.
     """
     equations = write_equations(observations, problem.sights, estimate, there)
     along = np.sum(off[equations.observation] * equations.direction, axis=1)
@@ -178,6 +183,8 @@ def _model(
     silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0
     used = weights.used | silent[equations.sight]
     weights = Weights(weights.inverse_sigma, used, np.ones_like(weights.robust))
+    if of_poses:
+        return without_shared(problem, estimate, equations, weights, ())[0]
     return make_linear_model(problem, estimate, equations, weights)
 
 
