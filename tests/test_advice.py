@@ -272,6 +272,16 @@ def test_what_phi_leaves_open_is_promised_from_unknown() -> None:
     assert advice.best is not None and advice.best.measurement.words == "measure the camera's height to 20 mm"
 
 
+def test_a_height_that_the_camera_may_be_below() -> None:
+    """1 degree: it hangs at 2 to 8 m, and may show nothing of what is at 3 m."""
+    calibration = calibrated("whole field, 1 deg")
+    high_m = 3.0
+    nodes = _prepared(calibration, None, high_m)[1].possible
+    assert min(there.camera_at("overhead").position[2] for _, there in nodes) < high_m
+    advice = advise(calibration, height_m=high_m)
+    assert advice.best is not None and first_of(advice)["line"].after.worst_mm == np.inf
+
+
 def test_promises_are_ranked_and_a_second_step_brings_more() -> None:
     advice = advised("whole field, 8 deg")
     worst = [promise.after.worst_mm for promise in advice.promises]

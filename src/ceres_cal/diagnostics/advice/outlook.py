@@ -173,7 +173,9 @@ def _errors(known: Spread, slopes: Array) -> Errors:
 
 
 def _errors_of(variances: Array) -> Errors:
-    """The errors of places whose x and y have variances (N,) together, m^2."""
+    """The errors of places whose x and y have variances (N,) together, m^2; far up a valley the image shows none."""
+    if not len(variances):
+        return Errors(np.inf, np.inf)
     sd = 1e3 * np.sqrt(variances)
     return Errors(float(np.max(sd)), float(np.mean(sd)))
 
