@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import HEIGHTS_M, at_height
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.scene.camera import in_image
@@ -68,6 +69,9 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
 
     Args:
         project: as the file has it, points (N, 3) m -> pixels (N, 2). box_m: of the field, None where there is none.
+
+    Raises:
+        InputError: parts of the field have no place in what the file says.
     """
     rounds = 8  # of bringing a place to where another camera shows it in the same pixel
     grid = (122, 91)  # pixels: finer than that of the fit
@@ -88,7 +92,13 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
             place = place + there - camera.locate(shown, height_m)
         return place
 
-    return ExportLoss(station, field_error_mm(camera, locate, field_pixels(camera, box_m), box_m, HEIGHTS_M), image_px)
+    field_mm = field_error_mm(camera, locate, field_pixels(camera, box_m), box_m, HEIGHTS_M)
+    if not np.all(np.isfinite(list(field_mm.values()))):
+        raise InputError(
+            f"station {station!r}: the camera sees so wide that nothing in this format shows all of the field as it "
+            "does: take another format, such as table, or name a lens that this one holds"
+        )
+    return ExportLoss(station, field_mm, image_px)
 
 
 def as_foreign(
@@ -121,5 +131,7 @@ def loss_words(loss: ExportLoss) -> list[str]:
         for height_m, (rms, worst) in loss.field_mm.items()
     ]
     if loss.image_px is not None:
-        lines.append("{}: {:.3g} px rms, {:.3g} px at most, over the image".format(loss.station, *loss.image_px))
+        shown = np.isfinite(loss.image_px[0])
+        off = "{:.3g} px rms, {:.3g} px at most".format(*loss.image_px) if shown else "some of it is not shown at all"
+        lines.append(f"{loss.station}: {off}, over the image")
     return lines

@@ -34,6 +34,8 @@ _NAMES = {
 """Model -> the kind of our lenses that it is, and the names of its coefficients there; "" of those that none has."""
 TO_HOLD = ("opencv12", THIN_PRISM_FISHEYE)
 """Models for lenses that they hold exactly: no other lens is fitted by them."""
+# Depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow.
+_ACROSS = 0.1
 _GRID = (41, 31)  # pixels of the image over which a fit is made
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
 
@@ -121,9 +123,10 @@ class ForeignCamera(Frozen):
             blanks += [] if model in TO_HOLD else [replace(one, coefficients=(0.0,) * len(numbers))]
         pixels = image_grid(camera.image_size)
         rays = camera.rays(pixels)
-        known = np.isfinite(rays[:, 0])
+        known, ahead = np.isfinite(rays[:, 0]), rays[:, 2] > _ACROSS
         fits = [cls.fitted(blank, rays[known], pixels[known]) for blank in blanks]
-        return min(fits, key=lambda fit: fit.error_px[0])
+        # Most models show nothing across or behind: they are told apart by the rest.
+        return min(fits, key=lambda fit: _error(fit.project_rays(rays[ahead]), pixels[ahead])[0])
 
     @property
     def pose(self) -> Pose:
@@ -173,7 +176,7 @@ class ForeignCamera(Frozen):
         count = len(start.coefficients)
         numbers = np.array([*start.focal, *start.centre, *start.coefficients])
         sizes = np.array([start.focal[0]] * 2 + [start.focal[0]] * 2 + [1.0] * count)
-        ahead = rays[:, 2] > 0.0
+        ahead = rays[:, 2] > _ACROSS
 
         def made(v: Array) -> ForeignCamera:
             return replace(start, focal=_two(v[:2]), centre=_two(v[2:4]), coefficients=tuple(v[4:].tolist()))
@@ -290,9 +293,8 @@ def nearest(camera: Camera, lens: Lens) -> Camera:
 
 def opencv_models(camera: Camera) -> tuple[str, ...]:
     """Those of OpenCV's models that may come near a camera: its fisheye where that is our lens, or sees across."""
-    across = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
     is_one = ForeignCamera.coefficients_of(camera.lens, FISHEYE) is not None
-    fisheye = is_one or bool(np.any(camera.rays(image_grid(camera.image_size))[:, 2] < across))
+    fisheye = is_one or bool(np.any(camera.rays(image_grid(camera.image_size))[:, 2] < _ACROSS))
     return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
 
 
