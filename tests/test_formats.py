@@ -1,9 +1,9 @@
 """The table of export formats: a format that nobody has heard of is exported to like the built-in ones."""
 
 import json
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -15,17 +15,16 @@ from ceres_cal.formats import EXPORT_FORMATS, Exported, ExportFormat, ExportLoss
 from ceres_cal.simulate import Disturbance, simulate
 
 
-@dataclass(frozen=True)
-class ToyOptions:
-    digits: int = field(default=3, metadata={"help": "after the point"})
-    comment: str = field(default="", metadata={"help": "what to say of it"})
-
-
-def write_toy(request: ExportRequest) -> Exported:
+def write_toy(
+    request: ExportRequest,
+    *,
+    digits: Annotated[int, "after the point"] = 3,
+    comment: Annotated[str, "what to say of it"] = "",
+) -> Exported:
     """phi of each station's camera, to so many digits; what was there before stays on top."""
     cameras = {name: request.calibration.station(name) for name in request.stations}
-    lines = [f"{name} {camera.phi:.{request.options.digits}f}" for name, camera in cameras.items()]
-    lines = [request.options.comment, *lines] if request.options.comment else lines
+    lines = [f"{name} {camera.phi:.{digits}f}" for name, camera in cameras.items()]
+    lines = [comment, *lines] if comment else lines
     losses = tuple(ExportLoss(name, {0.0: (0.1, 0.2), 0.15: (0.3, 0.4)}, (0.01, 0.02)) for name in cameras)
     before = request.existing or b""
     return Exported(
@@ -37,9 +36,7 @@ def write_folder(request: ExportRequest) -> Exported:
     return Exported({f"{name}.txt": b"here" for name in request.stations}, (), "a file for each station")
 
 
-TOY = ExportFormat(
-    "toy", "for this test", (".toy", ".gz.toy"), write_toy, ToyOptions, several_stations=True, edits=True
-)
+TOY = ExportFormat("toy", "for this test", (".toy", ".gz.toy"), write_toy, several_stations=True, edits=True)
 FOLDER = ExportFormat("folder", "for this test, too", (), write_folder)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
@@ -193,13 +193,10 @@ def _escaped(text: str) -> str:
 def _of_forms(forms: Iterable[Any]) -> Mapping[str, list[str]]:
     """Every option of some formats, with what it means to each of them."""
 
-    def each() -> Iterator[tuple[str, str]]:
-        for form in forms:
-            yield from ((one.name, f"{form.name}: {one.metadata.get('help', '')}") for one in fields(form.options))
-
     every: dict[str, list[str]] = {}
-    for name, text in each():
-        every.setdefault(name, []).append(text)
+    for form in forms:
+        for name, (_, text) in form.options.items():
+            every.setdefault(name, []).append(f"{form.name}: {text}")
     return every
 
 

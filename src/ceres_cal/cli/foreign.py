@@ -85,11 +85,9 @@ export_table = replace(
 
 def _typed(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
     """What was given of the formats' options, of the types that they have."""
-    from typing import get_type_hints
-
     import msgspec
 
-    types = {name: kind for form in forms for name, kind in get_type_hints(form.options).items()}
+    types = {name: kind for form in forms for name, (kind, _) in form.options.items()}
     options = {}
     for name, text in given.items():
         if name not in types:

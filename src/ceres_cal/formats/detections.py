@@ -9,14 +9,14 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ceres_cal.base.archives import read_foreign_npz
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.frozen import replace
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
@@ -25,23 +25,20 @@ from ceres_cal.observations import NO_CURVES, Curves, Observations, Points, View
 from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, target_named, targets_by_name
 
 
-class CornerOptions(Frozen, eq=True):
-    """What the board was, and the image: the file does not say it."""
-
-    columns: int = field(default=0, metadata={"help": "corners along a row of the board"})
-    rows: int = field(default=0, metadata={"help": "rows of corners"})
-    square: float = field(default=0.0, metadata={"help": "distance of the corners, m"})
-    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px"})
-    camera: str = field(default="camera", metadata={"help": "name of the camera; default: camera"})
-    sigma_px: float = field(default=1.0, metadata={"help": "of a corner at level 0; default: 1"})
-
-
-def _read_corners(request: ImportRequest) -> Observations:
+def _read_corners(
+    request: ImportRequest,
+    *,
+    columns: Annotated[int, "corners along a row of the board"] = 0,
+    rows: Annotated[int, "rows of corners"] = 0,
+    square: Annotated[float, "distance of the corners, m"] = 0.0,
+    image_size: Annotated[str, "WIDTHxHEIGHT px"] = "",
+    camera: Annotated[str, "name of the camera; default: camera"] = "camera",
+    sigma_px: Annotated[float, "of a corner at level 0; default: 1"] = 1.0,
+) -> Observations:
     """`# filename x y level`, a line for each corner, row by row; '-' or a level below 0 was not found."""
-    options = request.options
-    if min(options.columns, options.rows) < 2 or not options.square > 0.0:
+    if min(columns, rows) < 2 or not square > 0.0:
         raise InputError("the board is not said in the file: give columns, rows and square (m)")
-    board = checkerboard(options.columns, options.rows, options.square)
+    board = checkerboard(columns, rows, square)
     found: dict[str, list[tuple[float, float, float]]] = {}
     for number, line in enumerate(request.text.splitlines(), start=1):
         words = line.partition("#")[0].split()
@@ -59,33 +56,26 @@ def _read_corners(request: ImportRequest) -> Observations:
     for name, corners in whole.items():
         if len(corners) != len(board.points):
             raise InputError(f"image {name!r} has {len(corners)} corners, the board {len(board.points)}")
-    size, camera = parse_size(options.image_size), options.camera
+    size = parse_size(image_size)
     frames = {Path(name).stem: corners[:, :2] for name, corners in whole.items()}
     if len(frames) != len(whole):
         raise InputError("two images are called alike but for their folders: import one camera at a time")
     bare = Observations.from_points(frames, board, size, camera=camera)
     level = np.concatenate([corners[np.isfinite(corners[:, 0]), 2] for corners in whole.values()])
-    return replace(bare, points=replace(bare.points, sigma_px=options.sigma_px * level))
+    return replace(bare, points=replace(bare.points, sigma_px=sigma_px * level))
 
 
 # ---- named columns --------------------------------------------------------------------------------------------------
 
 
-class TableOptions(Frozen, eq=True):
-    """What the columns do not say."""
-
-    target: str = field(default="", metadata={"help": "whose features are named, such as ssl-b; without it X_m, Y_m"})
-    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px"})
-    camera: str = field(default="camera", metadata={"help": "name of the camera where no column says it"})
-    moves: bool = field(default=False, metadata={"help": "whether the target lay elsewhere in every frame (true)"})
-
-
 _COLUMNS = ("frame", "camera", "station", "placement", "point", "curve", "side", "x_px", "y_px", "sigma_px")
 _PLACE = ("X_m", "Y_m", "Z_m")
 _BYTES_PER_CELL = 150  # of memory, in a row by names
+_ZIP = b"PK"  # how an NPZ file begins
 
 
-def _read_csv(request: ImportRequest) -> Observations:
+def _csv_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
+    """Rows by names, and the names."""
     marks = request.content.count(b",") + request.content.count(b"\n")
     require_room(_BYTES_PER_CELL * marks + 2.0 * len(request.content), str(request.path))
     reader = csv.DictReader(io.StringIO(request.text))
@@ -93,21 +83,31 @@ def _read_csv(request: ImportRequest) -> Observations:
         rows = list(reader)
     except csv.Error as error:
         raise InputError(f"not a CSV file (line {reader.line_num}): {error}") from None
-    return _from_rows(rows, tuple(reader.fieldnames or ()), request.options)
+    return rows, tuple(reader.fieldnames or ())
 
 
-def _read_npz(request: ImportRequest) -> Observations:
+def _npz_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
+    """Rows by names, and the names."""
     columns = read_foreign_npz(request.content, str(request.path))
     require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
     lengths = {array.shape for array in columns.values()}
     if len(lengths) != 1 or any(len(shape) != 1 for shape in lengths):
         raise InputError(f"the columns must be of one dimension and as long as one another, not {sorted(lengths)}")
     rows = [dict(zip(columns, map(str, row), strict=True)) for row in zip(*columns.values(), strict=True)]
-    return _from_rows(rows, tuple(columns), request.options)
+    return rows, tuple(columns)
 
 
-def _from_rows(rows: Sequence[Mapping[str, Any]], names: tuple[str, ...], options: TableOptions) -> Observations:
+def _read_table(
+    request: ImportRequest,
+    *,
+    target: Annotated[str, "whose features are named, such as ssl-b; without it X_m, Y_m"] = "",
+    image_size: Annotated[str, "WIDTHxHEIGHT px"] = "",
+    camera: Annotated[str, "name of the camera where no column says it"] = "camera",
+    moves: Annotated[bool, "whether the target lay elsewhere in every frame (true)"] = False,
+) -> Observations:
     """Rows under named columns; each shows a point or a curve of the target, or a place in the world."""
+    is_npz = request.path.suffix.lower() == ".npz" or request.content.startswith(_ZIP)
+    rows, names = (_npz_rows if is_npz else _csv_rows)(request)
     if len(set(names)) < len(names):
         raise InputError("a column is there twice: keep one of them")
     if unknown := [name for name in names if name not in (*_COLUMNS, *_PLACE)]:
@@ -117,27 +117,27 @@ def _from_rows(rows: Sequence[Mapping[str, Any]], names: tuple[str, ...], option
     if not rows:
         raise InputError("it holds no row")
     places = [_place(row, number) for number, row in enumerate(rows, start=2)] if "X_m" in names else []
-    target = _target(options.target, places)
+    drawn = _target(target, places)
     views: dict[View, int] = {}
     points, curves = [], []
     for number, row in enumerate(rows, start=2):
-        view = views.setdefault(_view(row, options, target), len(views))
+        view = views.setdefault(_view(row, camera, moves=moves or drawn.movable), len(views))
         pixel = [_number(row, name, number) for name in ("x_px", "y_px")]
         sigma = _number(row, "sigma_px", number) if row.get("sigma_px") else 1.0
         if row.get("curve"):
             side = row.get("side") or "centre"
             if side not in SIDES:
                 raise InputError(f"line {number}: side {side!r} is unknown: {', '.join(SIDES)}")
-            curves.append((view, _index(target.curve_index, row["curve"], number), pixel, sigma, SIDES[side]))
+            curves.append((view, _index(drawn.curve_index, row["curve"], number), pixel, sigma, SIDES[side]))
         else:
             name = _place_name(places[number - 2]) if places else row.get("point") or ""
-            points.append((view, _index(target.point_index, name, number), pixel, sigma))
+            points.append((view, _index(drawn.point_index, name, number), pixel, sigma))
     points.sort(key=lambda one: one[0])
     curves.sort(key=lambda one: one[0])
-    size = parse_size(options.image_size)
+    size = parse_size(image_size)
     cameras = dict.fromkeys((view.camera for view in views), size)
     return Observations(
-        {"target": target}, cameras, tuple(views), Points(*_split(points, 4)), Curves(*_split(curves, 5))
+        {"target": drawn}, cameras, tuple(views), Points(*_split(points, 4)), Curves(*_split(curves, 5))
     )
 
 
@@ -147,9 +147,8 @@ def _split(rows: Sequence[tuple[Any, ...]], count: int) -> list[Any]:
     return columns
 
 
-def _view(row: Mapping[str, Any], options: TableOptions, target: Target) -> View:
-    frame, camera = row.get("frame") or "0", row.get("camera") or options.camera
-    moves = options.moves or target.movable
+def _view(row: Mapping[str, Any], camera: str, *, moves: bool) -> View:
+    frame, camera = row.get("frame") or "0", row.get("camera") or camera
     return View(
         frame, camera, row.get("station") or camera, "target", row.get("placement") or (frame if moves else None)
     )
@@ -252,9 +251,9 @@ def _any(_: bytes) -> bool:
 
 _NAMED = f"columns {', '.join((*_COLUMNS, *_PLACE))}"
 FORMATS = (
-    ImportFormat("corners-vnl", "mrcal's corners.vnl", (".vnl",), _any, _read_corners, CornerOptions),
-    ImportFormat("csv", f"observations as CSV, {_NAMED}", (".csv",), _any, _read_csv, TableOptions),
-    ImportFormat("npz-columns", "the same as an array for each column", (".npz",), _any, _read_npz, TableOptions),
+    ImportFormat("corners-vnl", "mrcal's corners.vnl", (".vnl",), _any, _read_corners),
+    ImportFormat("csv", f"observations as CSV, {_NAMED}", (".csv",), _any, _read_table),
+    ImportFormat("npz-columns", "the same as an array for each column", (".npz",), _any, _read_table),
     ImportFormat("mrcal-observations", "what a .cameramodel was made from", (".cameramodel",), _never, _read_mrcal),
     ImportFormat("colmap-observations", "the keypoints of a COLMAP model", (), _never, _read_colmap),
 )

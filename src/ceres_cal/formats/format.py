@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 from msgspec import Struct
 
@@ -83,19 +83,13 @@ class ExportRequest(Struct, frozen=True, eq=False):
     Attributes:
         stations: names, one or, where the format holds several, any number.
         ending: of the file that is asked for, one of the format's.
-        options: an instance of the format's options.
         existing: content of the file of that name before; only for formats that edit it, None where there is none.
     """
 
     calibration: Calibration
     stations: tuple[str, ...]
     ending: str
-    options: Any
     existing: bytes | None = None
-
-
-class NoOptions(Frozen, eq=True):
-    """Of a format that leaves nothing to choose."""
 
 
 class ExportFormat(Struct, frozen=True):
@@ -104,20 +98,32 @@ class ExportFormat(Struct, frozen=True):
     Attributes:
         name: as it is asked for. description: one line.
         endings: that its file may have, the usual one first; none where it is a folder of files.
-        export: makes it; raises InputError where the calibration cannot be said in the format.
-        options: frozen dataclass of numbers and texts, each with a default and metadata {"help": ...}: on the command
-            line --error-mm for error_mm.
+        export: makes it; raises InputError where the calibration cannot be said in the format. Its options are what it
+            takes by keyword: each Annotated[type, help], with a default; on the command line --error-mm for error_mm.
         several_stations: whether a file holds any number of stations. edits: whether an existing file is edited.
     """
 
     name: str
     description: str
     endings: tuple[str, ...]
-    export: Callable[[ExportRequest], Exported]
-    options: type[Any] = NoOptions
+    export: Callable[..., Exported]
     several_stations: bool = False
     edits: bool = False
 
+    @property
+    def options(self) -> dict[str, tuple[Any, str]]:
+        """Type and help of each option, by name."""
+        return _options(self.export)
+
+
+def _options(work: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
+    names = getattr(work, "__kwdefaults__", None)
+    hints = get_type_hints(work, include_extras=True) if names else {}
+    return {name: get_args(hints[name]) for name in names or ()}
+
+
+ImageSize = Annotated[str, "WIDTHxHEIGHT px, where the file does not say it"]
+"""An option of several formats."""
 
 # ---- reading --------------------------------------------------------------------------------------------------------
 
@@ -126,12 +132,11 @@ class ImportRequest(Struct, frozen=True, eq=False):
     """What is to be read.
 
     Attributes:
-        path: of the file or folder. content: of the file, empty of a folder. options: an instance of the format's.
+        path: of the file or folder. content: of the file, empty of a folder.
     """
 
     path: Path
     content: bytes
-    options: Any
 
     @property
     def text(self) -> str:
@@ -145,16 +150,20 @@ class ImportFormat(Struct, frozen=True):
     Attributes:
         name: as it is asked for; that of the export format, where there is one. description: one line.
         endings: that its file may have. recognises: whether a file that ends so is one, by its content.
-        read: makes what it holds; raises InputError, whose text need not name the file.
-        options: as those of an `ExportFormat`.
+        read: makes what it holds; raises InputError, whose text need not name the file. Its options are like those of
+            an `ExportFormat`.
     """
 
     name: str
     description: str
     endings: tuple[str, ...]
     recognises: Callable[[bytes], bool]
-    read: Callable[[ImportRequest], Calibration | Observations]
-    options: type[Any] = NoOptions
+    read: Callable[..., Calibration | Observations]
+
+    @property
+    def options(self) -> dict[str, tuple[Any, str]]:
+        """Type and help of each option, by name."""
+        return _options(self.read)
 
 
 class ImportedCameras(Frozen):

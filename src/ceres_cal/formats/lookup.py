@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,7 @@ from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
@@ -172,25 +172,18 @@ def _rays(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
 # ---- as an export format --------------------------------------------------------------------------------------------
 
 
-class LookupOptions(Frozen, eq=True):
-    """How fine the table is: see `make_lookup_table`."""
-
-    error_mm: float = field(default=0.1, metadata={"help": "largest interpolation error on the field; default: 0.1"})
-    step_px: int | None = field(
-        default=None, metadata={"help": "distance of the nodes; default: the widest that keeps to the error"}
-    )
-
-    def __post_init__(self) -> None:
-        if not self.error_mm > 0.0:
-            raise InputError(f"error_mm must be above 0, not {self.error_mm:g}")
-
-
-def _export(request: ExportRequest) -> Exported:
+def _export(
+    request: ExportRequest,
+    *,
+    error_mm: Annotated[float, "largest interpolation error on the field; default: 0.1"] = 0.1,
+    step_px: Annotated[int | None, "distance of the nodes; default: the widest that keeps to the error"] = None,
+) -> Exported:
     from ceres_cal.posterior.uncertainty import field_grid  # not for the command line's help
 
-    (station,) = request.stations
-    box, options = field_grid(request.calibration.targets), request.options
-    table = make_lookup_table(request.calibration.station(station), station, *box, options.error_mm, options.step_px)
+    if not error_mm > 0.0:
+        raise InputError(f"error_mm must be above 0, not {error_mm:g}")
+    (station,), box = request.stations, field_grid(request.calibration.targets)
+    table = make_lookup_table(request.calibration.station(station), station, *box, error_mm, step_px)
     nodes = (len(table.x_px), len(table.y_px))
     return Exported(
         table.to_bytes(),
@@ -200,4 +193,4 @@ def _export(request: ExportRequest) -> Exported:
     )
 
 
-FORMATS = (ExportFormat("table", "a look-up table from pixels to the field", (".npz",), _export, LookupOptions),)
+FORMATS = (ExportFormat("table", "a look-up table from pixels to the field", (".npz",), _export),)

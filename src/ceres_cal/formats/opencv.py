@@ -7,19 +7,20 @@ src opencv/opencv samples/cpp/calibration.cpp, stereo_calib.cpp.
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import (
     Exported,
     ExportFormat,
     ExportLoss,
     ExportRequest,
+    ImageSize,
     ImportedCameras,
     ImportFormat,
     ImportRequest,
@@ -111,13 +112,6 @@ def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-class OpenCvOptions(Frozen, eq=True):
-    """What a file may not say."""
-
-    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px, where the file does not say it"})
-    camera: str = field(default="camera", metadata={"help": "name for the camera; default: camera"})
-
-
 def _require_shallow(text: str) -> None:
     """InputError for elements within elements by the dozen: OpenCV reads them by recursion, and dies of thousands."""
     deepest, depth = 32, 0
@@ -127,7 +121,12 @@ def _require_shallow(text: str) -> None:
             raise InputError(f"not a FileStorage of OpenCV: more than {deepest} elements within each other")
 
 
-def _read(request: ImportRequest) -> Any:
+def _read(
+    request: ImportRequest,
+    *,
+    image_size: ImageSize = "",
+    camera: Annotated[str, "name for the camera; default: camera"] = "camera",
+) -> Any:
     import cv2
 
     _require_shallow(request.text)
@@ -142,17 +141,17 @@ def _read(request: ImportRequest) -> Any:
     stations = _text(storage, "stations").split()
     if stereo:
         stations = stations if len(stations) == 2 else ["left", "right"]
-        cameras = {name: _camera(storage, request, str(n)) for n, name in enumerate(stations, start=1)}
+        cameras = {name: _camera(storage, image_size, str(n)) for n, name in enumerate(stations, start=1)}
         if cameras[stations[1]].cam_from_world is None:
             first = cameras[stations[0]].pose
             between = Pose(_mat(storage, ("R",), (3, 3)), _mat(storage, ("T",), (3, 1)).ravel())
             cameras[stations[1]] = replace(cameras[stations[1]], cam_from_world=between @ first)
         return ImportedCameras(cameras).calibration("OpenCV")
-    name = stations[0] if stations else request.options.camera
-    return ImportedCameras({name: _camera(storage, request, "")}).calibration("OpenCV")
+    name = stations[0] if stations else camera
+    return ImportedCameras({name: _camera(storage, image_size, "")}).calibration("OpenCV")
 
 
-def _camera(storage: Any, request: ImportRequest, number: str) -> ForeignCamera:
+def _camera(storage: Any, image_size: str, number: str) -> ForeignCamera:
     matrix = _mat(storage, (f"M{number}",) if number else _MATRIX, (3, 3))
     coefficients = _mat(storage, (f"D{number}",) if number else _COEFFICIENTS, None).ravel()
     poses = _mat(storage, (f"extrinsic_parameters{number}",), None, needed=False)
@@ -161,14 +160,14 @@ def _camera(storage: Any, request: ImportRequest, number: str) -> ForeignCamera:
         pose = Pose.exp(poses[0])
         pose = pose if np.any(poses) else None
     fisheye = _text(storage, "distortion_model") == FISHEYE
-    return ForeignCamera.opencv(_size(storage, request), matrix, coefficients, pose, fisheye=fisheye)
+    return ForeignCamera.opencv(_size(storage, image_size), matrix, coefficients, pose, fisheye=fisheye)
 
 
-def _size(storage: Any, request: ImportRequest) -> tuple[int, int]:
+def _size(storage: Any, image_size: str) -> tuple[int, int]:
     sizes = [_real(storage, names) for names in (_WIDTH, _HEIGHT)]
     if all(size is not None and size.is_integer() and size > 0.0 for size in sizes):
         return int(sizes[0] or 0), int(sizes[1] or 0)
-    return parse_size(request.options.image_size)
+    return parse_size(image_size)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -227,5 +226,5 @@ def _recognises(content: bytes) -> bool:
 _WRITTEN = "OpenCV's FileStorage of one camera, or of two as stereo"
 FORMATS = (
     ExportFormat("opencv", _WRITTEN, _ENDINGS, _export, several_stations=True),
-    ImportFormat("opencv", "OpenCV's FileStorage", _ENDINGS, _recognises, _read, OpenCvOptions),
+    ImportFormat("opencv", "OpenCV's FileStorage", _ENDINGS, _recognises, _read),
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,9 +71,9 @@ def prepare_export(
             calibration,
             _stations(calibration, form, stations),
             _ending(form, path),
-            form.options(**_known_options(form, options)),
             read_bytes(path) if form.edits and path.exists() else None,
-        )
+        ),
+        **_known_options(form, options),
     )
 
 
@@ -94,7 +93,7 @@ def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> C
     content = b"" if path.is_dir() else read_bytes(path)
     chosen = _import_format(path, content, form)
     with naming(path):
-        made = chosen.read(ImportRequest(path, content, chosen.options(**_known_options(chosen, options))))
+        made = chosen.read(ImportRequest(path, content), **_known_options(chosen, options))
         if isinstance(made, Observations):
             made.require_inside()
     return made
@@ -162,8 +161,7 @@ def _ending(form: ExportFormat, path: Path) -> str:
 
 
 def _known_options(form: ExportFormat | ImportFormat, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    known = [one.name for one in fields(form.options)]
     for name in options:
-        if name not in known:
-            raise InputError(no_such(f"option of format {form.name}", name, known))
+        if name not in form.options:
+            raise InputError(no_such(f"option of format {form.name}", name, form.options))
     return options

@@ -7,13 +7,12 @@ src ros-perception/image_common camera_calibration_parsers/src/parse_yml.cpp.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.transforms import Pose, quaternion, rotation_of
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, loss_words
@@ -23,17 +22,15 @@ from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
 _MODELS = {"opencv5": "plumb_bob", "opencv8": "rational_polynomial", FISHEYE: "equidistant"}
 
 
-class RosOptions(Frozen, eq=True):
-    """Names of frames."""
-
-    world_frame: str = field(default="field", metadata={"help": "parent of the static transform; default: field"})
-
-
-def _export(request: ExportRequest) -> Exported:
+def _export(
+    request: ExportRequest,
+    *,
+    world_frame: Annotated[str, "parent of the static transform; default: field"] = "field",
+) -> Exported:
     (name,), ((foreign,), losses) = request.stations, as_foreign(request, lambda _: tuple(_MODELS))
     projection = np.column_stack([foreign.matrix, np.zeros(3)])
     (width, height), pose = foreign.image_size, foreign.pose.inverse
-    frames = {"frame_id": request.options.world_frame, "child_frame_id": f"{name}_optical_frame"}
+    frames = {"frame_id": world_frame, "child_frame_id": f"{name}_optical_frame"}
     x, y, z = pose.translation.tolist()
     qx, qy, qz, qw = quaternion(pose.rotation).tolist()
     data = {
@@ -97,6 +94,6 @@ def _recognises(content: bytes) -> bool:
 
 
 FORMATS = (
-    ExportFormat("ros", "ROS camera_info, the pose beside it", (".yaml", ".yml"), _export, RosOptions),
+    ExportFormat("ros", "ROS camera_info, the pose beside it", (".yaml", ".yml"), _export),
     ImportFormat("ros", "ROS camera_info", (".yaml", ".yml"), _recognises, _read),
 )

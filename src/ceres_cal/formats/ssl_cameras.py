@@ -8,13 +8,12 @@ height would trade off.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.base.words import HEIGHTS_M
@@ -30,14 +29,9 @@ NAMES = ("focal_length", "principal_point_x", "principal_point_y", "distortion",
 _POSITION = tuple(f"derived_camera_world_{name}" for name in _SHIFT)
 
 
-class SslOptions(Frozen, eq=True):
-    """Whose camera is whose."""
-
-    camera_id: str = field(
-        default="",
-        metadata={"help": "ids of the stations' cameras, with commas between; default: the number that each name ends "
-                  "in, else 0, 1, ..."},
-    )  # fmt: skip
+CameraIds = Annotated[
+    str, "ids of the stations' cameras, with commas between; default: the number that each name ends in, else 0, 1, ..."
+]
 
 
 def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
@@ -59,11 +53,11 @@ def _last_digits(name: str) -> str:
 
 
 def to_entries(
-    request: ExportRequest, box_m: Box | None
+    request: ExportRequest, camera_id: str, box_m: Box | None
 ) -> tuple[dict[int, dict[str, Any]], list[ExportLoss], list[str]]:
     """id -> SSL_GeometryCameraCalibration as plain data; what is lost; what to know of those who will read it."""
     entries, losses, warnings = {}, [], []
-    ids = camera_ids(request.stations, request.options.camera_id)
+    ids = camera_ids(request.stations, camera_id)
     for name, number in zip(request.stations, ids, strict=True):
         camera = request.calibration.station(name)
         entry = to_entry(_nearest(camera, box_m), number)

@@ -10,16 +10,23 @@ from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base.errors import InputError, attempt
-from ceres_cal.base.frozen import Frozen, field
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import (
+    Exported,
+    ExportFormat,
+    ExportRequest,
+    ImageSize,
+    ImportedCameras,
+    ImportFormat,
+    ImportRequest,
+)
 from ceres_cal.formats.loss import field_box
-from ceres_cal.formats.ssl_cameras import SslOptions, as_before, to_cameras, to_entries
+from ceres_cal.formats.ssl_cameras import CameraIds, as_before, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import geometry_from_bytes, to_bytes
 from ceres_cal.formats.yaml_files import read_yaml, yaml_text
 
 
-def geometry_of(request: ExportRequest, before: Mapping[str, Any]) -> tuple[dict[str, Any], Exported]:
+def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any]) -> tuple[dict[str, Any], Exported]:
     """SSL_GeometryData as plain data, with the field and the other cameras of what was there before.
 
     Raises:
@@ -34,7 +41,7 @@ def geometry_of(request: ExportRequest, before: Mapping[str, Any]) -> tuple[dict
     else:
         raise InputError("the message needs a field, and the calibration has none: export into a file that has one, "
                          "such as one that `ceres-cal listen` wrote")  # fmt: skip
-    entries, losses, warnings = to_entries(request, field_box(targets))
+    entries, losses, warnings = to_entries(request, camera_id, field_box(targets))
     others = {int(entry["camera_id"]): dict(entry) for entry in before.get("calib") or []}
     written = {number: as_before(entry, others.get(number)) for number, entry in entries.items()}
     cameras = dict(sorted({**others, **written}.items()))
@@ -46,16 +53,16 @@ def geometry_of(request: ExportRequest, before: Mapping[str, Any]) -> tuple[dict
     return data, Exported(b"", tuple(losses), words, facts, tuple(warnings))
 
 
-def _export_packet(request: ExportRequest) -> Exported:
+def _export_packet(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
     before = {} if request.existing is None else geometry_from_bytes(request.existing)
-    data, exported = geometry_of(request, before)
+    data, exported = geometry_of(request, camera_id, before)
     return exported.with_content(to_bytes("SSL_GeometryData", data))
 
 
-def _export_yaml(request: ExportRequest) -> Exported:
+def _export_yaml(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
     text = "" if request.existing is None else request.existing.decode("utf-8", errors="replace")
     before = _checked(read_yaml(text)) if text.strip() else {}
-    data, exported = geometry_of(request, before)
+    data, exported = geometry_of(request, camera_id, before)
     to_bytes("SSL_GeometryData", data)  # or says what a reader would refuse
     if "field" not in before:
         return exported.with_content(yaml_text(data).encode())
@@ -86,12 +93,6 @@ def _checked(data: Mapping[str, Any]) -> dict[str, Any]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-class SslReadOptions(Frozen, eq=True):
-    """What a message may not say."""
-
-    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px of cameras that do not say theirs"})
-
-
 def read_geometry(content: bytes) -> dict[str, Any]:
     """A geometry.yml, an SSL_GeometryData or a wrapper packet, as plain data; InputError where it is none of them."""
     if b"field:" in content:  # a packet holds no names of fields
@@ -101,9 +102,9 @@ def read_geometry(content: bytes) -> dict[str, Any]:
     return geometry_from_bytes(content)
 
 
-def _read(request: ImportRequest) -> Any:
+def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
     data = read_geometry(request.content)
-    cameras, warnings = to_cameras(data.get("calib", []), request.options.image_size)
+    cameras, warnings = to_cameras(data.get("calib", []), image_size)
     if not cameras:
         raise InputError("it holds no calibrated camera, only a field: `ceres-cal targets import` takes that")
     warnings.append(
@@ -121,10 +122,8 @@ _PACKET, _GEOMETRY_YML = "the league's geometry message", "vision-processor's ge
 _EDITED = "; a file that is there is edited"
 _WRITTEN = f"{_PACKET} (SSL_GeometryData, protobuf){_EDITED}"
 FORMATS = (
-    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export_packet, SslOptions, several_stations=True, edits=True),
-    ExportFormat(
-        _YAML_NAME, _GEOMETRY_YML + _EDITED, _YAML, _export_yaml, SslOptions, several_stations=True, edits=True
-    ),
-    ImportFormat(_NAME, _PACKET, _ENDINGS, _recognises_packet, _read, SslReadOptions),
-    ImportFormat(_YAML_NAME, _GEOMETRY_YML, _YAML, lambda content: b"field_length" in content, _read, SslReadOptions),
+    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export_packet, several_stations=True, edits=True),
+    ExportFormat(_YAML_NAME, _GEOMETRY_YML + _EDITED, _YAML, _export_yaml, several_stations=True, edits=True),
+    ImportFormat(_NAME, _PACKET, _ENDINGS, _recognises_packet, _read),
+    ImportFormat(_YAML_NAME, _GEOMETRY_YML, _YAML, lambda content: b"field_length" in content, _read),
 )

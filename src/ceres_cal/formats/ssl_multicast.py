@@ -21,7 +21,6 @@ from ceres_cal.base.errors import InputError, naming, note
 from ceres_cal.base.files import read_bytes
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.formats.format import Exported, ExportRequest
-from ceres_cal.formats.ssl_cameras import SslOptions
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import geometry_of, read_geometry
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
@@ -156,8 +155,8 @@ def ssl_packet(
     names = tuple(calibration.stations if stations is None else stations)
     for name in names:
         calibration.station(name)
-    request = ExportRequest(calibration, names, "", SslOptions(camera_id))
-    data, exported = geometry_of(request, {} if before is None else read_geometry(before))
+    request = ExportRequest(calibration, names, "")
+    data, exported = geometry_of(request, camera_id, {} if before is None else read_geometry(before))
     return wrapped(data), exported
 
 

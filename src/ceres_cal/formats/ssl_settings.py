@@ -14,11 +14,18 @@ from xml.sax.saxutils import escape
 from msgspec import Struct
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import (
+    Exported,
+    ExportFormat,
+    ExportRequest,
+    ImageSize,
+    ImportedCameras,
+    ImportFormat,
+    ImportRequest,
+)
 from ceres_cal.formats.loss import field_box
-from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, to_cameras, to_entries
+from ceres_cal.formats.ssl_cameras import NAMES, CameraIds, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import target_of
-from ceres_cal.formats.ssl_geometry import SslReadOptions
 from ceres_cal.scene.camera import LARGEST
 from ceres_cal.scene.targets import Target
 
@@ -131,13 +138,14 @@ def _number(one: _Var) -> float:
 # ---- writing --------------------------------------------------------------------------------------------------------
 
 
-def _export(request: ExportRequest) -> Exported:
+def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
     if request.existing is None:
         raise InputError("ssl-vision's settings are edited in place: name its robocup-ssl.xml (or a copy), with "
                          "ssl-vision closed")  # fmt: skip
     values = _values(request.existing)
     there, box = _cameras(values), field_box(request.calibration.targets)
-    entries, losses, warnings = to_entries(request, box or field_box({"field": settings_target(values)}))
+    box = box or field_box({"field": settings_target(values)})
+    entries, losses, warnings = to_entries(request, camera_id, box)
     changes: list[tuple[_Var, str]] = []
     for number, entry in entries.items():
         if number not in there:
@@ -172,10 +180,10 @@ def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-def _read(request: ImportRequest) -> Any:
+def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
     values = _values(request.content)
     every = sorted(_cameras(values).items())
-    cameras, warnings = to_cameras((_entry(*one) for one in every), request.options.image_size)
+    cameras, warnings = to_cameras((_entry(*one) for one in every), image_size)
     for number, there in every:
         if _OPENCV in there and there[_OPENCV].text == "true":
             warnings.append(
@@ -235,6 +243,6 @@ def _shape(group: Mapping[str, _Var]) -> dict[str, Any]:
 _NAME, _FILE, _ENDINGS = "ssl-vision-xml", "ssl-vision's robocup-ssl.xml", (".xml",)
 _WRITTEN = f"{_FILE}, edited in place"
 FORMATS = (
-    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export, SslOptions, several_stations=True, edits=True),
-    ImportFormat(_NAME, _FILE, _ENDINGS, lambda content: b"<VarXML" in content, _read, SslReadOptions),
+    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export, several_stations=True, edits=True),
+    ImportFormat(_NAME, _FILE, _ENDINGS, lambda content: b"<VarXML" in content, _read),
 )
