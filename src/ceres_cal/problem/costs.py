@@ -5,7 +5,7 @@ What Ceres calls: the last answer is kept, and an exception ends the solve inste
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
+from ceres_cal.base.transforms import Pose, left_jacobian, rotation_log, skew
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
@@ -310,48 +310,32 @@ def _smoothness(problem: Problem, estimate: Estimate, name: str, size: int) -> A
 
 # ---- a prior's block: root (x - mean) over every camera, station and structure number that it speaks of ------------
 
-
-class _Linear(NamedTuple):
-    """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
-
-    columns: list[int]
-    slots: list[int]
-    scales: Array
-    size: int
-
-    def values(self, block: Array) -> Array:
-        """(n,) in the units of the keys."""
-        return np.asarray(block[self.slots] * self.scales)
-
-    def slopes(self, block: Array, root: Array) -> Array:
-        """(R, size) derivatives by the block of root (R, n) times the values."""
-        slopes = np.zeros((len(root), self.size))
-        slopes[:, self.slots] = root * self.scales
-        return slopes
+_Coordinates = Callable[[Array], tuple[Array, Array]]
+"""(n,) what a prior speaks of in a solver's block, in the units of its keys, and (n, size) derivatives by the block."""
 
 
-class _StationCoordinates(NamedTuple):
-    """A station's position, and its turn from the prior's rotation about its own axes."""
+def _linear(slots: Sequence[int], scales: Array, size: int) -> _Coordinates:
+    """Numbers that stand in the block themselves."""
+    slopes = np.zeros((len(slots), size))
+    slopes[np.arange(len(slots)), slots] = scales
+    return lambda block: (block[slots] * scales, slopes)
 
-    columns: list[int]
-    rows: list[int]
-    rotation: Array
-    size: int = 6
 
-    def values(self, block: Array) -> Array:
-        """(n,) in the units of the keys."""
+def _of_station(rows: Sequence[int], rotation: Array) -> _Coordinates:
+    """A station's position, and its turn from the prior's rotation about its own axes, of a rotation vector and a
+    translation.
+    """
+
+    def coordinates(block: Array) -> tuple[Array, Array]:
         pose = Pose.exp(block)
-        turn = rotation_log(pose.rotation @ self.rotation.T)
-        return np.concatenate([pose.position, turn])[self.rows]
-
-    def slopes(self, block: Array, root: Array) -> Array:
-        """(R, 6) derivatives of root (R, n) times the values by the rotation vector and the translation."""
-        inverse, left = rotation_exp(block[:3]).T, left_jacobian(block[:3])
+        turn = rotation_log(pose.rotation @ rotation.T)
+        inverse, left = pose.rotation.T, left_jacobian(block[:3])
         slopes = np.zeros((6, 6))
         slopes[:3] = np.hstack([-inverse @ skew(block[3:]) @ left, -inverse])
-        turn = rotation_log(inverse.T @ self.rotation.T)
         slopes[3:, :3] = np.linalg.solve(left_jacobian(turn), left)
-        return np.asarray(root @ slopes[self.rows])
+        return np.concatenate([pose.position, turn])[rows], slopes[rows]
+
+    return coordinates
 
 
 class PriorCost(CachedCost):
@@ -365,17 +349,18 @@ class PriorCost(CachedCost):
         super().__init__(run)
         self._is_usual, self._is_log = prior.is_usual, prior.is_log
         self._root, self._mean = prior.information.root, prior.mean
-        parts = dict(_parts(prior, estimate, layout))
-        self._parts = list(parts.values())
-        self.owners: list[tuple[str, str]] = list(parts)
+        parts = list(_parts(prior, estimate, layout))
+        self.owners: list[tuple[str, str]] = [owner for owner, _, _, _ in parts]
+        self._coordinates = [(columns, coordinates) for _, _, columns, coordinates in parts]
         self.set_num_residuals(len(self._root))
-        self.set_parameter_block_sizes([part.size for part in self._parts])
+        self.set_parameter_block_sizes([size for _, size, _, _ in parts])
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
-        off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
-        for part, block in blocks:
-            off[part.columns] += part.values(block)
-        root = self._root
+        off, root, slopes = -self._mean, self._root, []
+        for (columns, coordinates), block in zip(self._coordinates, parameters, strict=True):
+            values, by_block = coordinates(block)
+            off[columns] += values
+            slopes.append((columns, by_block))
         if self._is_log:
             off, slope = logarithmic(off, self._mean)
             root = root * slope
@@ -383,8 +368,7 @@ class PriorCost(CachedCost):
         if self._is_usual:
             residuals, slope = _bent(residuals)
             root = slope[:, None] * root
-        slopes = [part.slopes(block, root[:, part.columns]).reshape(-1) for part, block in blocks]
-        return CostValue(at, residuals, slopes)
+        return CostValue(at, residuals, [(root[:, columns] @ by_block).reshape(-1) for columns, by_block in slopes])
 
 
 def _bent(residuals: Array) -> tuple[Array, Array]:
@@ -397,24 +381,22 @@ def _bent(residuals: Array) -> tuple[Array, Array]:
 
 def _parts(
     prior: GaussianPrior, estimate: Estimate, layout: Layout
-) -> Sequence[tuple[tuple[str, str], _Linear | _StationCoordinates]]:
-    """The blocks that a prior depends on, by owner."""
-    parts: list[tuple[tuple[str, str], _Linear | _StationCoordinates]] = []
+) -> Iterator[tuple[tuple[str, str], int, list[int], _Coordinates]]:
+    """The blocks that a prior depends on: owner, size, columns of the prior, and what stands there."""
     for (kind, owner), columns in columns_by_owner(prior.keys).items():
         quantities = [prior.keys[column].quantity for column in columns]
         if kind == "camera":
             camera, free = estimate.cameras[owner], layout.free[owner].tolist()
             numbers = [intrinsic_names(camera.lens).index(quantity) for quantity in quantities]
             slots, scales = [free.index(number) for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
-            parts.append(((kind, owner), _Linear(columns, slots, scales, len(free))))
+            yield (kind, owner), len(free), columns, _linear(slots, scales, len(free))
         elif kind == "station":
             rows = [STATION_QUANTITIES.index(quantity) for quantity in quantities]
             # Without turns among its numbers any rotation will do.
             rotation = prior.rotations.get(owner, estimate.stations[owner].cam_from_world.rotation)
-            parts.append(((kind, owner), _StationCoordinates(columns, rows, rotation)))
+            yield (kind, owner), 6, columns, _of_station(rows, rotation)
     structure = [column for column, key in enumerate(prior.keys) if key.is_structure]
     if structure:
         names = estimate.structure.names
         slots = [names.index(prior.keys[column].structure_name) for column in structure]
-        parts.append((("structure", ""), _Linear(structure, slots, np.ones(len(slots)), len(names))))
-    return parts
+        yield ("structure", ""), len(names), structure, _linear(slots, np.ones(len(slots)), len(names))
