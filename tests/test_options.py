@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,18 +30,11 @@ from ceres_cal.problem.parameters import AUTO, Options
 
 
 @dataclass(frozen=True)
-class FormOptions:
-    """Of a format."""
-
-    error_mm: float = 0.1
-
-
-@dataclass(frozen=True)
 class Form:
     """A format."""
 
     name: str = "table"
-    options: type[FormOptions] = FormOptions
+    options: Mapping[str, tuple[Any, str]] = field(default_factory=lambda: {"error_mm": (float, "")})
 
 
 class Every(QuietArguments):
