@@ -14,7 +14,7 @@ from ceres_cal.base.transforms import Pose, rotation_exp, rotation_from_euler
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 
-quick = settings(deadline=None, max_examples=100)
+quick = settings(deadline=None, max_examples=40)
 
 LENSES: list[Lens] = [
     Radial((-9e-4, 4e-6)),

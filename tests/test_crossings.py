@@ -22,7 +22,7 @@ arcs = st.builds(
 
 
 @given(st.lists(segments | arcs, min_size=2, max_size=5))
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_every_crossing_lies_on_both_curves(shapes: list[Curve]) -> None:
     curves = {f"c{n}": curve for n, curve in enumerate(shapes)}
     for name, place in crossings(curves).items():

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, read_json, write_bytes, write_json
 
-quick = settings(deadline=None, max_examples=100)
+quick = settings(deadline=None, max_examples=40)
 
 
 def names_in(folder: Path) -> list[str]:

@@ -14,7 +14,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens import LENSES, Brown, KannalaBrandt, Lens, Radial, make_lens
 
-quick = settings(deadline=None, max_examples=60)
+quick = settings(deadline=None, max_examples=40)
 
 phis = st.floats(200.0, 3000.0)
 

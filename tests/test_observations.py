@@ -19,7 +19,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
 from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
 
-quick = settings(deadline=None, max_examples=60)
+quick = settings(deadline=None, max_examples=40)
 
 Document = dict[str, Any]
 

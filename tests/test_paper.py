@@ -12,7 +12,7 @@ from ceres_cal.scene.lens import Radial
 
 A1, A2, A3 = 1.07761103142178, -0.00096240306505, 0.00000401304361  # section 2, to the last digit printed
 
-quick = settings(deadline=None, max_examples=100)
+quick = settings(deadline=None, max_examples=40)
 
 
 @st.composite

@@ -51,7 +51,7 @@ def own_sd(stated: Information, keys: tuple[Key, ...] = KEYS) -> Array:
 
 
 @given(st.integers(0, 2**31))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
     """However far the shifts are; what was stated of nothing is as wide as the shifts have it."""
     seen, stated, rng = known(seed)
@@ -72,7 +72,7 @@ def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
 
 
 @given(st.integers(0, 2**31), st.floats(-2.0, 4.0))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_errors_that_go_together_widen_no_prior(seed: int, strength: float) -> None:
     """The score of the observations scatters as much as anything; what was stated stays."""
     rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def test_errors_that_go_together_widen_no_prior(seed: int, strength: float) -> N
 
 
 @given(st.integers(0, 2**31))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_ends_are_no_farther_than_stated(seed: int) -> None:
     """sd with bends is that of the observations' information widened, beside what was stated."""
     rng = np.random.default_rng(seed)

@@ -28,7 +28,7 @@ from ceres_cal.scene.targets import (
     target_from_spec,
 )
 
-quick = settings(deadline=None, max_examples=100)
+quick = settings(deadline=None, max_examples=40)
 
 CUSTOM = custom(
     {"pole_top": (1.0, 2.0, 1.0)},

@@ -23,7 +23,7 @@ from ceres_cal.base.transforms import (
 # Where formulas change over or lose digits: next to nothing, the switch to the series, (just short of) half a turn.
 CRITICAL_ANGLES = (0.0, 1e-300, 1e-12, 1e-8, 0.999e-4, 1.001e-4, np.pi - 1e-7, np.pi - 1e-12, np.pi)
 
-quick = settings(deadline=None, max_examples=100)
+quick = settings(deadline=None, max_examples=40)
 
 
 @st.composite
