@@ -170,8 +170,7 @@ def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: fl
     """
     behind = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
     far_px = 1e6
-    r, _ = lines.equations(poses)
-    r = np.nan_to_num(r, nan=far_px, posinf=far_px, neginf=-far_px)
+    r = np.nan_to_num(lines.distances(poses), nan=far_px, posinf=far_px, neginf=-far_px)
     free = int(np.count_nonzero(~known.held))
     scale = np.maximum(scales(r, lines.weight, free), least_px)
     r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), behind * scale))

@@ -136,43 +136,58 @@ class Sightlines(Frozen):
         few = {name: getattr(self, name)[rows] for name in ("pixels", "w", "slope", "places", "along", "curve")}
         return replace(self, **few, counts=(points // 2, lines, arcs))
 
+    def distances(self, poses: Candidates) -> Array:
+        """Distances (K, N) px."""
+        d = self._rays(poses) @ np.swapaxes(poses.rotations, 1, 2)  # rows times it are R times columns
+        normals = self._normals(self.places - poses.positions[:, None], self._directions(poses.rotations), d)
+        return np.asarray(np.sum(normals * d, axis=2) * self._shares(poses, normals @ poses.rotations))
+
     def equations(self, poses: Candidates) -> tuple[Array, Array]:
         """Distances (K, N) px and their derivatives (K, N, 8) by `Candidates.moved`."""
-        phi, squared = np.exp(poses.log_phi)[:, None], self._squared
         rays = self._rays(poses)
-        d = rays @ np.swapaxes(poses.rotations, 1, 2)  # rows times it are R times columns
-        normals, by_position, by_turn = self._normals(poses, d)
+        d = rays @ np.swapaxes(poses.rotations, 1, 2)
+        to, along = self.places - poses.positions[:, None], self._directions(poses.rotations)
+        normals = self._normals(to, along, d)
         before = normals @ poses.rotations  # in the camera's frame
-        lean = before[:, :, 2] * phi * (self.slope + 2.0 * poses.bend[:, None] / self.unit_px**2)
-        steep = np.hypot(before[:, :, 0] + lean * self.pixels[:, 0], before[:, :, 1] + lean * self.pixels[:, 1])
-        share = 1.0 / np.maximum(steep, _LEAST)
-        derivatives = np.empty((*share.shape, 8))
-        derivatives[:, :, :3], derivatives[:, :, 3:6] = by_turn, by_position
+        share, derivatives = self._shares(poses, before), np.empty((*d.shape[:2], 8))
+        derivatives[:, :, :3], derivatives[:, :, 3:6] = self._slopes(to, along, d, normals)
         derivatives[:, :, 6] = before[:, :, 2] * rays[:, :, 2]
-        derivatives[:, :, 7] = before[:, :, 2] * phi * squared
+        derivatives[:, :, 7] = before[:, :, 2] * np.exp(poses.log_phi)[:, None] * self._squared
         return np.sum(normals * d, axis=2) * share, derivatives * share[:, :, None]
 
-    def _normals(self, poses: Candidates, d: Array) -> tuple[Array, Array, Array]:
-        """n (K, N, 3), and the derivatives (K, N, 3) of n . d by the position and by a turn."""
-        to, normals, by_position = self.places - poses.positions[:, None], np.empty_like(d), np.empty_like(d)
-        along = self._directions(poses.rotations)
-        straight, arcs = slice(0, self._arcs.start), self._arcs
+    def _shares(self, poses: Candidates, before: Array) -> Array:
+        """(K, N) px by which a row is off for each unit of n . d; before: n in the camera's frame."""
+        bent = self.slope + 2.0 * poses.bend[:, None] / self.unit_px**2
+        lean = before[:, :, 2] * np.exp(poses.log_phi)[:, None] * bent
+        steep = np.hypot(before[:, :, 0] + lean * self.pixels[:, 0], before[:, :, 1] + lean * self.pixels[:, 1])
+        return np.asarray(1.0 / np.maximum(steep, _LEAST))
+
+    def _normals(self, to: Array, along: Array, d: Array) -> Array:
+        """n (K, N, 3)."""
+        normals, straight, arcs = np.empty_like(d), slice(0, self._arcs.start), self._arcs
         normals[:, straight] = _cross(to[:, straight], along[:, straight])
+        unit = self._outwards(to, d)
+        normals[:, arcs, :2] = to[:, arcs, 2:] * unit
+        normals[:, arcs, 2] = -np.sum(unit * to[:, arcs, :2], axis=2) - np.sign(to[:, arcs, 2]) * self.along[arcs, 0]
+        return normals
+
+    def _outwards(self, to: Array, d: Array) -> Array:
+        """(K, A, 2) from an arc's middle to where the ray meets its plane, of unit length."""
+        to, e = to[:, self._arcs], d[:, self._arcs]
+        away = to[:, :, 2:] * e[:, :, :2] - to[:, :, :2] * e[:, :, 2:]  # times d_z
+        return np.asarray(away / np.maximum(np.linalg.norm(away, axis=2), _LEAST)[..., None])
+
+    def _slopes(self, to: Array, along: Array, d: Array, normals: Array) -> tuple[Array, Array]:
+        """(K, N, 3) derivatives of n . d by a turn and by the position."""
+        by_position, points, arcs = np.empty_like(d), self._points, self._arcs
+        straight = slice(0, arcs.start)
         by_position[:, straight] = -_cross(along[:, straight], d[:, straight])
         by_turn = _cross(d, normals)
-        points = self._points  # whose directions turn with the camera
-        by_turn[:, points] = _cross(to[:, points], by_position[:, points])
-        e, radius = d[:, arcs], self.along[arcs, 0]
-        h, off = -to[:, arcs, 2], -to[:, arcs, :2]
-        away = off * e[:, :, 2:] - h[..., None] * e[:, :, :2]  # x - M, times d_z
-        length = np.maximum(np.linalg.norm(away, axis=2), _LEAST)
-        unit = away / length[..., None]
-        normals[:, arcs, :2] = -h[..., None] * unit
-        normals[:, arcs, 2] = np.sum(unit * off, axis=2) + np.sign(h) * radius
-        by_position[:, arcs, :2] = unit * e[:, :, 2:]
-        by_position[:, arcs, 2] = -np.sum(unit * e[:, :, :2], axis=2)
-        by_turn[:, arcs] = _cross(e, normals[:, arcs])
-        return normals, by_position, by_turn
+        by_turn[:, points] = _cross(to[:, points], by_position[:, points])  # whose directions turn with the camera
+        unit = self._outwards(to, d)
+        by_position[:, arcs, :2] = unit * d[:, arcs, 2:]
+        by_position[:, arcs, 2] = -np.sum(unit * d[:, arcs, :2], axis=2)
+        return by_turn, by_position
 
     def seen(self, poses: Candidates) -> Mask:
         """(K, N) whether each row's place lies ahead and, on a line, between its ends."""

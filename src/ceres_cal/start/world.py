@@ -117,7 +117,7 @@ def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, foun
 def holds(lines: Sightlines, known: Beforehand, found: BestCameras, unit_px: float) -> bool:
     """Whether nearly all of what is seen agrees with a place, and more than any place would take up."""
     best = found.poses.take(np.array([0]))
-    distance = np.abs(lines.equations(best)[0][0])
+    distance = np.abs(lines.distances(best)[0])
     limit = min(_SCALES * found.scale_px, _ROUGH * unit_px) + 1e-3
     near = (distance < limit) & lines.seen(best)[0]
     return bool(np.mean(near) > _HOLDS and lines.independent >= np.count_nonzero(~known.held) + _LEFT_OVER)
