@@ -27,6 +27,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
+from ceres_cal.posterior.bent import valley
 from ceres_cal.posterior.maps import locate_slopes, spread_of_points, visible_pixels
 from ceres_cal.posterior.mixture import radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
@@ -121,8 +122,8 @@ def test_more_tilt_tells_more(tilt_deg: float, verdict: str) -> None:
 # ---- the profile ----------------------------------------------------------------------------------------------------
 
 
-def cost_at(calibration: Calibration, observations: Observations, phi: float | None) -> float:
-    """Twice the least cost, at the calibration's noise, with phi held somewhere or free."""
+def problem_at(calibration: Calibration, observations: Observations, phi: float | None) -> tuple[Problem, Estimate]:
+    """At the calibration's noise, with phi held somewhere or free; and an estimate to begin at."""
     options = Options(usual_camera=False, lens="radial", fixed={} if phi is None else {"phi": phi})
     fit, estimate = calibration.fit, calibration.estimate
     if phi is not None:
@@ -138,8 +139,21 @@ def cost_at(calibration: Calibration, observations: Observations, phi: float | N
     used = gather_sights(observations).used(np.ones(len(observations.points), dtype=bool), rows)
     priors = gather_priors(observations, options, estimate.structure)
     weighting = Weighting(fit.point_scale, fit.curve_scale)
-    problem = Problem(used, make_layout(observations, options), priors, weighting, options)
-    return 2.0 * solve(problem, estimate).cost
+    return Problem(used, make_layout(observations, options), priors, weighting, options), estimate
+
+
+def cost_at(calibration: Calibration, observations: Observations, phi: float | None) -> float:
+    """Twice the least cost, see `problem_at`."""
+    return 2.0 * solve(*problem_at(calibration, observations, phi)).cost
+
+
+@pytest.mark.parametrize("half_width", [1.96, 4.5])
+def test_a_valley_is_followed_beyond_its_bounds(half_width: float) -> None:
+    """Few degrees of freedom have them farther out than three sigma: else both ends were open, and phi anything."""
+    calibration = calibrated(3.0)
+    nodes = valley("overhead", *problem_at(calibration, observed(3.0), None), 1.0, half_width)
+    costs = np.array([node.cost for node in nodes])
+    assert min(costs[0], costs[-1]) - costs.min() > half_width**2
 
 
 @pytest.mark.parametrize("tilt_deg", [3.0, 1.0])

@@ -9,9 +9,11 @@ from accuracy.as_built import CAMERAS, Board, observed
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.boards import detect_boards
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.robust.unsteady import MOVES, ROLLING
+from ceres_cal.scene.targets import checkerboard
 
 VIEWS, MOVED_PX = 14, 12.0
 
@@ -85,3 +87,13 @@ def test_a_rolling_shutter_is_found_and_named() -> None:
         assert "rolling shutter" in found.sentence
         assert calibration.fit.point_scale < 1.2  # of the noise alone: 0.98 measured; 2.1 before it is taken off
         assert abs(phi_off(calibration)) < 3.5  # 2.0 measured; 2.7 and 3.8 before, of three times the error
+
+
+def test_pictures_of_two_cameras_are_no_stabilised_one(real_data: Path) -> None:
+    """A real stereo pair in one folder, 13 pictures each: their read-out seems to say most of what is left."""
+    pictures = sorted((real_data / "opencv_left_right").glob("*.jpg"))
+    both = detect_boards(pictures, checkerboard(9, 6, 0.025)).observations
+    calibration = calibrate(both)
+    assert not calibration.effects
+    first = diagnose(calibration, both).findings[0]
+    assert (first.kind, first.frame) == ("lens changed", "left14")

@@ -65,8 +65,8 @@ class FieldDifference(ErrorMap):
 
     @property
     def known_mm(self) -> float:
-        """Root mean square of what is expected."""
-        return rms(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm))
+        """Root mean square of what is expected, where anything is; infinite where it is unknown everywhere."""
+        return rms(np.where(np.isinf(self.expected_mm), np.nan, self.expected_mm), np.inf)
 
 
 class MapChange(Frozen):

@@ -21,7 +21,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import SolutionError, or_none
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import normal_cdf
+from ceres_cal.base.tails import NORMAL_95, normal_cdf
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Information, Key, over
@@ -32,8 +32,8 @@ from ceres_cal.problem.quantities import PHI_RANGE, difference, moved, natural_s
 from ceres_cal.problem.reduced import information
 from ceres_cal.robust.other_minima import FEW, solved_soon
 
-# Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
-# changes from half to double.
+# Rise of twice the cost at which the valley is followed no further: three sigma, or well beyond the 95 % bound where
+# few degrees of freedom have that farther out. Nothing changes from half to double.
 _FAR = 9.0
 _STEPS = (0.02, 0.35)  # of log phi
 
@@ -52,10 +52,13 @@ class Node(Frozen):
     information: Information
 
 
-def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float = 1.0) -> tuple[Node, ...]:
-    """Follow the valley from the estimate both ways, until it is three sigma up or phi is no lens any more.
+def valley(
+    camera: str, problem: Problem, estimate: Estimate, inflation: float = 1.0, half_width: float = NORMAL_95
+) -> tuple[Node, ...]:
+    """Follow the valley from the estimate both ways, until it is far up or phi is no lens any more.
 
     Args:
+        half_width: standard deviations from the middle to the end of a 95 % interval.
         inflation: factor on the variance of the observations along it: what they cost is divided by it.
 
     Raises:
@@ -73,8 +76,8 @@ def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float =
             f"camera {camera!r}: the least cost lies at phi {estimate.cameras[camera].phi:.1f} px, which is no lens: "
             "check labels and dimensions, add a prior on height_m or phi, or boards tilted by 20 degrees"
         )
-    down = list(_walk(camera, problem, first, -1, inflation))
-    up = list(_walk(camera, problem, first, +1, inflation))
+    far = max(_FAR, 2.0 * half_width**2)
+    down, up = (list(_walk(camera, problem, first, direction, inflation, far)) for direction in (-1, +1))
     if not (down or up):
         raise SolutionError(
             f"camera {camera!r}: no other phi beside {phi:.1f} px can be solved for, so nothing says how far it is "
@@ -126,8 +129,8 @@ def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
     return sum(prior.cost(estimate) for prior in own)
 
 
-def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float) -> Iterator[Node]:
-    """Nodes on one side, each found from the one before by a step along the valley's slope."""
+def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float, far: float) -> Iterator[Node]:
+    """Nodes on one side up to a rise, each found from the one before by a step along the valley's slope."""
     most_nodes = 60
     most_rise = 1.5  # from one node to the next
     unit = unit_px(first.estimate.cameras[camera])
@@ -137,11 +140,11 @@ def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation:
     for _ in range(most_nodes):
         phi = node.estimate.cameras[camera].phi
         wanted = float(np.clip(phi * np.exp(direction * step), low, high))
-        if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
+        if node.cost - lowest > far or direction * (wanted - phi) <= 0.0:
             return
         following = _node(camera, problem, _ahead(camera, node, wanted), inflation)
         change = np.inf if following is None else abs(following.cost - node.cost)
-        if following is None or (change > most_rise and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
+        if following is None or (change > most_rise and node.cost - lowest < far / 2.0 and step > _STEPS[0]):
             step *= 0.5  # too far to find, or to interpolate where the bounds will lie
             if step < 0.5 * _STEPS[0]:
                 return

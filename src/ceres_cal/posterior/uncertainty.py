@@ -128,8 +128,8 @@ def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
 
 
 def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirection, ...]:
-    """Directions, weakest first, along which sigma exceeds KNOWN in natural sizes; neither structure nor the nodes of
-    a lens's surface are looked at.
+    """Directions, weakest first, along which sigma exceeds KNOWN in natural sizes, each that words tell from the rest;
+    neither structure nor the nodes of a lens's surface are looked at.
 
     Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes some
     number by more than a hundredth of itself.
@@ -143,7 +143,9 @@ def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirec
     values, vectors = np.linalg.eigh(finite)
     weak = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
     weak += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
-    return tuple(_direction(estimate, posterior, keys, relative, vector) for relative, vector in weak)
+    every = [_direction(estimate, posterior, keys, relative, vector) for relative, vector in weak]
+    words = [one.words for one in every]
+    return tuple(one for number, one in enumerate(every) if one.words not in words[:number])
 
 
 def _direction(

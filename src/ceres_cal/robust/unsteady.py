@@ -25,9 +25,10 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import SparseColumns
-from ceres_cal.effects.effect import Amount, EffectEstimate
+from ceres_cal.effects.effect import Amount, Case, EffectEstimate
 from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RandomEffects, RepeatedAmounts
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model, without_shared
+from ceres_cal.effects.table.lens import LensChanged
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
@@ -135,6 +136,8 @@ def find_unsteady(
         some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
         if before is not None or _seem_displaced(model_of(*some.built_as(estimate), of_poses=True)):
             model = model_of(some)
+            if before is None and any(LensChanged().columns(Case(observations, some, estimate, model))):
+                continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` tells that
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own:
                 sizes[camera], noise = own, max(left, noise)
@@ -216,21 +219,13 @@ def _seem_displaced(model: Linearised) -> bool:
 
 def _seems_to_move(model: Linearised) -> bool:
     """Whether principal points of views move by themselves, by moments: their scores have the variance T + T^2 sigma^2.
-
-    Beside what else displaces views they move by less. Where they moved once, from some view on, pictures of two
-    cameras were joined, or the lens was touched: that is told by `diagnose`, and not solved for.
+    Beside what else displaces views they move by less.
     """
     whole_told, score = _of_views(model, model.equations.intrinsics[:, _CENTRE])
     told = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2), 1e-300)
-    least, once = (0.75 * _LEAST_PX) ** 2 * np.sum(told), 0.25  # share of the variance that one step leaves
-
-    def about_mean(views: slice) -> float:
-        mean = np.sum(score[views], axis=0) / np.sum(told[views], axis=0)
-        return float(np.sum((score[views] - told[views] * mean) ** 2 / told[views] - 1.0))
-
-    whole = about_mean(slice(0, None))
-    steps = (about_mean(slice(0, at)) + about_mean(slice(at, None)) for at in range(1, len(score)))
-    return whole > least and min(steps) > once * whole
+    mean = np.sum(score, axis=0) / np.sum(told, axis=0)
+    moved = float(np.sum((score - told * mean) ** 2 / told - 1.0))
+    return moved > (0.75 * _LEAST_PX) ** 2 * float(np.sum(told))
 
 
 def _of_views(model: Linearised, columns: Array) -> tuple[Array, Array]:
