@@ -29,6 +29,7 @@ import photographs
 import pytest
 import refit_after_move
 import watching
+from conftest import made_once
 from faults import fuzz_commands
 from scenes import RADIAL
 
@@ -65,11 +66,15 @@ def calibration(observations: Observations) -> Calibration:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one good file for each reader, and what commands take besides."""
-    folder = tmp_path_factory.mktemp("fuzz") / "good"
-    folder.mkdir()
-    fuzz_commands.corpus(folder)
-    return folder
+    """A folder with one good file for each reader, and what commands take besides: a worker's own copy."""
+
+    def made() -> Path:
+        folder = tmp_path_factory.mktemp("made") / "good"
+        folder.mkdir()
+        fuzz_commands.corpus(folder)
+        return folder
+
+    return Path(shutil.copytree(made_once(tmp_path_factory, "corpus", made), tmp_path_factory.mktemp("fuzz") / "good"))
 
 
 def program(*arguments: object, **settings: Any) -> subprocess.CompletedProcess[str]:
