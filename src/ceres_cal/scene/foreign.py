@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.least_squares import least_squares
@@ -34,8 +34,6 @@ _NAMES = {
 """Model -> the kind of our lenses that it is, and the names of its coefficients there; "" of those that none has."""
 TO_HOLD = ("opencv12", THIN_PRISM_FISHEYE)
 """Models for lenses that they hold exactly: no other lens is fitted by them."""
-# Depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow.
-_ACROSS = 0.1
 _GRID = (41, 31)  # pixels of the image over which a fit is made
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
 
@@ -123,7 +121,7 @@ class ForeignCamera(Frozen):
             blanks += [] if model in TO_HOLD else [replace(one, coefficients=(0.0,) * len(numbers))]
         pixels = image_grid(camera.image_size)
         rays = camera.rays(pixels)
-        known, ahead = np.isfinite(rays[:, 0]), rays[:, 2] > _ACROSS
+        known, ahead = np.isfinite(rays[:, 0]), _ahead(rays)
         fits = [cls.fitted(blank, rays[known], pixels[known]) for blank in blanks]
         # Most models show nothing across or behind: they are told apart by the rest.
         return min(fits, key=lambda fit: _error(fit.project_rays(rays[ahead]), pixels[ahead])[0])
@@ -176,7 +174,7 @@ class ForeignCamera(Frozen):
         count = len(start.coefficients)
         numbers = np.array([*start.focal, *start.centre, *start.coefficients])
         sizes = np.array([start.focal[0]] * 2 + [start.focal[0]] * 2 + [1.0] * count)
-        ahead = rays[:, 2] > _ACROSS
+        ahead = _ahead(rays)
 
         def made(v: Array) -> ForeignCamera:
             return replace(start, focal=_two(v[:2]), centre=_two(v[2:4]), coefficients=tuple(v[4:].tolist()))
@@ -294,8 +292,15 @@ def nearest(camera: Camera, lens: Lens) -> Camera:
 def opencv_models(camera: Camera) -> tuple[str, ...]:
     """Those of OpenCV's models that may come near a camera: its fisheye where that is our lens, or sees across."""
     is_one = ForeignCamera.coefficients_of(camera.lens, FISHEYE) is not None
-    fisheye = is_one or bool(np.any(camera.rays(image_grid(camera.image_size))[:, 2] < _ACROSS))
+    rays = camera.rays(image_grid(camera.image_size))
+    fisheye = is_one or bool(np.any(np.isfinite(rays[:, 0]) & ~_ahead(rays)))
     return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
+
+
+def _ahead(rays: Array) -> Mask:
+    """(N,) unit rays that are not across: beside shallower ones tangents grow beyond what functions of them follow."""
+    shallowest = 0.1
+    return np.asarray(rays[:, 2] > shallowest)
 
 
 def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> Array:
