@@ -157,7 +157,7 @@ def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
     built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA, None).priors)
     assert built.scatter_m > 0.0 and not built.is_other
     followed = Followed(CAMERA, FIELD, FIELD.curve_names, (), lines, FIELD.curve_names, built)
-    seen = _observations("0001", followed, FIELD, FieldOptions(points=False))
+    seen = _observations("0001", followed, FIELD, FieldOptions())
     pixels, over = CAMERA.project(FIELD.point_array), []
     for priors in (seen.priors, tuple(one for one in seen.priors if one.curve)):
         calibration = calibrate(replace(seen, priors=priors), Options(lens="radial", powers=(2, 3)))

@@ -197,8 +197,8 @@ def test_from_clicks_to_a_calibration(tmp_path: Path, seed: int) -> None:
 
 def test_edges_say_the_same_as_middles(tmp_path: Path, shot: script.Shot) -> None:
     path = saved(shot, tmp_path)
-    middle = detect_field([path], FIELD, shot.camera, options=FieldOptions(points=False)).observations
-    edges = detect_field([path], FIELD, shot.camera, options=FieldOptions(points=False, edges=True)).observations
+    middle = detect_field([path], FIELD, shot.camera).observations
+    edges = detect_field([path], FIELD, shot.camera, options=FieldOptions(edges=True)).observations
     half = len(middle.curves)
     assert len(edges.curves) == 2 * half and len(middle.points) == 0
     assert np.unique(edges.curves.side).tolist() == [-1, 1]
@@ -360,8 +360,8 @@ def test_command(tmp_path: Path, shot: script.Shot, capsys: pytest.CaptureFixtur
     assert answer["curves"] == len(observations.curves) and observations.views[0].camera == "overhead"
     clicked = [argument for name, (x, y) in points.items() for argument in ("--corner", f"{name}={x},{y}")]
     (tmp_path / "target.json").write_text(json.dumps({"kind": "ssl-field", "division": "B"}))
-    assert main([*detect, "--target", str(tmp_path / "target.json"), *clicked, "--lines-only", "--quiet"]) == 0
-    assert len(Observations.load(out).points) == 0
+    assert main([*detect, "--target", str(tmp_path / "target.json"), *clicked, "--points"]) == 0
+    assert "corners and crossings" in capsys.readouterr().out and len(Observations.load(out).points) >= 6
     other = str(tmp_path / "other.json")
     Observations.load(out).save(other)
     capsys.readouterr()

@@ -182,7 +182,7 @@ def test_a_photograph_of_another_league(tmp_path: Path, capsys: pytest.CaptureFi
     shot = take_field("vss-3", EVERY["vss-3"], 2)
     path, refused, out = (str(tmp_path / name) for name in ("vss.png", "refused.png", "o.json"))
     cv2.imwrite(path, shot.picture.image)
-    command = ["detect", "field", path, "--target", "vss-3", "--auto", "-o", out, "--picture", refused]
+    command = ["detect", "field", path, "--target", "vss-3", "--auto", "--points", "-o", out, "--picture", refused]
     assert main(command) == 2
     assert "it looks alike in 2 ways: LeftGoalLine lies towards" in capsys.readouterr().err
     assert cv2.imread(refused) is not None
@@ -199,7 +199,7 @@ def test_a_real_photograph_that_was_stretched(
     """Its field is painted by hand, and its pixels are higher than wide."""
     path, out = str(real_data / "vss_overhead_robocin" / "test_frame.png"), str(tmp_path / "o.json")
     command = ["detect", "field", path, "--target", "vss-3", "--auto", "--facing", "LeftGoalLine=left", "-o", out]
-    assert main([*command, "--json"]) == 0
+    assert main([*command, "--points", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert 0.945 < answer["found"][0]["aspect"] < 0.97  # 0.958; circle: 185 px high, 193 wide
     observations = Observations.load(out)

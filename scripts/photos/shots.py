@@ -22,6 +22,7 @@ from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light
 from ceres_cal.detect.photographs import Clicks, FieldDetections, detect_field, follow
 from ceres_cal.detect.rings import detect_rings
@@ -234,9 +235,10 @@ def floor_rows(runs: int) -> Iterator[Row]:
                 print(f"photograph {seed}: {error}", file=sys.stderr)
                 continue
             means.append(float(np.mean(floor_error_mm(shot, calibration.station()))))
-            points = found.observations.points
-            truth = shot.camera.project(shot.target.point_array[points.feature])
-            point_pulls.append(((points.pixels - truth) / points.sigma_px[:, None]).ravel())
+            (followed,) = found.found.values()
+            met = find_crossings(shot.target, followed.camera, followed.lines)
+            truth = shot.camera.project(shot.target.point_array[met.feature])
+            point_pulls.append(((met.pixels - truth) / met.sigma_px[:, None]).ravel())
     pull = np.concatenate(point_pulls)
     yield Row("clicks to calibration", "mean floor error, mm", float(np.mean(means)), most=1.0, note=f"{runs} runs")
     yield Row("clicks to calibration", "mean floor error of the worst photograph, mm", float(np.max(means)))
@@ -340,7 +342,7 @@ def real_rows(folder: Path, picture: Path | None, seen: tuple[Path, FieldDetecti
 
 
 def draw(path: Path, found: FieldDetections, picture: Path) -> None:
-    """The photograph with the model (yellow, red where it was not found), line centres (blue) and crossings (green)."""
+    """The photograph with the model (yellow, red where it was not found) and line centres (blue)."""
     image = cv2.imread(str(path))
     assert image is not None
     lines = found.found[str(path)].lines
@@ -348,6 +350,4 @@ def draw(path: Path, found: FieldDetections, picture: Path) -> None:
         cv2.circle(image, (round(x), round(y)), 2, (0, 255, 255) if seen else (0, 0, 255), -1)
     for x, y in lines.pixels[lines.found]:
         cv2.circle(image, (round(16 * x), round(16 * y)), 20, (255, 0, 0), -1, cv2.LINE_AA, 4)
-    for x, y in found.observations.points.pixels:
-        cv2.drawMarker(image, (round(x), round(y)), (0, 255, 0), cv2.MARKER_CROSS, 16, 1)
     cv2.imwrite(str(picture), image)

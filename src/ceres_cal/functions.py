@@ -84,14 +84,14 @@ def detect_field(
     estimate: Sequence[Prior] = (),
     mask: str | PathLike[str] | None = None,
     edges: bool = False,
-    lines_only: bool = False,
+    points: bool = False,
     keep_start: bool = False,
     camera: str | None = None,
     station: str | None = None,
     refused: Callable[[Path, SearchResult], None] | None = None,
     progress: ImageProgress | None = None,
 ) -> FieldDetections:
-    """Find the painted lines, corners and crossings of a field in photographs of one station.
+    """Find the painted lines of a field in photographs of one station.
 
     Args:
         images: photographs that one camera took at one station, or a function that makes them, which is called once
@@ -104,7 +104,7 @@ def detect_field(
             such as {"LeftGoalLine": "top"}.
         not_painted: lines of the target that this field does not have. estimate: dimensions to solve for.
         mask: a picture of the same size; what is black in it is left out. edges: both edges of each line.
-        lines_only: no corners and crossings. keep_start: the start is good to 12 px.
+        points: corners and crossings, too, where the lines' places lead to. keep_start: the start is good to 12 px.
         camera, station: names in the observations; by default those of the calibration, or "camera".
         refused: called with the path of each image that does not show the field, and what was seen in it.
         progress: called after each image with (steps done, steps in all, file name).
@@ -139,7 +139,7 @@ def detect_field(
     options = FieldOptions(
         camera or "camera",
         station or camera or "camera",
-        points=not lines_only,
+        points=points,
         edges=edges,
         lengths=tuple(estimate),
         left_out=None if mask is None else read_grey(Path(mask)) == 0,

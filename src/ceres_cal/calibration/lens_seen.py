@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, distinct
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.tails import upper_tail
@@ -314,8 +314,7 @@ class InlierRows(Frozen):
 
     @cached_property
     def _groups(self) -> Sights:
-        """A sight of each group: a placement, or, of what stays where it is, a feature."""
-        return self.sights.by_feature(_placed(self.sights))
+        return groups_of(self.sights)
 
     @cached_property
     def _sigma_px(self) -> float:
@@ -346,12 +345,16 @@ def _placed(sights: Sights) -> Mask:
     return placed & (np.count_nonzero(placed) >= fewest_placements)
 
 
-def require_groups(sights: Sights) -> None:
-    """Raise FewGroupsError where there is too little to hold out."""
-    fewest_groups = 8  # with fewer nothing tells lenses apart
+def groups_of(sights: Sights, *, required: bool = False) -> Sights:
+    """A sight of each group: a placement, or, of what stays where it is, a feature; half of a line where these are few.
+
+    Raises:
+        FewGroupsError: there is too little to hold out, though it is required.
+    """
+    fewest = 8  # with fewer nothing tells lenses apart
     placed = _placed(sights)
-    count = int(np.count_nonzero(placed))
-    for own in (sights[int(number)] for number in np.flatnonzero(~placed)):
-        count += len(distinct(own.point_index)) + len(distinct(own.track_index))
-    if count < fewest_groups:
+    groups = sights.by_feature(placed)
+    groups = groups if len(groups) >= fewest else sights.by_feature(placed, halved=True)
+    if required and len(groups) < fewest:
         raise FewGroupsError("too few views or features to tell lenses apart")
+    return groups

@@ -66,7 +66,9 @@ class FieldArguments(QuietArguments):
     mask: Path | None = option("a picture of the same size: what is black in it is left out (hall, people)", "FILE")
     picture: Path | None = option("draw what was seen in the first photograph that is refused", "FILE")
     edges: bool = switch("both edges of each line instead of its middle")
-    lines_only: bool = switch("no corners and crossings")
+    points: bool = switch(
+        "corners and crossings, too, for programs that take no lines: lines alone tell the camera better"
+    )
     camera: str | None = arguments.camera_option(
         "name of the camera; default: that of the calibration, or camera", None
     )
@@ -118,7 +120,7 @@ def _run(args: FieldArguments) -> Document:
         estimate=arguments.parse_estimates(args.estimate, {"field": target}),
         mask=args.mask,
         edges=args.edges,
-        lines_only=args.lines_only,
+        points=args.points,
         keep_start=args.keep_start,
         camera=args.camera,
         station=args.station,
@@ -195,7 +197,8 @@ def _sections(detections: FieldDetections, merged: dict[str, Any], output: Path)
     every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
     lengths = {prior.quantity: prior.value[0] for prior in observations.priors if prior.dimension}
     seen = f"{len(images)} of {every} images show the field"
-    first = f"{seen}: {plural(curves, 'line observation')}, {plural(points, 'corner')} and crossings"
+    met = f", {plural(points, 'corner')} and crossings" if points else ""
+    first = f"{seen}: {plural(curves, 'line observation')}{met}"
     yield Section("", [first], {"points": points, "curves": curves, "found": images})
     said = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
     rough = [f"lengths, roughly, for `calibrate` to solve for: {said} m"] if lengths else []

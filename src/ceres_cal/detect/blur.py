@@ -111,26 +111,29 @@ def with_coma(
     Args:
         fits: by an even blur. size: of the picture, height and width.
     """
-    # Standard deviations; of the misfit; of half the diagonal; windows that tell whether it is worth while, and the
-    # length that is.
-    surely, clearly, outer, few, least_px = 4.5, 0.05, 0.2, 50, 1.6
+    # Standard deviations, in the dark up to 2.6 and of coma from 6.7; of half the diagonal; windows that tell whether
+    # it is worth while, and the length that is.
+    surely, outer, few, least_px = 4.5, 0.2, 50, 1.6
     offsets = (course.pixels - 0.5 * (np.array(size[::-1]) - 1.0)) / (0.5 * np.hypot(*size))
     across, radius = np.sum(offsets * course.normals, axis=1), np.linalg.norm(offsets, axis=1)
     rows = _some(np.flatnonzero(np.isfinite(fits.offset_px) & (np.abs(across) > outer)))
     if len(rows) < _FEWEST_IN_SECTOR or _coma_shape(windows, course, blur, _some(rows, few), across)[1] < least_px:
         return None
     inwards, outwards = (_drawn_out(windows, course, blur, rows, lean * across) for lean in (-1.0, 1.0))
-    more = inwards[1] - outwards[1]
-    told = float(np.mean(more)) / max(float(np.std(more)), 1e-9) * len(more) ** 0.5
-    even = float(np.mean(np.log(fits.noise[rows])))
+    told, even = _sigmas(inwards[1] - outwards[1]), np.log(fits.noise[rows])
     if abs(told) < surely:
-        return (outwards[0], 1.0) if float(np.mean(outwards[1])) < even - clearly else None
+        return (outwards[0], 1.0) if _sigmas(even - outwards[1]) > surely else None
     out = np.copysign(1.0, told)
     shapes = product((across, np.cbrt(across * radius**2)), (0.0, 1.0))
     every = [_drawn_out(windows, course, blur, rows, out * shape * radius**power) for shape, power in shapes]
     left = [float(np.mean(one)) for _, one in every]
     best = int(np.argmin(left))
-    return (every[best][0], _OF_OTHERS if best else _OF_COMA) if left[best] < even else None
+    return (every[best][0], _OF_OTHERS if best else _OF_COMA) if left[best] < float(np.mean(even)) else None
+
+
+def _sigmas(differences: Array) -> float:
+    """How many of its standard deviations a mean is above 0."""
+    return float(np.mean(differences)) / max(float(np.std(differences)), 1e-9) * len(differences) ** 0.5
 
 
 def _drawn_out(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, Array]:

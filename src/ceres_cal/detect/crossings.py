@@ -43,8 +43,8 @@ class _Branch(Frozen):
 def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
     """Every point of the target in which at least two measured curves meet.
 
-    Each branch is a straight line through the offsets of its nearest places from the course; the course itself bends as
-    lens and arc do.
+    Each branch is a parabola through the offsets of its nearest places from the course: the course itself bends as lens
+    and arc do, but for what a formula of the lens leaves. Straight lines were up to nine standard deviations off.
     """
     on_curve_m = 1e-6
     used = np.zeros(len(lines.course), dtype=bool)
@@ -87,11 +87,11 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
         return None
     rows, along = rows[chosen], along[chosen]
     weight = lines.sigma_px[rows] ** -2.0
-    basis = np.column_stack([np.ones(len(rows)), along])
+    basis = np.vander(along / reach_px, 3, increasing=True)
     covariance = np.linalg.inv(basis.T @ (weight[:, None] * basis))
     offset = covariance @ (basis.T @ (weight * lines.offset_px[rows]))
     squares = float(weight @ (lines.offset_px[rows] - basis @ offset) ** 2)
-    more = max(1.0, (squares + _AS_STATED) / (len(rows) - 2 + _AS_STATED))
+    more = max(1.0, (squares + _AS_STATED) / (len(rows) - 3 + _AS_STATED))
     return _Branch(here.normals[0], float(offset[0]), more * float(covariance[0, 0]), rows)
 
 

@@ -177,17 +177,30 @@ class Sights(Frozen, Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
-    def by_feature(self, whole: Mask) -> Sights:
-        """Each sight as one of every feature that it shows; those (S,) that are to stay whole as they are."""
+    def by_feature(self, whole: Mask, *, halved: bool = False) -> Sights:
+        """Each sight as one of every feature that it shows, or of every half of a curve in the image; those (S,) that
+        are to stay whole as they are.
+        """
         numbers = np.arange(len(self))
         sight = np.concatenate([np.repeat(numbers, np.diff(b)) for b in (self.point_bounds, self.curve_bounds)])
-        feature = np.concatenate([2 * self.point_index + 1, 2 * self.track_index + 2])
+        half = self._halves(sight[len(self.point_rows) :]) if halved else 0
+        feature = np.concatenate([2 * self.point_index + 1, 2 * (2 * self.track_index + half) + 2])
         feature[whole[sight]] = 0
         span = 1 + int(feature.max(initial=0))
         names, group = np.unique(sight * span + feature, return_inverse=True)
         p, c = np.split(group, [len(self.point_rows)])
         sizes = np.bincount(p, minlength=len(names)), np.bincount(c, minlength=len(names))
         return self._rows(names // span, np.argsort(p, kind="stable"), np.argsort(c, kind="stable"), *sizes)
+
+    def _halves(self, sight: Indices) -> Indices:
+        """(M,) in which half of its curve an observation of a sight (M,) lies, 0 or 1."""
+        half = np.zeros(len(sight), dtype=np.int64)
+        curve = sight * (1 + int(self.track_index.max(initial=0))) + self.track_index
+        for one in np.unique(curve):
+            rows = np.flatnonzero(curve == one)
+            along = self.curve_pixels[rows][:, np.argmax(np.ptp(self.curve_pixels[rows], axis=0))]
+            half[rows] = along > np.median(along)
+        return half
 
     def displaced(self, points: Array, curves: Array) -> Sights:
         """With every observation shifted, (N, 2) and (M, 2) px by row of the observations."""

@@ -73,7 +73,7 @@ class FieldOptions(Frozen, eq=True):
 
     Attributes:
         camera, station: the names they bear; the station's is that of the camera by default.
-        points: corners and crossings, too; else curve observations only.
+        points: corners and crossings, too, which are extrapolated: lines as long as that are bent as no formula knows.
         edges: both edges of the paint instead of its middle.
         left_out: (height, width) pixels that show nothing of the field: hall, walls, people.
         keep_start: nothing farther from the start than 12 px is looked at.
@@ -83,7 +83,7 @@ class FieldOptions(Frozen, eq=True):
 
     camera: str = "camera"
     station: str | None = None
-    points: bool = True
+    points: bool = False
     edges: bool = False
     left_out: Mask | None = None
     keep_start: bool = False
