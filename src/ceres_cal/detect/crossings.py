@@ -70,7 +70,7 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
 
 
 def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:
-    reach_px = 100.0
+    reach_px, bent_px = 100.0, 0.5  # how far a branch is followed, and by how much it may bend until there
     each_way, one_way, fewest = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
     course = lines.course
     foot = nearest_on_curve(target.curves[target.curve_names[curve]], point[None])
@@ -88,10 +88,10 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
     rows, along = rows[chosen], along[chosen]
     weight = lines.sigma_px[rows] ** -2.0
     basis = np.vander(along / reach_px, 3, increasing=True)
-    covariance = np.linalg.inv(basis.T @ (weight[:, None] * basis))
+    covariance = np.linalg.inv(basis.T @ (weight[:, None] * basis) + np.diag([0.0, 0.0, bent_px**-2.0]))
     offset = covariance @ (basis.T @ (weight * lines.offset_px[rows]))
     squares = float(weight @ (lines.offset_px[rows] - basis @ offset) ** 2)
-    more = max(1.0, (squares + _AS_STATED) / (len(rows) - 3 + _AS_STATED))
+    more = max(1.0, (squares + _AS_STATED) / (len(rows) - 2 + _AS_STATED))
     return _Branch(here.normals[0], float(offset[0]), more * float(covariance[0, 0]), rows)
 
 
