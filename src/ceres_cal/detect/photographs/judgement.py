@@ -49,7 +49,8 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
         started: whether somebody said where to start.
     """
     if followed.built.is_other:
-        help_ = ": correct the target, or have them found (--estimate)" if followed.built.dimensions else ""
+        asked = ",".join(name.removesuffix("_m") for name in followed.built.dimensions)
+        help_ = f": correct the target, or have it found (--estimate {asked})" if asked else ""
         return "; ".join(followed.built.words()) + help_
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
