@@ -29,7 +29,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.bent import valley
 from ceres_cal.posterior.maps import locate_slopes, spread_of_points, visible_pixels
-from ceres_cal.posterior.mixture import radii
+from ceres_cal.posterior.mixture import quantiles, radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
@@ -173,6 +173,18 @@ def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
     else:
         assert verdict.verdict == "unknown" and verdict.low == 0.0
         assert cost_at(calibration, observations, 125.0) - least < rise
+
+
+@pytest.mark.parametrize("share, is_known", [(0.02, True), (0.08, False)])
+def test_a_thin_tail_in_which_nothing_is_known(share: float, is_known: bool) -> None:
+    """95 % of the errors are shorter than something as long as less than 5 % of them are not known."""
+    weights, means = np.array([1.0 - share, share]), np.zeros((2, 1, 2))
+    known = np.array([np.eye(2), np.diag([np.inf, np.inf])])[:, None]
+    (radius,) = radii(weights, means, known)
+    low, high = quantiles(weights, means, np.diagonal(known, axis1=-2, axis2=-1), 1.96)
+    assert np.isfinite([radius, *low[0], *high[0]]).tolist() == [is_known] * 5
+    if is_known:  # of the part that is known so much lies beyond
+        assert radius == pytest.approx(np.sqrt(-2.0 * np.log((0.05 - share) / (1.0 - share))), rel=0.01)
 
 
 # ---- other lenses ---------------------------------------------------------------------------------------------------

@@ -368,7 +368,8 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     radius = radii(weights, means, known) * width / NORMAL_95
     if mixture.is_followed:
         tail = 2.0 * float(normal_cdf(-FARTHER))
-        radius = np.maximum(radius, _LARGER * radii(weights, means, known, tail))  # of what is normal, 0.7 of it
+        far = _LARGER * radii(weights, means, known, tail)  # of what is normal, 0.7 of the radius
+        radius = np.maximum(radius, np.where(np.isfinite(far), far, 0.0))  # less than 5 % of a valley may show nothing
     covariance = np.asarray(np.einsum("f,fnij->nij", weights, known))
     with np.errstate(invalid="ignore"):
         covariance = covariance + np.einsum("f,fni,fnj->nij", weights, means, means)
@@ -378,6 +379,8 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     covariance[open_] = np.diag([np.inf, np.inf])
     sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     sd = np.minimum(sd, radius / of_round) if mixture.is_followed else sd
+    thin = ~np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(sd)  # a tail that nothing is known in
+    covariance[thin] = 0.5 * sd[thin, None, None] ** 2 * np.eye(2)
     return Reading(low, high, covariance, radius, sd)
 
 

@@ -244,9 +244,10 @@ def moments(weights: Array, means: Array, variances: Array) -> Array:
 
 def quantiles(weights: Array, means: Array, variances: Array, half_width: float) -> tuple[Array, Array]:
     """(...) below and above which as much of a mixture lies, of means and variances (F, ...), as of a normal variable
-    beyond so many sigmas.
+    beyond so many sigmas. Half of what has no variance lies beyond any place: infinite where that is more.
     """
-    unknown = np.isinf(variances).any(axis=0)
+    nowhere = 0.5 * np.tensordot(weights, np.isinf(variances).astype(float), axes=1)
+    unknown = nowhere > normal_cdf(-half_width)
     sds = np.sqrt(np.where(unknown, 1.0, variances))
     low, high = (_quantile(weights, sign * means, sds, half_width) for sign in (-1.0, 1.0))
     return np.where(unknown, -np.inf, -low), np.where(unknown, np.inf, high)
@@ -256,7 +257,7 @@ def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Ar
     """(...) what as much of the mixture lies above."""
     if len(weights) == 1:
         return np.asarray(means[0] + half_width * sds[0])
-    finite, tail = np.isfinite(means), float(normal_cdf(-half_width))
+    finite, tail = np.isfinite(means) & np.isfinite(sds), float(normal_cdf(-half_width))
     beyond = np.tensordot(weights, (means == np.inf).astype(float), axes=1) > tail
     low = np.where(beyond, 0.0, np.min(np.where(finite, means - _REACH * sds, np.inf), axis=0))
     high = np.where(beyond, 0.0, np.max(np.where(finite, means + _REACH * sds, -np.inf), axis=0))
@@ -315,7 +316,6 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
         finite = np.nan_to_num(covariances, nan=0.0)
         variance = 2.0 * np.sum(finite**2, axis=(-2, -1)) + 4.0 * np.einsum("fni,fnij,fnj->fn", means, finite, means)
         cubed = variance / (9.0 * square**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
-    unknown = np.isinf(covariances).any(axis=(0, 2, 3))
     sized = np.isfinite(square) & np.isfinite(variance) & (square > 0.0)
     exact = square == 0.0
     square, cubed = np.where(sized, square, 1.0), np.where(sized, np.maximum(cubed, 1e-30), 1e-30)
@@ -323,7 +323,7 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
     each = np.sqrt(square * (1.0 - cubed + away * np.sqrt(cubed)) ** 3)
     each = np.where(sized, each, np.where(exact, 0.0, np.inf))
     if len(weights) == 1:
-        return np.asarray(np.where(unknown, np.inf, each[0]))
+        return np.asarray(each[0])
     nowhere = np.tensordot(weights, np.isinf(each).astype(float), axes=1) > tail
 
     def above(radius: Array, rows: Indices) -> Array:
@@ -331,6 +331,5 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
         share = normal_cdf((1.0 - spread - np.cbrt(radius**2 / square[:, rows])) / np.sqrt(spread))
         return weights @ np.where(sized[:, rows], share, np.isinf(each[:, rows]))
 
-    endless = unknown | nowhere
-    largest = np.max(np.where(np.isfinite(each) & ~endless, each, 0.0), axis=0)
-    return np.asarray(np.where(endless, np.inf, _root(above, np.zeros_like(largest), largest, tail)))
+    largest = np.max(np.where(np.isfinite(each) & ~nowhere, each, 0.0), axis=0)
+    return np.asarray(np.where(nowhere, np.inf, _root(above, np.zeros_like(largest), largest, tail)))
