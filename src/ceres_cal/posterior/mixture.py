@@ -324,12 +324,16 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
     each = np.where(sized, each, np.where(exact, 0.0, np.inf))
     if len(weights) == 1:
         return np.asarray(each[0])
-    nowhere = np.tensordot(weights, np.isinf(each).astype(float), axes=1) > tail
+    lost = np.tensordot(weights, np.isinf(each).astype(float), axes=1)
+    nowhere = lost > tail
 
     def above(radius: Array, rows: Indices) -> Array:
         spread = cubed[:, rows]
         share = normal_cdf((1.0 - spread - np.cbrt(radius**2 / square[:, rows])) / np.sqrt(spread))
         return weights @ np.where(sized[:, rows], share, np.isinf(each[:, rows]))
 
-    largest = np.max(np.where(np.isfinite(each) & ~nowhere, each, 0.0), axis=0)
+    # Beside what is lost the rest has to lie nearer than all of it by itself.
+    largest = np.max(
+        np.where(np.isfinite(each) & ~nowhere, np.where(lost > 0.0, _REACH * np.sqrt(square), each), 0.0), 0
+    )
     return np.asarray(np.where(nowhere, np.inf, _root(above, np.zeros_like(largest), largest, tail)))
