@@ -14,7 +14,7 @@ from test_cli import Say, refused, say
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.terminal import ProgressBar
-from ceres_cal.detect.photographs import detect_field
+from ceres_cal.detect.photographs import FieldOptions, detect_field
 from ceres_cal.problem.parameters import Station
 
 __all__ = ["say"]
@@ -27,7 +27,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shot = script.take(0)
     (place / "in").mkdir()
     cv2.imwrite(str(place / "in" / "shot.png"), shot.picture.image)
-    found = detect_field([place / "in" / "shot.png"], shot.target, script.clicks(shot, 0))
+    asked = FieldOptions(points=True)  # for the closed form
+    found = detect_field([place / "in" / "shot.png"], shot.target, script.clicks(shot, 0), options=asked)
     found.observations.save(place / "obs.json")
     options = script.OPTIONS[shot.camera.lens.kind]
     calibration = calibrate(found.observations, options)

@@ -56,7 +56,10 @@ def _from_four_points(camera: Camera, sight: Sights) -> Pose:
     floor = np.flatnonzero(np.abs(sight.points[:, 2]) < 1e-9)
     places, first = np.unique(sight.points[floor, :2], axis=0, return_index=True)
     if len(places) < 4:
-        raise DegenerateError(f"{sight.key}: the paper's method needs four points of the floor, not {len(places)}")
+        raise DegenerateError(
+            f"{sight.key}: the paper's method needs four points of the floor, not {len(places)}: observe its corners "
+            "(`ceres-cal detect field --points` does in photographs)"
+        )
     chosen = floor[first[_widest_four(places)]]
     rays = camera.rays(sight.pixels[chosen])
     return pose_from_homography(homography_from_points(sight.points[chosen, :2], rays[:, :2] / rays[:, 2:]))

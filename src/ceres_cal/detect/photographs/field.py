@@ -100,7 +100,8 @@ def detect_field(
     options: FieldOptions | None = None,
     progress: ImageProgress | None = None,
 ) -> FieldDetections:
-    """Painted lines, arcs, corners and crossings of a field in photographs that one camera took at one station.
+    """Painted lines and arcs of a field in photographs that one camera took at one station; where the options ask for
+    them, corners and crossings.
 
     Curve observations are of the paint's middle, at places whose windows share no pixel; `sigma_px` comes from the
     pixels of each window, times a factor that the scatter from place to place tells. A point is where measured curves
