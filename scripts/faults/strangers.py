@@ -21,7 +21,7 @@ from photos.real_data import real_folder
 from runner import Row, script
 
 PROGRAM = (sys.executable, "-c", "import sys; from ceres_cal.cli import main; sys.exit(main())")
-_ODD = re.compile(r"unexpected|Traceback|Warning|\bnan\b|\binf\b|\bNaN\b", re.IGNORECASE)
+_ODD = re.compile(r"unexpected|Traceback|[a-z]Warning|\bnan\b|\binf\b|\bNaN\b")
 _FORMATS = {
     "ssl-vision": "pb", "vision-processor": "yml", "opencv": "yml", "ros": "yaml", "kalibr": "yaml",
     "mrcal": "cameramodel", "colmap": "", "paper": "txt",
