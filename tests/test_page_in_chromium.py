@@ -40,7 +40,7 @@ def photos3(real_data: Path) -> Path:
     """The folder of rendered photographs that --auto is not tried on here, beside the real ones."""
     folder = real_data.parent / "photos3"
     if not folder.is_dir():
-        pytest.skip(f"no rendered photographs: {folder} is not there")
+        pytest.skip(f"no rendered photographs: {folder} is not there (it lies beside $CERES_CAL_REAL)")
     return folder
 
 

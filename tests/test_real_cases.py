@@ -29,7 +29,7 @@ def case(real_data: Path) -> Callable[[str], Path]:
     def place(name: str) -> Path:
         path = real_data / "cases" / name
         if not path.is_file():
-            pytest.skip(f"{path} is not there")
+            pytest.skip(f"no such case here: {path} (set CERES_CAL_REAL to a folder that has it)")
         return path
 
     return place

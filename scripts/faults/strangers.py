@@ -20,12 +20,10 @@ from typing import Any
 from photos.real_data import real_folder
 from runner import Row, script
 
+from ceres_cal.formats import EXPORT_FORMATS, IMPORT_FORMATS
+
 PROGRAM = (sys.executable, "-c", "import sys; from ceres_cal.cli import main; sys.exit(main())")
 _ODD = re.compile(r"unexpected|Traceback|[a-z]Warning|\bnan\b|\binf\b|\bNaN\b")
-_FORMATS = {
-    "ssl-vision": "pb", "vision-processor": "yml", "opencv": "yml", "ros": "yaml", "kalibr": "yaml",
-    "mrcal": "cameramodel", "colmap": "", "paper": "txt",
-}  # fmt: skip
 
 
 def odd_words(*arguments: object) -> list[str]:
@@ -44,8 +42,9 @@ def commands(folder: Path, picture: Path) -> Iterator[tuple[object, ...]]:
     yield from (("compare", made, made), ("advise", made), ("project", made, "0,0"))
     yield from (("locate", made, "100,100", "--height-mm", height) for height in (0, 150))
     yield ("undistort", made, picture, "-o", folder / "straight.png")
-    for name, ending in _FORMATS.items():
-        file = folder / f"as_{name}{'.' * bool(ending)}{ending}"
+    there_and_back = (form for form in EXPORT_FORMATS.values() if form.name in IMPORT_FORMATS and not form.edits)
+    for name, endings in ((form.name, form.endings) for form in there_and_back):
+        file = folder / f"as_{name}{next(iter(endings), '')}"
         yield ("export", made, "--to", name, "-o", file)
         yield ("import", file, "--from", name, "-o", folder / f"{name}.json")
         yield ("compare", made, folder / f"{name}.json")

@@ -16,9 +16,7 @@ from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
-from ceres_cal.calibration.outcome import (
-    of_closed_form,
-)
+from ceres_cal.calibration.outcome import of_closed_form
 from ceres_cal.calibration.solving import Explained, Watched, explained, known_of, solved_from
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights, is_bulk
@@ -183,9 +181,8 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
             seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     said = []
     while other := chosen.instead(*seen.outlier_masks(observations)):
-        found = attempt(
-            partial(seen_with, other)
-        )  # reads: "another lens explains observations that were taken out, ..."
+        # reads: "another lens explains observations that were taken out, ..."
+        found = attempt(partial(seen_with, other))
         if isinstance(found, CalibrationError):
             without = "but makes no calibration of all"
             said.append(f"another lens explains observations that were taken out, {without}: {found}")

@@ -29,8 +29,8 @@ from ceres_cal.calibration.lens_seen import (
     Candidate,
     InlierRows,
     Kind,
-    groups_of,
     profiles_of,
+    require_groups,
     seen_through,
 )
 from ceres_cal.observations import Observations
@@ -108,7 +108,7 @@ def compared_kinds(
     total = len(observations.points) + len(observations.curves)
     few = thinned(observations, most_rows if by_most else max(least_rows, int(share * total)), fewest_frames)
     sights = built.held(gather_sights(few), few)
-    groups_of(sights, required=True)
+    require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
     tried = every

@@ -314,7 +314,7 @@ class InlierRows(Frozen):
 
     @cached_property
     def _groups(self) -> Sights:
-        return groups_of(self.sights)
+        return _groups_of(self.sights)
 
     @cached_property
     def _sigma_px(self) -> float:
@@ -345,16 +345,19 @@ def _placed(sights: Sights) -> Mask:
     return placed & (np.count_nonzero(placed) >= fewest_placements)
 
 
-def groups_of(sights: Sights, *, required: bool = False) -> Sights:
-    """A sight of each group: a placement, or, of what stays where it is, a feature; half of a line where these are few.
+_FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
 
-    Raises:
-        FewGroupsError: there is too little to hold out, though it is required.
+
+def _groups_of(sights: Sights) -> Sights:
+    """A sight of each group: a placement, or, of what stays where it is, a feature; half of a line where these are
+    few.
     """
-    fewest = 8  # with fewer nothing tells lenses apart
     placed = _placed(sights)
     groups = sights.by_feature(placed)
-    groups = groups if len(groups) >= fewest else sights.by_feature(placed, halved=True)
-    if required and len(groups) < fewest:
+    return groups if len(groups) >= _FEWEST_GROUPS else sights.by_feature(placed, halved=True)
+
+
+def require_groups(sights: Sights) -> None:
+    """Raise FewGroupsError where there is too little to hold out."""
+    if len(_groups_of(sights)) < _FEWEST_GROUPS:
         raise FewGroupsError("too few views or features to tell lenses apart")
-    return groups

@@ -241,9 +241,10 @@ def _audited_station(one: Agreement) -> Section:
     camera, maps = one.solution.station(), one.change.maps
     off_px, noise_px = excess_px(one)
     known_mm = {} if one.solution.posterior is None else {over.height_m: over.known_mm for over in maps}
-    every = [(f"{sd:.2g} mm" if math.isfinite(sd) else "unknown", 1e3 * h) for h, sd in known_mm.items()]
-    known = ", ".join(f"{amount} at {height_mm:.0f} mm" for amount, height_mm in every)
-    ours = f"ours: {camera!r}" + (f", {'' if known.startswith('unknown') else 'known to '}{known}" if known else "")
+    known = (
+        f"{f'± {sd:.2g} mm' if math.isfinite(sd) else 'unknown'} at {1e3 * h:.0f} mm" for h, sd in known_mm.items()
+    )
+    ours = ", ".join((f"ours: {camera!r}", *known))
     off = f"its picture is off by {off_px:.3f} px rms beyond the noise of {noise_px:.3f} px"
     data: dict[str, Any] = {"trusted": one.holds, "cause": one.cause, "words": one.words}
     data |= {"off_px": off_px, "noise_px": noise_px, "posed": not one.pose_free}

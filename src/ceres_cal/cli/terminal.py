@@ -268,9 +268,9 @@ def _answer(arguments: list[str]) -> int:
 def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
     """What is said of an error, and the exit code."""
     interrupted = 130  # what a shell reports of a program that SIGINT ended
+    most_letters = 200  # of an error that nobody wrote for people
     if isinstance(error.__cause__, KeyboardInterrupt):  # a library that was being loaded makes an ImportError of it
         error = error.__cause__
-    most_letters = 200  # of an error that nobody wrote for people
     match error:
         case CalibrationError():
             return str(error), error.exit_code

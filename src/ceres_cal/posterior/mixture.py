@@ -333,7 +333,6 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
         return weights @ np.where(sized[:, rows], share, np.isinf(each[:, rows]))
 
     # Beside what is lost the rest has to lie nearer than all of it by itself.
-    largest = np.max(
-        np.where(np.isfinite(each) & ~nowhere, np.where(lost > 0.0, _REACH * np.sqrt(square), each), 0.0), 0
-    )
+    reach = np.where(lost > 0.0, _REACH * np.sqrt(square), each)
+    largest = np.max(np.where(np.isfinite(each) & ~nowhere, reach, 0.0), axis=0)
     return np.asarray(np.where(nowhere, np.inf, _root(above, np.zeros_like(largest), largest, tail)))

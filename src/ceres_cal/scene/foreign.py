@@ -32,6 +32,7 @@ _NAMES = {
     THIN_PRISM_FISHEYE: (KannalaBrandt.kind, ("k1", "k2", "p1", "p2", "k3", "k4", "", "")),
 }
 """Model -> the kind of our lenses that it is, and the names of its coefficients there; "" of those that none has."""
+_FISHEYES = (FISHEYE, THIN_PRISM_FISHEYE)  # models of angles, which show what is across, too
 TO_HOLD = ("opencv12", THIN_PRISM_FISHEYE)
 """Models for lenses that they hold exactly: no other lens is fitted by them."""
 _GRID = (41, 31)  # pixels of the image over which a fit is made
@@ -174,7 +175,7 @@ class ForeignCamera(Frozen):
         count = len(start.coefficients)
         numbers = np.array([*start.focal, *start.centre, *start.coefficients])
         sizes = np.array([start.focal[0]] * 2 + [start.focal[0]] * 2 + [1.0] * count)
-        ahead = _ahead(rays)
+        ahead = np.full(len(rays), fill_value=True) if start.model in _FISHEYES else _ahead(rays)
 
         def made(v: Array) -> ForeignCamera:
             return replace(start, focal=_two(v[:2]), centre=_two(v[2:4]), coefficients=tuple(v[4:].tolist()))
@@ -298,7 +299,7 @@ def opencv_models(camera: Camera) -> tuple[str, ...]:
 
 
 def _ahead(rays: Array) -> Mask:
-    """(N,) unit rays that are not across: beside shallower ones tangents grow beyond what functions of them follow."""
+    """(N,) unit rays that models of tangents can show: beside shallower ones these grow beyond all functions."""
     shallowest = 0.1
     return np.asarray(rays[:, 2] > shallowest)
 

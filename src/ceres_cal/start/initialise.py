@@ -65,7 +65,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
     """
-    least_sigmas, better = 5.0, 0.75  # that are left; times as much left: of wrong quarters 1.3 to 20 times
+    least_sigmas, better = 5.0, 0.75  # that are left; share of them: a wrong quarter leaves 1.3 to 20 times as many
     share = 0.22  # of the picture's size, from its middle
     start = _initialised(observations, sights, options)
     for name, size in observations.cameras.items():

@@ -73,7 +73,7 @@ class FieldOptions(Frozen, eq=True):
 
     Attributes:
         camera, station: the names they bear; the station's is that of the camera by default.
-        points: corners and crossings, too, which are extrapolated: lines as long as that are bent as no formula knows.
+        points: corners and crossings, too. They are extrapolated from places of lines, which tell a camera better.
         edges: both edges of the paint instead of its middle.
         left_out: (height, width) pixels that show nothing of the field: hall, walls, people.
         keep_start: nothing farther from the start than 12 px is looked at.
