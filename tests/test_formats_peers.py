@@ -150,7 +150,7 @@ def test_a_camera_that_sees_behind_itself_in_a_model_of_tangents(tmp_path: Path)
 
 
 def test_a_fisheye_is_fitted_by_all_that_it_shows() -> None:
-    """Corners 102 degrees off the axis and a decentring that it has not: 8.2 px at most, 12 by what lies ahead alone."""
+    """Corners 102 degrees off the axis and a decentring that it has not: 8.2 px off at most, 12 by what is ahead."""
     lens = make_lens("kannala-brandt", coefficients={"k1": -0.02, "p1": 0.002, "p2": -0.001})
     assert ForeignCamera.of(replace(with_lens(lens), phi=480.0), FISHEYE).error_px[1] < 8.5
 
