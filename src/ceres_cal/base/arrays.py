@@ -70,6 +70,16 @@ def rms(values: Array, nothing: float = np.nan) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else nothing
 
 
+def grid_places(x: Array, y: Array) -> Array:
+    """(Y * X, 2) all places of a grid x (X,), y (Y,), row by row."""
+    return np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+
+
+def is_diagonal(matrix: Array) -> bool:
+    """Whether all but the diagonal of a matrix (n, n) is nought."""
+    return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
+
+
 def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
     """Which of the known names each one is."""
     order = {name: number for number, name in enumerate(known)}

@@ -158,9 +158,8 @@ def make_table(
     target_of_view = numbers_of((one.target for one in observations.views), observations.targets)
     feature = np.concatenate([points.feature, curves.feature]) + first[is_curve.astype(int), target_of_view[view]]
     pixel = np.concatenate([points.pixels, curves.pixels])
-    residual = np.full((count, 2), np.nan)
-    residual[equations.observation] = 0.0
-    np.add.at(residual, equations.observation, equations.direction * equations.residual[:, None])
+    residual, shown = np.full((count, 2), np.nan), equations.observation
+    residual[shown] = equations.displacement(equations.residual, count)[shown]
     distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
     inlier = inliers.rows
     original = np.concatenate(observations.copies.originals)

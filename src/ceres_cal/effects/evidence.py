@@ -23,7 +23,7 @@ scatter of the others explains (`Offsets`).
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -107,6 +107,8 @@ LEAST_PX = 1e-3
 """Noise that nothing is measured better than: of exact observations rounding repeats, and is no offset."""
 _DETERMINED = 1e-6  # of the largest eigenvalue of V
 _Name = TypeVar("_Name", bound=Hashable)
+Others = Sequence[tuple[Indices, float]]
+"""Numbers of other effects, and the sigma of each."""
 _NO_SCATTER, _AS_IS = np.zeros(1), np.ones(1)
 
 
@@ -288,14 +290,15 @@ class RepeatedAmounts(Frozen):
         freedom = int(np.sum(np.maximum(np.count_nonzero(there, axis=0) - 1, 0)))
         return float(np.sum(squares)) / max(freedom, 1) / self.noise, freedom
 
-    def beside(self, numbers: Indices, others: Indices, sigmas_m: Array) -> tuple[Array, Array]:
-        """Score and information of some numbers, with others scattering by sigmas (K,)."""
+    def _beside(self, numbers: Indices, others: Others) -> tuple[Array, Array]:
+        """Score and information of some numbers, with others scattering by their sigmas."""
         score, information = self.score[numbers], self.information[np.ix_(numbers, numbers)]
         if not len(others):
             return score, information
-        root = sigmas_m / np.sqrt(self.noise)
-        own = np.eye(len(others)) + root[:, None] * self.information[np.ix_(others, others)] * root
-        across = root[:, None] * np.column_stack([self.information[np.ix_(others, numbers)], self.score[others]])
+        at = np.concatenate([own for own, _ in others])
+        root = np.concatenate([np.full(len(own), sigma) for own, sigma in others]) / np.sqrt(self.noise)
+        own = np.eye(len(at)) + root[:, None] * self.information[np.ix_(at, at)] * root
+        across = root[:, None] * np.column_stack([self.information[np.ix_(at, numbers)], self.score[at]])
         taken = across[:, :-1].T @ np.linalg.solve(own, across)
         return score - taken[:, -1], information - taken[:, :-1]
 
@@ -306,9 +309,23 @@ class RepeatedAmounts(Frozen):
         covariance = sigmas[:, None] * np.linalg.inv(inner) * sigmas
         return np.asarray(-covariance @ self.score[numbers] / self.noise), np.asarray(covariance)
 
-    def size(self, numbers: Indices, others: Indices, sigmas: Array, prior: SizePrior) -> tuple[float, float]:
-        """Sigma and probability of some numbers, with others scattering by sigmas (see `RandomEffects`); as they were
-        beforehand where too few sights tell what goes together within them.
+    def scatter(
+        self, numbers: Indices, others: Others, prior: SizePrior, tells: float, within: float = 1.0
+    ) -> tuple[float, float]:
+        """Sigma and probability of some numbers, with others scattering by their sigmas (see `RandomEffects`).
+
+        Args:
+            tells: share of the largest, of directions that tell a size. within: factor on the variance of the scores.
+        """
+        score, information = self._beside(numbers, others)
+        effects = RandomEffects.of(information / within, score / within, 0.0, self.rest, share=tells)
+        effects = replace(effects, freedom=self.spare + len(effects.size))
+        sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))
+        return float(sigma * np.sqrt(self.noise)), probability
+
+    def _size(self, numbers: Indices, others: Others, prior: SizePrior) -> tuple[float, float]:
+        """The same where what goes together within a sight counts as noise; as it was beforehand where too few sights
+        tell that.
         """
         # The same of directions that tell a size. What is free besides takes up nearly all of those that are less
         # determined, and what it does not follow counts there a thousandfold: a board's shear of 3 % explained what a
@@ -317,12 +334,7 @@ class RepeatedAmounts(Frozen):
         within, freedom = self._within(numbers)
         if freedom < _FEWEST:
             return float(np.sqrt(np.mean(np.square(prior.sizes)))), 1.0 - prior.absent
-        within = max(within, 1.0)
-        score, information = self.beside(numbers, others, sigmas)
-        effects = RandomEffects.of(information / within, score / within, 0.0, self.rest, share=tells)
-        effects = replace(effects, freedom=self.spare + len(effects.size))
-        sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))
-        return float(sigma * np.sqrt(self.noise)), probability
+        return self.scatter(numbers, others, prior, tells, max(within, 1.0))
 
     def sizes(
         self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior]
@@ -343,7 +355,6 @@ class RepeatedAmounts(Frozen):
             ):
                 found[name] = before
                 continue
-            at = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[one] for one in beside)])
-            sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[one]), of) for one, of in beside.items())])
-            found[name], asked[name] = self.size(own, at, sigmas, priors[name]), beside
+            others = [(numbers[one], sigma) for one, sigma in beside.items()]
+            found[name], asked[name] = self._size(own, others, priors[name]), beside
         return found

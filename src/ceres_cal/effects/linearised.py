@@ -196,11 +196,9 @@ class Linearised(Frozen):
 
     def decreases(self, columns: Array) -> Array:
         """(Q,) by how much the squared residuals fall with each of the columns (E, Q), px per unit, alone."""
-        scaled = columns * self.weight[:, None]
-        rest, taken = self._projected(scaled)
-        left = np.sum(rest[self.used] ** 2, axis=0) - np.sum(taken**2, axis=0)
-        determined = left > LEAST_LEFT * np.sum(scaled[self.used] ** 2, axis=0)
-        slope = rest[self.used].T @ self.score[self.used] - taken.T @ self.step
+        normal, slope = self.left_of(columns)
+        left, scaled = np.diagonal(normal), columns[self.used] * self.weight[self.used, None]
+        determined = left > LEAST_LEFT * np.sum(scaled**2, axis=0)
         return np.where(determined, slope**2 / np.where(determined, left, 1.0), 0.0)
 
     def taken_by(self, columns: Array) -> Array:

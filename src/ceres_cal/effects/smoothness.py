@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import NOTHING, Array
+from ceres_cal.base.arrays import NOTHING, Array, is_diagonal
 from ceres_cal.base.frozen import replace
 from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem.information import Information, Key
@@ -59,7 +59,7 @@ def _by_sizes(
     another size takes the inverse of what is left alone, a Schur complement, not of everything; along directions in
     which it is one at the `first` sizes, so that inverses are plain.
     """
-    sizes = [int(np.count_nonzero(form)) if _is_diagonal(form) else 0 for form in forms]
+    sizes = [int(np.count_nonzero(form)) if is_diagonal(form) else 0 for form in forms]
     largest = int(np.argmax(sizes))
     turned = np.flatnonzero(np.diagonal(forms[largest]) if sizes[largest] else np.zeros(len(slope)))
     rest = np.setdiff1d(np.arange(len(slope)), turned)
@@ -92,11 +92,7 @@ def _by_sizes(
 def _rank(form: Array) -> int:
     rows = np.any(form != 0.0, axis=1)
     own = form[np.ix_(rows, rows)]
-    return len(own) if _is_diagonal(own) else int(np.linalg.matrix_rank(own, hermitian=True))
-
-
-def _is_diagonal(form: Array) -> bool:
-    return bool(np.count_nonzero(form) == np.count_nonzero(np.diagonal(form)))
+    return len(own) if is_diagonal(own) else int(np.linalg.matrix_rank(own, hermitian=True))
 
 
 def with_smoothness(

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.archives import Column, read_npz
-from ceres_cal.base.arrays import AnyArray, Array
+from ceres_cal.base.arrays import AnyArray, Array, grid_places
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
+from ceres_cal.scene.camera import in_image
 
 if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera
@@ -154,16 +155,15 @@ def _table(camera: Camera, station: str, step: int, x_m: Array, y_m: Array) -> L
     x, y = (step * np.arange(-1, int(np.ceil((size - 0.5) / step)) + 1, dtype=float) for size in camera.image_size)
     flat = camera.homography(), np.array(camera.cam_from_world.rotation[:, 2])
     plain = LookupTable(station, camera.image_size, step, x, y, *_rays(camera, x, y), {}, *flat)
-    pixels = np.column_stack([part.ravel() for part in np.meshgrid(x[:-1] + 0.5 * step, y[:-1] + 0.5 * step)])
-    inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
+    pixels = grid_places(x[:-1] + 0.5 * step, y[:-1] + 0.5 * step)
+    inside = in_image(pixels, camera.image_size)
     errors = field_error_mm(camera, plain.locate, pixels[inside], (x_m, y_m), HEIGHTS_M)
     return replace(plain, error_mm=errors)
 
 
 def _rays(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
     """Where the nodes' rays meet the floor, and how that changes with height, (Y, X, 2) each."""
-    nodes = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
-    floor = camera.locate(nodes)
+    floor = camera.locate(grid_places(x, y))
     slope = (camera.position[:2] - floor) / camera.position[2]
     shape = (len(y), len(x), 2)
     return floor.reshape(shape), slope.reshape(shape)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, grid_places
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import HEIGHTS_M, at_height
 from ceres_cal.formats.format import ExportLoss, ExportRequest
@@ -58,8 +58,8 @@ def field_box(targets: Mapping[str, Target]) -> Box | None:
 
 def field_pixels(camera: Camera, box_m: Box) -> Array:
     """(N, 2) pixels in which the camera shows places evenly over the field and a little above it."""
-    x, y = (part.ravel() for part in np.meshgrid(*box_m))
-    every = [camera.project(np.column_stack([x, y, np.full(len(x), height_m)])) for height_m in HEIGHTS_M]
+    places = grid_places(*box_m)
+    every = [camera.project(np.column_stack([places, np.full(len(places), h)])) for h in HEIGHTS_M]
     pixels = np.concatenate(every)
     return np.asarray(pixels[in_image(pixels, camera.image_size)])
 

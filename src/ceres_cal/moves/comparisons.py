@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, median, numerical
+from ceres_cal.base.arrays import Array, grid_places, median, numerical
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
@@ -135,7 +135,7 @@ def _camera_compared(a: Calibration, b: Calibration, name: str, other: str, with
         raise InputError(f"camera {name!r}: its images are of {sizes}: calibrations of one size can be compared")
     width, height = first.image_size
     x, y = (np.linspace(0.0, n - 1.0, max(2, round(columns * n / width))) for n in (width, height))
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    pixels = grid_places(x, y)
     seen, also = first.rays(pixels), second.rays(pixels)
     both = np.isfinite(seen[:, 0]) & np.isfinite(also[:, 0])
     turn = _common_turn(seen[both], also[both]) if without_turn else np.eye(3)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, grid_places
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.shown import brief, drawn
@@ -30,7 +30,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import STATION_QUANTITIES, Information, Key, over
 from ceres_cal.problem.parameters import Estimate, intrinsic_names
 from ceres_cal.problem.quantities import PixelSlopes, moved, pixel_slopes
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 
 
 class PointSpread(Frozen):
@@ -127,7 +127,7 @@ class FieldGrid(Frozen):
     @property
     def places(self) -> Array:
         """(Y * X, 2) m, row by row."""
-        return np.column_stack([part.ravel() for part in np.meshgrid(self.x_m, self.y_m)])
+        return grid_places(self.x_m, self.y_m)
 
 
 class ErrorMap(FieldGrid, ABC):
@@ -179,8 +179,7 @@ def visible_pixels(estimate: Estimate, station: str, places: Array, height_m: fl
     """Pixels (N, 2) of places (N, 2) m at a height; NaN where the station's image does not show them."""
     camera = estimate.camera_at(station)
     pixels = camera.project(np.column_stack([places, np.full(len(places), height_m)]))
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
+    inside = in_image(pixels, camera.image_size)
     # A ray that comes from below the plane is no view of it, and past the rim of the lens there is no way back.
     back = camera.locate(pixels, height_m)
     with np.errstate(invalid="ignore"):
@@ -294,7 +293,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
         raise InputError(f"there is no camera {camera!r}: it is one of {', '.join(estimate.cameras)}")
     own = estimate.cameras[camera].at(Pose.identity())
     x, y = image_grid(own.image_size)
-    pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    pixels = grid_places(x, y)
 
     def known(picture: Picture) -> Reading:
         shown = Functional(

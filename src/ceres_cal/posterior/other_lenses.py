@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, grid_places
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import HEIGHTS_M
@@ -71,7 +71,7 @@ class OtherLenses(Frozen):
         for name, reach_px in self.reach_px.items():
             camera = self.near.cameras[name]
             x, y = (np.linspace(0.0, side - 1.0, _PLACES) for side in camera.image_size)
-            places = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+            places = grid_places(x, y)
             pixels[name] = places[np.linalg.norm(places - camera.principal_point, axis=1) <= reach_px]
         return pixels
 

@@ -226,6 +226,16 @@ class Equations(Frozen):
     def motion(self) -> Array:
         return self.pose[:, 3:]
 
+    def along(self, displacement: Array) -> Array:
+        """(E,) px of a displacement (N, 2) of the observations along each direction."""
+        return np.asarray(np.sum(displacement[self.observation] * self.direction, axis=1))
+
+    def displacement(self, along: Array, count: int) -> Array:
+        """(N, 2) px of so many observations, of which each is moved by (E,) px along its directions."""
+        moved = np.zeros((count, 2))
+        np.add.at(moved, self.observation, along[:, None] * self.direction)
+        return moved
+
     def of_sights(self, chosen: Mask) -> Mask:
         """(E,) the equations of the chosen sights."""
         return np.asarray(chosen[self.sight])

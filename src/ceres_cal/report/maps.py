@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, grid_places
 from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, image_grid
@@ -231,7 +231,7 @@ def image_figure(material: Material, station: str) -> Figure:
     """The map of one station on the floor, over its image instead of the field."""
     posed = material.calibration.stations[station]
     x, y = image_grid(posed.image_size)
-    pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    pixels = grid_places(x, y)
     radii = np.full(len(pixels), np.nan)
     shown = np.isfinite(posed.locate(pixels)).all(axis=1)
     assert material.uncertainty is not None

@@ -120,8 +120,7 @@ class _Amounts(Frozen):
         """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
         estimate = end.solution.estimate
         equations = write_equations(observations, problem.sights, estimate, end.residuals)
-        along = np.sum(off[equations.observation] * equations.direction, axis=1)
-        equations = replace(equations, residual=equations.residual - along)
+        equations = replace(equations, residual=equations.residual - equations.along(off))
         model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))
         case = Case(observations, problem, estimate, model)
         groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
@@ -168,23 +167,21 @@ class _Amounts(Frozen):
         moved, sd = amounts - before._best[0], np.sqrt(np.diagonal(covariance))
         return self.likely == before.likely and bool(np.all(np.abs(moved) <= _AT_REST * sd))
 
-    def _shift(self, group: _EffectGroup) -> Array:
-        """(E,) px by which a group's best amounts move the model."""
-        return np.asarray(group.columns.of(group.number) @ self._best[0][group.own])
+    @property
+    def _explained(self) -> Array:
+        """(E,) px by which the best amounts of the likely groups move the model."""
+        likely, amounts = (self.groups[number] for number in self.likely), self._best[0]
+        shifts = (group.columns.of(group.number) @ amounts[group.own] for group in likely)
+        return sum(shifts, np.zeros(len(self.case.equations)))
 
     def displacement(self, observations: int) -> Array:
         """(N + M, 2) px by which the best amounts displace the observations."""
-        equations, off = self.case.equations, np.zeros((observations, 2))
-        for number in self.likely:
-            along = self._shift(self.groups[number])[:, None] * equations.direction
-            np.add.at(off, equations.observation, along)
-        return off
+        return self.case.equations.displacement(self._explained, observations)
 
     def estimates(self) -> Iterator[EffectEstimate]:
         """Of what is solved for, and how likely it is that a floor is off, which is not."""
         case, (amounts, covariance) = self.case, self._best
-        explained = sum((self._shift(self.groups[number]) for number in self.likely), np.zeros(len(case.equations)))
-        left = case.model.left_over + case.model.left_of_column(explained * case.model.weight)
+        left = case.model.left_over + case.model.left_of_column(self._explained * case.model.weight)
         for number in self.likely:
             group, (sigma, probability) = self.groups[number], self.sizes[number]
             own, sd = amounts[group.own], np.sqrt(np.diagonal(covariance)[group.own])

@@ -7,7 +7,7 @@ predict elsewhere.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import from_placement
 from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths
+
+if TYPE_CHECKING:
+    from ceres_cal.problem.shares import Histogram
 
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
@@ -186,18 +189,8 @@ class NoiseScales(NamedTuple):
         return self.points * self.reject_sigma, self.curves * self.reject_sigma
 
 
-class Lengths(Protocol):
-    """Lengths of residuals in their stated sigmas, or what was added up of them: of all that can be shown."""
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-
-    def middle(self) -> float:
-        """Their median; 0 of none."""
-
-    def within(self, bound: float) -> tuple[int, float]:
-        """Of those that are no longer, how many, and the sum of their squares."""
+Lengths: TypeAlias = "EachLength | Histogram"
+"""Lengths of residuals in their stated sigmas, or what was added up of them: of all that can be shown."""
 
 
 def noise_of(

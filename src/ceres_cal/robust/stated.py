@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, is_diagonal
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.base.words import two_digits
@@ -106,8 +106,7 @@ class Statement(Frozen):
 
 def is_plain(prior: GaussianPrior) -> bool:
     """Whether each number is stated by itself: not a posterior."""
-    matrix = prior.information.matrix
-    return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
+    return is_diagonal(prior.information.matrix)
 
 
 def statements(problem: Problem, observations: Observations, estimate: Estimate) -> Iterator[Statement]:

@@ -26,7 +26,7 @@ from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
-from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RandomEffects, RepeatedAmounts
+from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model, without_shared
 from ceres_cal.effects.table.lens import LensChanged
 from ceres_cal.observations import Observations
@@ -180,8 +180,7 @@ def _model(
         of_poses: whether nothing else is free, which takes half the time.
     """
     equations = write_equations(observations, problem.sights, estimate, there)
-    along = np.sum(off[equations.observation] * equations.direction, axis=1)
-    equations = replace(equations, residual=equations.residual - along)
+    equations = replace(equations, residual=equations.residual - equations.along(off))
     weights = weights_of(equations)
     silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0
     used = weights.used | silent[equations.sight]
@@ -260,20 +259,16 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     found: dict[str, float] = {}
     for kind in [*numbers] * sweeps:
         found.pop(kind, None)
-        beside = np.concatenate([np.empty(0, dtype=np.int64), *(numbers[other] for other in found)])
-        sigmas = np.concatenate([np.empty(0), *(np.full(len(numbers[other]), of) for other, of in found.items())])
-        score, information = repeated.beside(numbers[kind], beside, sigmas)
-        effects = RandomEffects.of(information, score, 0.0, repeated.rest, share=_TOLD)
-        effects = replace(effects, freedom=repeated.spare + len(effects.size))
+        others = [(numbers[other], sigma) for other, sigma in found.items()]
         prior = LENS_LEAVES if kind == _IMAGE else _MODES[kind][1]
-        sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(repeated.noise)))
+        sigma, probability = repeated.scatter(numbers[kind], others, prior, _TOLD)
         if probability > LIKELY:
-            found[kind] = sigma * np.sqrt(repeated.noise)
+            found[kind] = sigma
     squares = {
         kind: sigma**2 * np.trace(repeated.information[np.ix_(*2 * [numbers[kind]])]) for kind, sigma in found.items()
     }
-    others = repeated.rest + sum(own for kind, own in squares.items() if kind not in (_IMAGE, _READ_OUT))
-    rolling = views >= enough_views and squares.get(_READ_OUT, 0.0) > says_most * others
+    by_others = repeated.rest + sum(own for kind, own in squares.items() if kind not in (_IMAGE, _READ_OUT))
+    rolling = views >= enough_views and squares.get(_READ_OUT, 0.0) > says_most * by_others
     return (found if rolling or _centre_moves(found) else {}), repeated.noise
 
 
@@ -305,11 +300,9 @@ def _predicted(
     coefficients = through @ (covariance @ step) - (left_open @ slope)[:, :, 0]
     moved = np.sum(modes * coefficients[equations.sight], axis=1)
     moved = model.beyond_private((moved * model.weight)[:, None])[:, 0] / model.weight  # what poses do not follow
-    displacement = np.zeros((count, 2))
-    np.add.at(displacement, equations.observation, moved[:, None] * equations.direction)
     return Unsteady(
         sizes,
-        displacement,
+        equations.displacement(moved, count),
         float(np.einsum("sij,sji->", told, left_open)),
         free_keys(estimate, problem.layout, problem.private),
         _shifts(own, common, through, covariance) * np.sqrt(noise),
@@ -326,5 +319,4 @@ def _shifts(own: Linearised, common: Array, through: Array, covariance: Array) -
     taken = common[:, :, : own.shared.shape[1]].transpose(0, 2, 1)
     across = np.sum(taken @ through, axis=0)
     alone = across[:, : taken.shape[1]]
-    values, vectors = np.linalg.eigh(alone + across @ covariance @ across.T)
-    return np.asarray((own.root @ vectors * np.sqrt(np.maximum(values, 0.0))).T)
+    return shifts_by(own.root, alone + across @ covariance @ across.T)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, grid_places
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.least_squares import least_squares
@@ -306,8 +306,7 @@ def _ahead(rays: Array) -> Mask:
 
 def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> Array:
     """(N, 2) pixels evenly over an image, to its very edges."""
-    axes = [np.linspace(-0.5, size - 0.5, count) for size, count in zip(image_size, steps, strict=True)]
-    return np.column_stack([part.ravel() for part in np.meshgrid(*axes)])
+    return grid_places(*(np.linspace(-0.5, size - 0.5, count) for size, count in zip(image_size, steps, strict=True)))
 
 
 def to_opencv(camera: Camera) -> OpenCvCamera:

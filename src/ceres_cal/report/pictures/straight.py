@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, grid_places
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.report.pictures.warp import Warp, make_warp, require_size
@@ -112,8 +112,8 @@ def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
     counted = 100_000  # pixels of a photograph, about, of which it is told whether they are shown
     width, height = camera.image_size
     step = max(1, int(np.sqrt(width * height / counted)))
-    grid = np.meshgrid(np.arange(0.0, width, step), np.arange(0.0, height, step))
-    there = _at_depth_1(camera, np.column_stack([part.ravel() for part in grid]), slope)
+    pixels = grid_places(np.arange(0.0, width, step), np.arange(0.0, height, step))
+    there = _at_depth_1(camera, pixels, slope)
     return float(np.mean(in_image(there * straight.phi + straight.principal_point, straight.image_size)))
 
 
