@@ -30,7 +30,7 @@ from ceres_cal.calibration.calibrating import calibrate, lens_by_held_out
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
 from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
 from ceres_cal.calibration.lens_seen import Candidate
-from ceres_cal.calibration.solving import Explained
+from ceres_cal.calibration.solving import Explained, Task
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.photographs import detect_field
@@ -43,6 +43,7 @@ from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import residuals, write_equations
+from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
@@ -152,10 +153,10 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (no lens can be")]
     explained, gone = solving.explained, {"kannala-brandt"}
 
-    def broken(start: Start, seen: Observations, problem: Problem, *others: Any) -> Explained:
+    def broken(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
         if problem.options.lens in gone:
             raise SolutionError("no camera")
-        return explained(start, seen, problem, *others)
+        return explained(task, start, problem, built)
 
     monkeypatch.setattr(calibrating, "explained", broken)
     calibration = calibrate(seen)
@@ -189,7 +190,7 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     """After every other kind; what it says is said."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
-    def broken(start: Start, seen: Observations, problem: Problem, *_: Any) -> Explained:
+    def broken(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
         asked.append(label_of(problem.options))
         raise SolutionError(f"no camera with {asked[-1]}")
 

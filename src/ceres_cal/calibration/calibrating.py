@@ -17,7 +17,7 @@ from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import of_closed_form
-from ceres_cal.calibration.solving import Explained, Watched, explained, known_of, solved_from
+from ceres_cal.calibration.solving import Explained, Task, explained, known_of, solved_from
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import unfilled
@@ -28,7 +28,7 @@ from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import problem_of
 from ceres_cal.problem.quantities import require_possible_numbers
 from ceres_cal.problem.structure import EXACT, make_structure
-from ceres_cal.robust.as_built import AS_DRAWN, Built, free_dimensions
+from ceres_cal.robust.as_built import Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
@@ -104,7 +104,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(start, observations, sights, options, Watched(knows=knows)).redrawn()
+        return _of_lens(Task(observations, knows=knows), start, sights, options).redrawn()
 
 
 def _measured(
@@ -131,41 +131,40 @@ def _calibrated(
     """See `calibrate`."""
     observations.require_inside()
     if options.closed_form_only or not (client is not None or is_bulk(observations)):
-        return _chosen(observations, options, Watched(progress))
+        return _chosen(Task(observations, progress), options)
     from ceres_cal.robust.bulk import Bulk
 
     digest, bulk = meanwhile(lambda: observations.digest), Bulk(observations, client)
     try:
         part = _part(bulk, options)
-        calibration = _chosen(part.observations, options, Watched(progress, partial(bulk.settled, part)))
+        calibration = _chosen(Task(part.observations, progress, partial(bulk.settled, part)), options)
     finally:
         bulk.close()
     return replace(calibration, digest=digest.result())
 
 
-def _chosen(observations: Observations, options: Options, watched: Watched) -> Calibration:
+def _chosen(task: Task, options: Options) -> Calibration:
     """With the lens that is named, or the one that is chosen."""
-    sights = gather_sights(observations)
+    sights = gather_sights(task.observations)
     if options.lens == AUTO:
-        return _of_any_lens(observations, sights, options, watched)
-    return _of_lens(initialise(observations, sights, options), observations, sights, options, watched)
+        return _of_any_lens(replace(task, chosen=True), sights, options)
+    return _of_lens(task, initialise(task.observations, sights, options), sights, options)
 
 
-def _of_any_lens(observations: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
     """With the lens that the data ask for."""
     from ceres_cal.calibration.lens_choice import choose_lens
     from ceres_cal.calibration.lens_forms import papers
 
+    observations = task.observations
     start = initialise(observations, sights, papers(options))
     if options.closed_form_only:
-        return _of_lens(start, observations, sights, papers(options), watched)
-
-    watched = replace(watched, chosen=True)
+        return _of_lens(task, start, sights, papers(options))
 
     def seen_with(one: Chosen) -> Explained:
         named = replace(one.options, priors=options.priors).with_first_power(len(sights))  # compared without priors
         problem = problem_of(observations, sights, named, one.start.estimate)
-        return explained(one.start, observations, problem, None, watched, one.built)
+        return explained(task, one.start, problem, one.built)
 
     chosen = choose_lens(observations, options, start)
     seen, chosen = chosen.first_solved(seen_with, papers(options), start)
@@ -180,7 +179,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         if chosen.choice.chosen != before.choice.chosen:
             seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     said = []
-    while other := chosen.instead(*seen.outlier_masks(observations)):
+    while other := chosen.instead(*seen.outlier_masks):
         # reads: "another lens explains observations that were taken out, ..."
         found = attempt(partial(seen_with, other))
         if isinstance(found, CalibrationError):
@@ -191,7 +190,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
     last = chosen
 
     def known_with(one: Chosen) -> Calibration:
-        return known_of(seen if one is last else seen_with(one), observations, None, watched)
+        return known_of(seen if one is last else seen_with(one))
 
     calibration, chosen = last.first_solved(known_with, papers(options), start)
     if calibration.posterior is not None and (others := chosen.others) is not None:
@@ -215,20 +214,13 @@ def _part(bulk: Bulk, options: Options) -> Subset:
     return bulk.part(bulk.standing_out(solve_robustly(problem, few, start.estimate, is_near=start.is_near)))
 
 
-def _of_lens(
-    start: Start,
-    observations: Observations,
-    sights: Sights,
-    options: Options,
-    watched: Watched,
-    built: Built = AS_DRAWN,
-) -> Calibration:
+def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
     """With a lens that is named."""
     options = options.with_first_power(len(sights))
-    problem = problem_of(observations, sights, options, start.estimate)
+    problem = problem_of(task.observations, sights, options, start.estimate)
     if options.closed_form_only:
-        return of_closed_form(start, observations, problem)
-    return solved_from(start, observations, problem, watched=watched, built=built)
+        return of_closed_form(start, task.observations, problem)
+    return solved_from(task, start, problem)
 
 
 @or_none  # quiet: the caller raises the first failure

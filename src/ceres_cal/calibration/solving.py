@@ -36,7 +36,7 @@ from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
-from ceres_cal.robust.competing import Subproblem, compete
+from ceres_cal.robust.competing import Solver, Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
@@ -51,40 +51,31 @@ if TYPE_CHECKING:
     from ceres_cal.robust.bulk import Settled
 
 
-class Again(Frozen, eq=True):
-    """How a calibration is taken up again after an earlier one.
+class Task(Frozen):
+    """What is solved for, and who is told of it.
 
     Attributes:
-        known: the layout of everything that is known by a posterior, also where the solve holds it.
-        scales: noise scales of points and curves that were seen before; None for those of these observations alone.
-        assessed: whether the posterior is wanted.
+        progress: called at every iteration. settle: where these observations are a part, what solves for all of them
+            from the end of the part, see `Bulk.settled`.
+        tested: whether what was stated is held against everything else. knows: whether it is then asked what is known
+            of the numbers. chosen: whether the data chose the lens: what one that is too simple leaves looks like a
+            principal point that moves.
+        before: of a calibration that is taken up again, the layout of everything that is known by a posterior, also
+            where the solve holds it. scales: noise scales of points and curves that were seen before it.
     """
 
-    known: Layout
-    scales: tuple[float, float] | None
-    assessed: bool = True
-
-
-class Watched(Frozen):
-    """Who is told of the solves, and what solves for all observations where these are a part.
-
-    Attributes:
-        progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
-        knows: whether it is asked what is then known of the numbers. chosen: whether the data chose the lens: what one
-            that is too simple leaves looks like a principal point that moves.
-    """
-
+    observations: Observations
     progress: Callable[[Progress], None] | None = None
     settle: Callable[..., Settled] | None = None
+    tested: bool = True
     knows: bool = True
     chosen: bool = False
-
-
-_UNWATCHED = Watched()
+    before: Layout | None = None
+    scales: tuple[float, float] | None = None
 
 
 class Explained(Frozen):
-    """A solution, and what explains the observations that it does not fit.
+    """A solution of a task, and what explains the observations that it does not fit.
 
     Attributes:
         explanations: what else groups of observations may be. as_built: how targets were built.
@@ -92,10 +83,11 @@ class Explained(Frozen):
         unsteady: what moves single views. digest: of the observations, which remember it, while it is worked out.
     """
 
+    task: Task
     problem: Problem
     start: Start
     end: RobustSolution
-    explanations: tuple[Explanation, ...]
+    explanations: tuple[Explanation, ...] = ()
     as_built: tuple[AsBuilt, ...] = ()
     beside: EffectsEnd | None = None
     others: tuple[Solution, ...] = ()
@@ -109,22 +101,25 @@ class Explained(Frozen):
         asked = every if rough else of_placements(every)
         return bool(len(asked)) and LeftOver.of_end(self.end, asked).asks_for_more
 
-    def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+    @property
+    def outlier_masks(self) -> tuple[Mask, Mask]:
         """See `Calibration.outlier_masks`."""
         inliers = self.end.inliers
         if inliers.rows.all():
             return ~inliers.points, ~inliers.curves
-        return self.came_out(observations).outlier_masks(observations)
+        return self.came_out.outlier_masks(self.task.observations)
 
-    def came_out(self, observations: Observations) -> Calibration:
+    @property
+    def came_out(self) -> Calibration:
         """The calibration, not assessed."""
         if self.digest is not None:
             self.digest.result()
-        return came_out(self.start.phi_from, observations, self.problem, self.end, self.explanations)
+        return came_out(self.start.phi_from, self.task.observations, self.problem, self.end, self.explanations)
 
-    def effects(self, observations: Observations) -> tuple[EffectEstimate, ...]:
+    @property
+    def effects(self) -> tuple[EffectEstimate, ...]:
         """What was solved for beside the problem."""
-        moving = self.unsteady.estimates(observations) if self.unsteady else ()
+        moving = self.unsteady.estimates(self.task.observations) if self.unsteady else ()
         return (*moving, *(self.beside.estimates if self.beside else ()))
 
     @property
@@ -140,23 +135,16 @@ class Explained(Frozen):
 
         return shifts_at
 
-    def without(self, conflicts: Conflicts, observations: Observations) -> Explained:
+    def without(self, conflicts: Conflicts) -> Explained:
         """The answer without what was stated and everything else contradicts."""
         if conflicts.answer is None:
             return self
         problem = replace(self.problem, priors=conflicts.answer.problem.priors)
-        shown = residuals(observations, problem.sights, conflicts.answer.solution.estimate)
+        shown = residuals(self.task.observations, problem.sights, conflicts.answer.solution.estimate)
         return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
 
 
-def solved_from(
-    start: Start,
-    observations: Observations,
-    problem: Problem,
-    again: Again | None = None,
-    watched: Watched = _UNWATCHED,
-    built: Built = AS_DRAWN,
-) -> Calibration:
+def solved_from(task: Task, start: Start, problem: Problem, built: Built = AS_DRAWN) -> Calibration:
     """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.
 
     Args:
@@ -165,43 +153,41 @@ def solved_from(
     Raises:
         CalibrationError: see `calibrate`.
     """
-    return known_of(explained(start, observations, problem, again, watched, built), observations, again, watched)
+    return known_of(explained(task, start, problem, built))
 
 
-def explained(
-    start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched, built: Built
-) -> Explained:
+def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
     """Solve and explain what is left; see `solved_from`."""
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
+    observations = task.observations
     takes_long = len(observations.points) + len(observations.curves) > long_to_digest
-    digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
-    seen, may_move = _solved(start, observations, problem, again, watched, built), watched.chosen and not watched.settle
-    steady = _made_steady(seen, observations, problem, watched) if may_move else None
+    digest = meanwhile(lambda: observations.digest) if takes_long and task.settle is None else None
+    seen, may_move = _solved(task, start, problem, built), task.chosen and not task.settle
+    steady = _made_steady(seen, problem) if may_move else None
     if steady is None:
-        seen = _explained(seen, observations, problem.sights, again, watched, built)
+        seen = _explained(seen, problem.sights, built)
         may_move = may_move and bool(seen.explanations or seen.as_built)
-        steady = _made_steady(seen, observations, problem, watched) if may_move else None
+        steady = _made_steady(seen, problem) if may_move else None
     return replace(steady or seen, digest=digest)
 
 
-def known_of(seen: Explained, observations: Observations, again: Again | None, watched: Watched) -> Calibration:
+def known_of(seen: Explained) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
-    conflicts, assessed = Conflicts(), again is None or again.assessed
-    if assessed:
-        part = taking_part(seen.problem, observations, seen.explanations) if again is None else None
-        usual = again.scales if again else None
-        conflicts = find_conflicts(seen.problem, observations, seen.end, usual, part, seen.shifts_at)
-        seen = seen.without(conflicts, observations)
+    task, observations, conflicts = seen.task, seen.task.observations, Conflicts()
+    if task.tested:
+        part = None if task.before is not None else taking_part(seen.problem, observations, seen.explanations)
+        conflicts = find_conflicts(seen.problem, observations, seen.end, task.scales, part, seen.shifts_at)
+        seen = seen.without(conflicts)
     settled = None
-    if watched.settle is not None:
-        settled = watched.settle(seen.problem, seen.end, seen.explanations, watched.progress)
+    if task.settle is not None:
+        settled = task.settle(seen.problem, seen.end, seen.explanations, task.progress)
         seen = replace(seen, end=settled.end)
     explanations = settled.explanations if settled else seen.explanations
-    effects = seen.effects(observations)
+    effects = seen.effects
     warnings = (*(one.warning for one in explanations), *(one.warning for one in effects if one.is_solved))
     posterior = None
-    if assessed and watched.knows:
-        seen, posterior = _known(seen, observations, conflicts, again)
+    if task.tested and task.knows:
+        seen, posterior = _known(seen, conflicts)
         alike = seen_alike(seen.others, seen.end.solution.estimate, posterior.half_width)
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
         strange = (
@@ -209,7 +195,7 @@ def known_of(seen: Explained, observations: Observations, again: Again | None, w
             *seen_from_behind(seen.end.solution.estimate, observations),
         )
         warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
-    calibration = seen.came_out(observations)
+    calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)
     wholes = [one.rows for one in seen.explanations if one.is_taken]
@@ -220,7 +206,7 @@ def known_of(seen: Explained, observations: Observations, again: Again | None, w
     return replace(calibration, options=options, as_built=seen.as_built, effects=effects)
 
 
-def _made_steady(first: Explained, observations: Observations, problem: Problem, watched: Watched) -> Explained | None:
+def _made_steady(first: Explained, problem: Problem) -> Explained | None:
     """With what displaces single views taken off, and again as it is found then; None where nothing does.
 
     It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
@@ -229,7 +215,7 @@ def _made_steady(first: Explained, observations: Observations, problem: Problem,
     At rest the predictions follow the noise: halves differ by 1.7 of what is stated where they do by 1.4 after twice.
     """
     twice = 2
-    seen, unsteady = first, None
+    task, observations, seen, unsteady = first.task, first.task.observations, first, None
     for _ in range(twice):
         unsteady = find_unsteady(seen.problem, observations, seen.end, unsteady)
         if unsteady is None:  # or what seemed to move was what the lens or the target left
@@ -239,57 +225,48 @@ def _made_steady(first: Explained, observations: Observations, problem: Problem,
         options = replace(problem.options, powers=named.powers, terms=named.terms)
         again = problem_of(observations, problem.sights, options, start)
         steady = unsteady.taken_off(again, len(observations.points))
-        end = solve_robustly(steady, observations, start, None, watched.progress, is_near=True)
-        solved = Explained(steady, replace(first.start, estimate=start, is_near=True), end, ())
-        seen = replace(_explained(solved, observations, steady.sights, None, watched, AS_DRAWN), unsteady=unsteady)
+        end = solve_robustly(steady, observations, start, None, task.progress, is_near=True)
+        solved = Explained(task, steady, replace(first.start, estimate=start, is_near=True), end)
+        seen = replace(_explained(solved, steady.sights, AS_DRAWN), unsteady=unsteady)
     return seen
 
 
-def _solved(
-    start: Start, observations: Observations, problem: Problem, again: Again | None, watched: Watched, built: Built
-) -> Explained:
+def _solved(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
     """Solve, reject, solve: nothing else is explained yet, and targets are drawn as they seemed to be built."""
-    usual = again.scales if again else None
+    observations = task.observations
     problem = replace(problem, sights=built.held(problem.sights, observations))
-    end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
-    if again is None:
-        problem, start, end = _as_long_as_asked(problem, observations, start, end, watched.progress)
-        require_measured(end.problem, end.solution.estimate)
-    return Explained(problem, start, end, ())
+    end = solve_robustly(problem, observations, start.estimate, task.scales, task.progress, is_near=start.is_near)
+    seen = Explained(task, problem, start, end)
+    if task.before is None:
+        seen = _as_long_as_asked(seen)
+        require_measured(seen.end.problem, seen.end.solution.estimate)
+    return seen
 
 
-def _explained(
-    first: Explained, observations: Observations, drawn: Sights, again: Again | None, watched: Watched, built: Built
-) -> Explained:
+def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
     """Let explanations compete; solve for targets as built, where they are drawn otherwise, and for effects."""
+    task, observations = first.task, first.task.observations
 
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
-        usual = again.scales if again else None
-        return solve_robustly(others, some.observations, _start_of(others, some, first.start, again), usual)
+        return solve_robustly(others, some.observations, _start_of(others, some, first), task.scales)
 
     end, explanations = compete(first.problem, observations, first.end, solved)
-    seen = Explained(replace(first.problem, sights=drawn), first.start, end, explanations)
-    if again is None:
-        seen = _of_targets(seen, observations, solved, watched, built)
+    seen = Explained(task, replace(first.problem, sights=drawn), first.start, end, explanations)
+    if task.before is None:
+        seen = _of_targets(seen, solved, built)
     require_fits(seen.end, seen.problem)
     require_possible(observations, seen.problem.sights, seen.end.solution.estimate, seen.end.residuals)
     return seen
 
 
-def _of_targets(
-    seen: Explained,
-    observations: Observations,
-    solved: Callable[[Problem, Subproblem], RobustSolution],
-    watched: Watched,
-    built: Built,
-) -> Explained:
+def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
-    is_asked = problem.options.as_built == "estimate"
+    observations, is_asked = seen.task.observations, problem.options.as_built == "estimate"
     if is_asked:
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved, built)
     if is_asked and estimated(observations):
-        part, is_all = taking_part(problem, observations, explanations), watched.settle is None
+        part, is_all = taking_part(problem, observations, explanations), seen.task.settle is None
         beside = solve_beside_effects(problem, part, observations, end, solves=is_all)
         problem, end = beside.problem, beside.end
     others: tuple[Solution, ...] = ()
@@ -297,31 +274,30 @@ def _of_targets(
         least, others = least_of_few(end.problem, end.solution.estimate, seen.start.others)
         if least is not end.solution.estimate:
             end = replace(end.moved_to(least, observations, problem), reduced=None)
-    return Explained(problem, seen.start, end, explanations, as_built, beside, others)
+    return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside, others)
 
 
-def _known(
-    seen: Explained, observations: Observations, conflicts: Conflicts, again: Again | None
-) -> tuple[Explained, Posterior]:
+def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]:
     """What is known of every number, with what the lens hides and whatever else may be."""
-    end, posterior = _assess(seen, observations, again)
-    if again is None:
+    end, posterior = _assess(seen)
+    is_new = seen.task.before is None
+    if is_new:
         require_lens_told(end.solution.estimate, posterior)
     known = seen if end is seen.end else replace(seen, end=end)
-    if again is None and known.leaves_alike:
-        posterior = posterior.widened(*shifts_by_roughness(end, observations))
+    if is_new and known.leaves_alike:
+        posterior = posterior.widened(*shifts_by_roughness(end, seen.task.observations))
     return known, with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
-def _assess(seen: Explained, observations: Observations, again: Again | None) -> tuple[RobustSolution, Posterior]:
+def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
     Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
     """
-    end = seen.end
-    known = end.problem if again is None else replace(end.problem, layout=again.known)
+    end, before, observations = seen.end, seen.task.before, seen.task.observations
+    known = end.problem if before is None else replace(end.problem, layout=before)
     estimate = end.solution.estimate
-    reduced = end.reduced if again is None else None
+    reduced = end.reduced if before is None else None
     reduced = reduced or information(known, estimate)
 
     def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
@@ -334,30 +310,24 @@ def _assess(seen: Explained, observations: Observations, again: Again | None) ->
     return (end if assessed is estimate else end.moved_to(assessed, observations, seen.problem)), posterior
 
 
-def _start_of(others: Problem, some: Subproblem, start: Start, again: Again | None) -> Estimate:
+def _start_of(others: Problem, some: Subproblem, first: Explained) -> Estimate:
     """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
     alike = set(others.sights.keys) == set(some.problem.sights.keys)
-    if again is not None or not alike or all(key.placement is None for key in others.sights.keys):
-        return start.estimate  # that of the world was found with what does not belong among the rest
+    if first.task.before is not None or not alike or all(key.placement is None for key in others.sights.keys):
+        return first.start.estimate  # that of the world was found with what does not belong among the rest
     return initialise(some.observations, others.sights, others.options).estimate
 
 
-def _as_long_as_asked(
-    problem: Problem,
-    observations: Observations,
-    start: Start,
-    end: RobustSolution,
-    progress: Callable[[Progress], None] | None,
-) -> tuple[Problem, Start, RobustSolution]:
-    """The problem with the lens that the residuals ask for where nothing is stated of its powers, its start and end.
+def _as_long_as_asked(seen: Explained) -> Explained:
+    """With the lens that the residuals ask for where nothing is stated of its powers.
 
     A lens without a formula has all of its terms where residuals of different views agree from place to place. How
     large their numbers are the data say in any case (`effects/smoothness.py`): they cost time.
     """
-    options = problem.options
+    options, observations, progress = seen.problem.options, seen.task.observations, seen.task.progress
     if options.powers:
-        return problem, start, end
-    problem, end = _named(problem), replace(end, problem=_named(end.problem))
+        return seen
+    problem, end = _named(seen.problem), replace(seen.end, problem=_named(seen.end.problem))
     longer = replace(options, terms=tuple(options.blank_lens.more_terms))
     may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
     if may_grow and LeftOver.of_end(end).in_cells > AGREES:
@@ -367,7 +337,8 @@ def _as_long_as_asked(
         found = attempt(lambda: solve_robustly(try_of, observations, near, progress=progress))
         if isinstance(found, RobustSolution) and _shows_all(found):
             problem, end = _named(try_of), replace(found, problem=_named(found.problem))
-    return problem, replace(start, estimate=_seen_longer(start.estimate, problem.options)), end
+    start = replace(seen.start, estimate=_seen_longer(seen.start.estimate, problem.options))
+    return replace(seen, problem=problem, start=start, end=end)
 
 
 def _named(problem: Problem) -> Problem:

@@ -16,7 +16,7 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted
-from ceres_cal.calibration.solving import Again, Watched, solved_from
+from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
     judged,
     old_poses,
@@ -78,8 +78,8 @@ def refit(
 
     def solved_with(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
         problem, known = refit_problem(plan, what, start)
-        again = Again(known, plan.scales, assessed)
-        return solved_from(Start(start, phi_from), plan.observations, problem, again, Watched(progress))
+        task = Task(plan.observations, progress, tested=assessed, before=known, scales=plan.scales)
+        return solved_from(task, Start(start, phi_from), problem)
 
     result = solved_with(what, estimate, assessed=True)
     try:

@@ -12,7 +12,7 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.solving import Again, solved_from
+from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.agreement import Agreement, Agreements, Misfit, matched, require_stations
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations
@@ -63,7 +63,8 @@ def score(
         raise InputError("with its stations held nothing is left to be posed: `ceres-cal check` is for that")
     start = Start(_start(calibration, observed, sights, known), calibration.phi_from)
     priors = gather_priors(observed, given, EXACT)
-    posed = solved_from(start, observed, Problem(sights, layout, priors, options=given), Again(layout, None, False))
+    task = Task(observed, tested=False, before=layout)
+    posed = solved_from(task, start, Problem(sights, layout, priors, options=given))
     left = residuals(observed, sights, posed.estimate)
     noise = _noise_ratios(posed, calibration)
     views = [(view.camera, _view(number, observed, left, posed, noise)) for number, view in enumerate(observed.views)]
