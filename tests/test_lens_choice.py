@@ -270,10 +270,11 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
 
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
     start = initialise(observations, gather_sights(observations), options)
-    every = choose_lens(observations, Options(), start).others
+    every = choose_lens(observations, Options(), start).among
+    assert every is not None and every.others.others
     monkeypatch.setattr(seen, "solve", solved)
-    few = choose_lens(observations, Options(), start).others
-    assert every is not None and every.others and few is not None and not few.others
+    few = choose_lens(observations, Options(), start).among
+    assert few is not None and not few.others.others
 
 
 def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,8 +283,9 @@ def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: 
     start = initialise(observations, gather_sights(observations), options)
     chosen = choose_lens(observations, Options(), start)
     monkeypatch.setattr(seen, "_KEPT", 0.0)
-    few = chosen.others
-    assert few is not None and not few.others and not few.failed
+    assert chosen.among is not None
+    few = chosen.among.others
+    assert not few.others and not few.failed
 
 
 def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:

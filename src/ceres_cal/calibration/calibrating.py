@@ -179,7 +179,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         if chosen.choice.chosen != before.choice.chosen:
             seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     said = []
-    while other := chosen.instead(*seen.outlier_masks):
+    while chosen.among is not None and (other := chosen.among.instead(*seen.outlier_masks)):
         # reads: "another lens explains observations that were taken out, ..."
         found = attempt(partial(seen_with, other))
         if isinstance(found, CalibrationError):
@@ -193,7 +193,8 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         return known_of(seen if one is last else seen_with(one))
 
     calibration, chosen = last.first_solved(known_with, papers(options), start)
-    if calibration.posterior is not None and (others := chosen.others) is not None:
+    if calibration.posterior is not None and chosen.among is not None:
+        others = chosen.among.others
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
         if others.failed:

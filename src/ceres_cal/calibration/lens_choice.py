@@ -86,19 +86,6 @@ class Chosen(Frozen):
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
 
-    @property
-    def others(self) -> OtherLenses | None:
-        """What other lenses would say, as far as they are probable; None where nothing was compared."""
-        return None if self.among is None else self.among.others
-
-    def instead(self, points: Mask, curves: Mask) -> Chosen | None:
-        """The lens in its place, where others explain what it takes out of the observations; None where none does.
-
-        Args:
-            points, curves: (N,), (M,) which ones that is.
-        """
-        return None if self.among is None else self.among.instead(points, curves)
-
 
 class Comparison(Frozen):
     """The lenses that were compared, and the one that was chosen.
@@ -136,7 +123,7 @@ class Comparison(Frozen):
 
     @cached_property
     def others(self) -> OtherLenses:
-        """What other lenses would say; nothing beside one without a formula."""
+        """What other lenses would say, as far as they are probable; nothing beside one without a formula."""
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
@@ -169,8 +156,12 @@ class Comparison(Frozen):
         return Chosen(form.of(self.seen.options), start, _choice(self), self)
 
     def instead(self, points: Mask, curves: Mask) -> Chosen | None:
-        """See `Chosen.instead`; of very many observations some were compared, and the rest is not looked at. What
-        predicts clearly better, a lens without a formula, stays.
+        """The lens in place of the chosen one, where others explain what it takes out of the observations; None where
+        none does. Of very many observations some were compared, and the rest is not looked at. What predicts clearly
+        better, a lens without a formula, stays.
+
+        Args:
+            points, curves: (N,), (M,) the observations that it takes out.
         """
         if self.share < 1.0 or self.chosen.form.blank.roughness:
             return None

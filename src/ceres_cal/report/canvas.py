@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from msgspec import Struct
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, replace
@@ -70,11 +69,8 @@ _STYLE: dict[str, Any] = {
 }
 
 
-class Drawing(Struct, frozen=True):
-    """What is drawn: `draw(axes, width_in)` into one pair of axes; `height` over width of the whole."""
-
-    draw: Callable[[Axes, float], None]
-    height: float
+Draw = Callable[["Axes", float], None]
+"""Draws into one pair of axes, for a picture of a width in inches."""
 
 
 class Hover(Frozen, eq=True):
@@ -103,10 +99,11 @@ class Hover(Frozen, eq=True):
         return replace(self, names=(tuple(columns), tuple(rows)))
 
 
-def to_svg(drawing: Drawing, width_in: float, name: str, *, whole_file: bool = False) -> str:
+def to_svg(draw: Draw, height: float, width_in: float, name: str, *, whole_file: bool = False) -> str:
     """An <svg> element to stand in a page, or the text of a file of its own.
 
     Args:
+        height: over the width, of the whole.
         name: one of its own on the page: what the element calls its parts begins with it.
     """
     from matplotlib import rc_context
@@ -115,12 +112,12 @@ def to_svg(drawing: Drawing, width_in: float, name: str, *, whole_file: bool = F
 
     style: Any = {**_STYLE, "svg.hashsalt": name}
     with rc_context(style):
-        figure = Figure(figsize=(width_in, width_in * drawing.height), layout="constrained")
+        figure = Figure(figsize=(width_in, width_in * height), layout="constrained")
         engine = figure.get_layout_engine()
         assert engine is not None
         engine.set(w_pad=0.03, h_pad=0.03)  # type: ignore[call-arg]
         axes = figure.add_subplot()
-        drawing.draw(axes, width_in)
+        draw(axes, width_in)
         stream = io.StringIO()
         write: Any = FigureCanvasSVG(figure).print_svg
         write(stream, metadata={"Date": None, "Creator": None})

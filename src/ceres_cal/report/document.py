@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from ceres_cal.report.canvas import Drawing, Hover
+    from ceres_cal.report.canvas import Draw, Hover
 
 WIDTH = 100
 """Of a text for people, in letters."""
@@ -68,17 +68,17 @@ class Table(NamedTuple):
 class Figure(NamedTuple):
     """A picture with a title, a sentence that says how to read it, and the table behind it.
 
-    A wide one is drawn twice, for a wide and for a narrow window. `hover` is what is said beside the pointer; whoever
-    has none finds it in the table.
+    One that has a `wide_height` is drawn twice, for a wide and for a narrow window; heights are over the width. `hover`
+    is what is said beside the pointer; whoever has none finds it in the table.
     """
 
     name: str
     title: str
     reading: str
-    drawing: Drawing
+    draw: Draw
     table: Table
-    wide: bool = False
-    narrow_drawing: Drawing | None = None
+    height: float = 0.66
+    wide_height: float | None = None
     hover: Hover | None = None
 
 
@@ -89,7 +89,6 @@ class PhotoFigure(NamedTuple):
     title: str
     reading: str
     jpeg: bytes
-    wide: bool = True
 
 
 class Gallery(NamedTuple):

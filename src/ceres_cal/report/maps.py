@@ -12,7 +12,7 @@ from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, image_grid
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
+from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Draw, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
@@ -46,8 +46,8 @@ def field_drawing(
     fields: Iterable[Target],
     worst_m: tuple[float, float] | None = None,
     observed: Array | None = None,
-) -> Drawing:
-    """A map over the field, with the field's lines, the border of the image, and the camera on top.
+) -> tuple[Draw, float]:
+    """A map over the field, with the field's lines, the border of the image, and the camera on top; and its height.
 
     Args:
         grid: x (X,) and y (Y,) m. values: (Y, X) mm, NaN where nothing is shown, infinite where nothing can be said.
@@ -73,7 +73,7 @@ def field_drawing(
         axes.grid(visible=False)
         MM.bar(axes, label)
 
-    return Drawing(draw, min(max(float(np.ptp(y_m) / np.ptp(x_m)) * 0.9 + 0.2, 0.4), 1.4))
+    return draw, min(max(float(np.ptp(y_m) / np.ptp(x_m)) * 0.9 + 0.2, 0.4), 1.4)
 
 
 def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> None:
@@ -113,7 +113,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
     """One map of one station over the field, at one of its heights."""
     one, drawn = material.maps[station][number], material.drawn_maps[station][number]
     posed = material.calibration.stations[station]
-    drawing = field_drawing(
+    draw, height = field_drawing(
         (drawn.x_m, drawn.y_m),
         drawn.radius_95_mm,
         LABEL,
@@ -129,8 +129,9 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         where + _named(material, station),
         f"{_reading(one)}. Dashed: the border of the image, open beyond it. Triangle: the camera."
         + (" Dots: observations." if one.height_m == 0.0 else ""),
-        drawing,
+        draw,
         grid_table(f"{LABEL}, at y \\ x", one.radius_95_mm[::-1], one.x_m, one.y_m[::-1], "{:.1f} m"),
+        height,
         hover=Hover.of(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
     )
 
@@ -215,8 +216,9 @@ def _over_image(
         *name[:2],
         f"{name[2]} Dots: observations, in {_covered(observed, image_size)} of 192 parts of the image. Where there are "
         "none, the lens model is extrapolated.",
-        Drawing(draw, 0.92 * height / width + 0.2),
+        draw,
         grid_table(f"95 % within, {unit}, at y \\ x", radii, *grid, "{:.0f} px"),
+        0.92 * height / width + 0.2,
         hover=Hover.of(*grid, spoken(radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
     )
 
@@ -270,4 +272,4 @@ def comparison_svg(comparison: Agreement, before: Calibration) -> str:
     label = f"{comparison.name}, {at_height(over.height_m)}: difference, mm ({over.mean_mm:.2f} on average)"
     grid, camera = (over.x_m, over.y_m), before.stations[comparison.name]
     drawing = field_drawing(grid, over.errors_mm, label, camera, over.height_m, fields)
-    return canvas.to_svg(drawing, canvas.WIDE_IN, "comparison", whole_file=True)
+    return canvas.to_svg(*drawing, canvas.WIDE_IN, "comparison", whole_file=True)

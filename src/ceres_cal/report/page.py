@@ -59,14 +59,14 @@ def _(piece: document.Figure) -> str:
     label = f'role="img" aria-label="{escape(piece.title)}"'
     if piece.hover is not None:
         label += f' data-hover="{escape(json.dumps(vars(piece.hover), separators=(",", ":"), ensure_ascii=False))}"'
-    narrow = to_svg(piece.narrow_drawing or piece.drawing, NARROW_IN, f"{piece.name}-narrow")
-    if piece.wide:
-        wide = to_svg(piece.drawing, WIDE_IN, f"{piece.name}-wide")
+    narrow = to_svg(piece.draw, piece.height, NARROW_IN, f"{piece.name}-narrow")
+    if piece.wide_height is not None:
+        wide = to_svg(piece.draw, piece.wide_height, WIDE_IN, f"{piece.name}-wide")
         drawn = f'<div class="on-wide" {label}>{wide}</div><div class="on-narrow" {label}>{narrow}</div>'
     else:
         drawn = f"<div {label}>{narrow}</div>"
     return (
-        f'<figure id="{escape(piece.name)}"{_class("wide" if piece.wide else "")}><h3>{escape(piece.title)}</h3>'
+        f'<figure id="{escape(piece.name)}"{_class("wide" if piece.wide_height else "")}><h3>{escape(piece.title)}</h3>'
         f'{drawn}<div class="reading"><figcaption>{escape(piece.reading)}</figcaption>'
         f"<details><summary>The numbers behind it</summary>{html(piece.table)}</details></div></figure>"
     )
@@ -85,7 +85,8 @@ def _(piece: document.PhotoFigure) -> str:
 @html.register
 def _(piece: document.Gallery) -> str:
     elements = [html(picture) for picture in piece.pictures]
-    if sum(not picture.wide for picture in piece.pictures) % 2 and not piece.pictures[-1].wide:
+    in_a_column = [isinstance(one, document.Figure) and one.wide_height is None for one in piece.pictures]
+    if sum(in_a_column) % 2 and in_a_column[-1]:
         elements[-1] = elements[-1].replace("<figure ", '<figure class="lone" ', 1)
     return f'<div class="gallery">{"".join(elements)}</div>'
 

@@ -14,7 +14,7 @@ from ceres_cal.base.words import fixed, grouped, short
 from ceres_cal.diagnostics import ResidualTable
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summary
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
+from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.findings import summary_table
 from ceres_cal.report.material import Material, paint_of
@@ -61,10 +61,10 @@ def vectors(material: Material, name: str) -> Figure:
         "times. For a line or arc it is the shortest way to the curve. Strokes in random directions are noise. "
         f"Thick: means of regions that noise cannot explain ({len(means[0])} of {means[2]}). Where they grow "
         f"or turn together, the model is wrong.{_thinned(sum(map(len, shown)), len(inliers) + len(outliers))}",
-        Drawing(draw, 0.93 * shape + 0.07),
+        draw,
         _region_table(material.diagnosis.summaries.regions, name),
-        wide=True,
-        narrow_drawing=Drawing(draw, 0.86 * shape + 0.18),
+        0.86 * shape + 0.18,
+        0.93 * shape + 0.07,
     )
 
 
@@ -221,7 +221,7 @@ def against_radius(material: Material, name: str) -> Figure:
         f"Residuals against the radius{owner_suffix(material, name)}",
         "Each dot is the component of a residual away from the principal point. The trend should stay at 0 within its "
         f"band. A wave means that the lens needs more coefficients.{_thinned(len(drawn), len(known))}",
-        Drawing(draw, 0.66),
+        draw,
         Table(("radius, px", "trend px", "± sd", "mean / sd"), tuple(_trend_rows(trend))),
     )
 
@@ -272,7 +272,7 @@ def by_frame(material: Material) -> Figure:
         "Residuals frame by frame",
         "Root mean square residual of each frame in units of the expected noise; 1 is normal. A single high frame "
         "has wrong labels, motion blur or a moved camera. A lasting step means that the camera moved at that frame.",
-        Drawing(draw, 0.66),
+        draw,
         summary_table("frame", frames, range(len(frames.names))),
         hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
     )
@@ -322,11 +322,12 @@ def outliers(material: Material) -> Figure | None:
         f"{grouped(len(rows))} of {grouped(len(table))} observations did not take part "
         f"({material.calibration.options.reject_sigma:g} sigma and more). A few are normal. Most of one feature "
         "means a wrong label, or paint that is off its nominal position.",
-        Drawing(draw, 0.2 + 0.055 * max(len(named), 6)),
+        draw,
         Table(
             ("farthest first", "feature", "frame", "px off", "sigma"),
             tuple(_outlier_row(material, int(row)) for row in order),
         ),
+        0.2 + 0.055 * max(len(named), 6),
     )
 
 

@@ -12,7 +12,7 @@ from ceres_cal.base.words import counted, fixed, powered, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.problem.information import Key
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
+from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.material import ClosedForm, Material
 from ceres_cal.report.residual_pictures import number_of, owner_suffix
@@ -47,8 +47,9 @@ def correlation(material: Material) -> Figure | None:
         "Dark blue: errors of two numbers have the same sign; brown: opposite signs. Where the correlation is near 1 "
         "or -1 (such as phi and height), the ratio is known much better than each number. Grey: unknown."
         + (f" {counted(rest, 'further number')} not drawn." if rest else ""),
-        Drawing(lambda axes, _: _draw_matrix(axes, matrix, labels), 0.86),
+        lambda axes, _: _draw_matrix(axes, matrix, labels),
         _pairs(matrix, labels),
+        0.86,
         hover=Hover.of(
             places := np.arange(0.5, len(labels)),
             places,
@@ -128,7 +129,7 @@ def convergence(material: Material) -> Figure | None:
         "Convergence of the last solve",
         f"The cost should fall steeply and end. A long flat tail means that some combination of numbers is hardly "
         f"determined. {how} after {counted(solved.rounds, 'solve')}. The last one ends at {history[-1]:.6g}.",
-        Drawing(draw, 0.66),
+        draw,
         Table(("iteration", "cost", "fall"), rows),
     )
 
@@ -159,7 +160,7 @@ def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
         "Closed form against bundle",
         f"Farther left is better. The median residual is {short(medians['bundle'])} px after the bundle adjustment and "
         f"{short(medians['closed form'])} px after the closed form of the paper.",
-        Drawing(draw, 0.66),
+        draw,
         _comparison(material.calibration, closed.calibration, curves, shares),
     )
 
@@ -223,7 +224,7 @@ def distortion(material: Material, name: str) -> Figure:
         f"The distortion curve{owner_suffix(material, name)}",
         f"Radius of a pixel from the principal point, measured (horizontal) and without distortion (vertical), "
         f"{model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px. The dotted part is extrapolated.",
-        Drawing(lambda axes, _: draw_distortion(axes, camera, reach), 0.66),
+        lambda axes, _: draw_distortion(axes, camera, reach),
         Table(
             ("r, px", "r', px", "r' - r, px", "r' / r"),
             tuple((f"{r:.1f}", *_row(r, ideal_radius)) for r, ideal_radius in table_rows),

@@ -9,7 +9,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.words import grouped
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import CURVE, OUTLIER, POINT, Drawing
+from ceres_cal.report.canvas import CURVE, OUTLIER, POINT
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.material import Material
 from ceres_cal.report.residual_pictures import frame_image, lines_in_image, number_of, owner_suffix, stride
@@ -63,10 +63,10 @@ def support(material: Material, name: str) -> Figure:
         f"What the observations support{owner_suffix(material, name)}",
         f"Observations lie in {filled} of {counts.size} parts of the image (blue). Elsewhere the lens model is "
         f"extrapolated.{of_lines} Where lines are orange, neither lens nor field was checked.",
-        Drawing(draw, 0.93 * shape + 0.07),
+        draw,
         Table(("line", "visible length observed", "observations"), tuple(rows)),
-        wide=True,
-        narrow_drawing=Drawing(draw, 0.86 * shape + 0.18),
+        0.86 * shape + 0.18,
+        0.93 * shape + 0.07,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import CURVE, INK, PAINT, POINT, WIDE_IN, Drawing
+from ceres_cal.report.canvas import CURVE, INK, PAINT, POINT, WIDE_IN
 from ceres_cal.scene.curves import Arc, Curve, crossings, curve_points
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.target import Disc, Paper
@@ -52,7 +52,7 @@ def target_svg(target: Target, name: str) -> str:
         axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
         axes.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=name)
 
-    return canvas.to_svg(Drawing(draw, float(height / width) + 0.08), WIDE_IN, f"target-{name}", whole_file=True)
+    return canvas.to_svg(draw, float(height / width) + 0.08, WIDE_IN, f"target-{name}", whole_file=True)
 
 
 def _draw_curves(axes: Axes, target: Target, away: float) -> None:
