@@ -276,7 +276,7 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
         (("calibrate", "x", "--powers", "2,x"), "--powers '2,x': give whole numbers"),
         (("calibrate", "x", "--powers", "3", "--lens", "brown"), "--powers is for the radial or spline lens"),
         (("calibrate", "x", "--fix", "k3"), "--fix 'k3': write NAME=VALUE"),
-        (("calibrate", "x", "--fix", "k3=0", "--fix", "k3=1"), "k3 is fixed twice"),
+        (("calibrate", "x", "--fix", "k3=0", "--fix", "k3=1"), "k3 is given twice"),
         (("calibrate", "x", "--fix", "k3=nan"), "'nan' is not a finite number"),
         (("calibrate", "x", "x"), "x: given twice"),
         (("calibrate", "nowhere.json"), "nowhere.json: no such file"),

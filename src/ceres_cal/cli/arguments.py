@@ -7,7 +7,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import did_you_mean, printable
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ceres_cal.problem.parameters import Options
     from ceres_cal.scene.targets import Target
 
+_T = TypeVar("_T")
 PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
 FACING_EXAMPLE = "LeftGoalLine=top"
 _ESTIMATE_EXAMPLE = "length,width"
@@ -193,12 +194,27 @@ def repeated(option: str, values: Iterable[str]) -> list[str]:
     return [word for value in values for word in (option, value)]
 
 
-def parse_facing(spec: str) -> tuple[str, str]:
-    """NAME=SIDE of a picture."""
-    name, equals, side = (part.strip() for part in spec.partition("="))
-    if not (name and equals and side):
-        raise InputError(f"--facing {spec!r}: write NAME=SIDE, such as {FACING_EXAMPLE}")
-    return name, side
+def named_values(option: str, form: str, parse: Callable[[str, str], _T], specs: Iterable[str]) -> dict[str, _T]:
+    """What is said of each name by an option that is given as NAME=VALUE.
+
+    Args:
+        form: how it is written. parse: a value, and how to name it in messages.
+    """
+    found: dict[str, _T] = {}
+    for spec in specs:
+        where = f"{option} {spec!r}"
+        name, _, value = (part.strip() for part in spec.partition("="))
+        if not (name and value):
+            raise InputError(f"{where}: write {form}")
+        if name in found:
+            raise InputError(f"{where}: {name} is given twice")
+        found[name] = parse(value, where)
+    return found
+
+
+def parse_facing(specs: Iterable[str]) -> dict[str, str]:
+    """The side of the picture by name."""
+    return named_values("--facing", f"NAME=SIDE, such as {FACING_EXAMPLE}", lambda side, _: side, specs)
 
 
 def parse_names(text: str) -> list[str]:

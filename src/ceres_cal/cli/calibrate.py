@@ -131,7 +131,8 @@ class CalibrateArguments(arguments.ReportArguments):
 def _run(args: CalibrateArguments) -> Document:
     files.require_outputs(args, args.observations)
     files.require_different(args.observations)
-    fixed, powers = _fixed(args.fix), _powers(args)  # wrong usage is said before anything is read
+    fixed = arguments.named_values("--fix", "NAME=VALUE, such as k3=0", arguments.parse_number, args.fix)
+    powers = _powers(args)  # wrong usage is said before anything is read
     observations = files.read_observations(args.observations)
     photographs = files.report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
@@ -194,18 +195,6 @@ def _powers(args: CalibrateArguments) -> tuple[int, ...]:
         return tuple(int(power) for power in args.powers.split(","))
     except ValueError:
         raise InputError(f"--powers {args.powers!r}: give whole numbers between commas, such as 2,3") from None
-
-
-def _fixed(specs: Sequence[str]) -> dict[str, float]:
-    fixed: dict[str, float] = {}
-    for spec in specs:
-        name, equals, value = spec.partition("=")
-        if not equals:
-            raise InputError(f"--fix {spec!r}: write NAME=VALUE, such as k3=0")
-        if name.strip() in fixed:
-            raise InputError(f"--fix {spec!r}: {name.strip()} is fixed twice")
-        fixed[name.strip()] = arguments.parse_number(value, f"--fix {spec!r}")
-    return fixed
 
 
 def _options(args: CalibrateArguments, observations: Observations, **parsed: Any) -> Options:

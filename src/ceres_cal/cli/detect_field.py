@@ -115,7 +115,7 @@ def _run(args: FieldArguments) -> Document:
         target=target,
         start=start,
         auto=args.auto,
-        facing=dict(map(arguments.parse_facing, args.facing)),
+        facing=arguments.parse_facing(args.facing),
         not_painted=arguments.parse_names(args.not_painted),
         estimate=arguments.parse_estimates(args.estimate, {"field": target}),
         mask=args.mask,
@@ -175,17 +175,15 @@ def _start(path: Path, *, auto: bool) -> Calibration | Clicks:
 def _corners(specs: Sequence[str]) -> Clicks:
     from ceres_cal.detect.photographs import Clicks
 
-    points: dict[str, tuple[float, float]] = {}
-    for spec in specs:
-        where = f"--corner {spec!r}"
-        name, equals, place = spec.partition("=")
-        numbers = arguments.parse_numbers(place, where) if equals else ()
+    form = f"NAME=X,Y, such as {_CORNER}"
+
+    def pixel(text: str, where: str) -> tuple[float, float]:
+        numbers = arguments.parse_numbers(text, where)
         if len(numbers) != 2:
-            raise InputError(f"{where}: write NAME=X,Y, such as {_CORNER}")
-        if name.strip() in points:
-            raise InputError(f"{where}: {name.strip()} is given twice")
-        points[name.strip()] = (numbers[0], numbers[1])
-    return Clicks(points)
+            raise InputError(f"{where}: write {form}")
+        return numbers[0], numbers[1]
+
+    return Clicks(arguments.named_values("--corner", form, pixel, specs))
 
 
 # ---- the answer -----------------------------------------------------------------------------------------------------

@@ -95,7 +95,7 @@ def _require_fitting(args: RunArguments) -> None:
     field = require_shown(images, args.target, args.board, args.prior, args.camera, args.lens)
     if field is not None:
         lengths = arguments.parse_estimates(args.estimate, {"field": field})
-        sides = dict(map(arguments.parse_facing, args.facing))
+        sides = arguments.parse_facing(args.facing)
         lines_to_find(field, sides, arguments.parse_names(args.not_painted), lengths)
 
 
