@@ -79,117 +79,9 @@ class WeakDirection(Frozen, eq=True):
     shares: tuple[tuple[Key, float], ...]
 
 
-def verdicts(estimate: Estimate, posterior: Posterior, conflicts: Sequence[Conflict] = ()) -> tuple[Verdict, ...]:
-    """One for each shared number, in the order of the posterior's keys.
-
-    Args:
-        conflicts: what was stated and everything else contradicts.
-    """
-    disputed = {(one.owner, one.quantity, one.unit) for one in conflicts if one.kind not in _GIVES_WAY}
-    bounds, values = posterior.bounds, values_of(estimate, posterior.keys)
-    half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
-    if posterior.followed:  # a valley that widens farther out is no better known than there
-        half = np.maximum(half, np.ptp(posterior.bounds_at(FARTHER), axis=1) / (2.0 * FARTHER))
-    sizes, open_half = natural_sizes(estimate, posterior.keys), half.copy()
-    low, high = values + bounds[:, 0], values + bounds[:, 1]
-    followed = np.zeros(len(values), dtype=bool)
-    for name in posterior.followed:
-        mixture = posterior.mixtures[name]
-        at = posterior.information.columns(mixture.keys)
-        followed[at] = True
-        if mixture.open_below or mixture.open_above:  # an open valley has no width, whatever it is compared with
-            along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
-            open_half[along], low[along] = np.inf, np.maximum(low[along], 0.0)
-    sd = np.where(followed, half, posterior.sd)
-    relative = np.where(followed, open_half, posterior.sd) / sizes
-    columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
-    return tuple(
-        Verdict(key, value, sigma, bottom, top, share, _word(key, share, key[1:] in disputed), by_profile, factor)
-        for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
-    )
-
-
 def _word(key: Key, relative: float, is_disputed: bool) -> str:
     known, weak = (_LEARNT, 0.95) if key.kind == "structure" else (KNOWN, WEAK)
     return "unknown" if relative > weak else CONFLICT if is_disputed else "known" if relative <= known else "weak"
-
-
-def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
-    """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
-    unknown: dict[str, tuple[str, ...]] = {}
-    every = list(posterior.placements.values())
-    if every and are_known(np.array([one.matrix for one in every]), sigma_limits(every[0].keys)):
-        return unknown
-    for name in posterior.placements:
-        lost = np.isinf(posterior.placement(name).sd)
-        if lost.any():
-            unknown[name] = tuple(q for q, is_lost in zip(PLACEMENT_QUANTITIES, lost, strict=True) if is_lost)
-    return unknown
-
-
-def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirection, ...]:
-    """Directions, weakest first, along which sigma exceeds KNOWN in natural sizes, each that words tell from the rest;
-    neither structure nor the nodes of a lens's surface are looked at.
-
-    Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes some
-    number by more than a hundredth of itself.
-    """
-    nodes = {(name, quantity) for name, camera in estimate.cameras.items() for quantity in camera.lens.nodes}
-    keys = [key for key in posterior.keys if key.kind != "structure" and key[1:3] not in nodes]
-    at = posterior.information.columns(keys)
-    sizes = natural_sizes(estimate, keys)
-    lost = posterior.spread.unknown[at] / sizes[:, None]
-    finite = posterior.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
-    values, vectors = np.linalg.eigh(finite)
-    weak = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
-    weak += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
-    every = [_direction(estimate, posterior, keys, relative, vector) for relative, vector in weak]
-    words = [one.words for one in every]
-    return tuple(one for number, one in enumerate(every) if one.words not in words[:number])
-
-
-def _direction(
-    estimate: Estimate, posterior: Posterior, keys: Sequence[Key], relative: float, vector: Array
-) -> WeakDirection:
-    scaled = vector / vector[np.argmax(np.abs(vector))]
-    named = [int(i) for i in np.argsort(-np.abs(scaled)) if abs(scaled[i]) >= _IN_WORDS]
-    shares = tuple((keys[i], float(scaled[i])) for i in named)
-    return WeakDirection(_words(estimate, posterior, [keys[i] for i in named], relative), relative, shares)
-
-
-def _words(estimate: Estimate, posterior: Posterior, keys: Sequence[Key], relative: float) -> str:
-    phi = next((key for key in keys if key.quantity == "phi"), None)
-    heights = [key for key in keys if key.quantity == "height" and phi and _camera(estimate, key) == phi.owner]
-    if phi is not None and heights:
-        ratio = max(ratio_sd(estimate, posterior, phi.owner, key.owner) for key in heights)
-        if ratio < _TOGETHER * relative:
-            stations = ", ".join(repr(key.owner) for key in heights)
-            whose = "its height" if stations == repr(phi.owner) else f"the height of {stations}"
-            known = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
-            return f"phi of {phi.owner!r} and {whose} trade off: {known}"
-    owners = dict.fromkeys(key.owner for key in keys)
-    parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
-    many, names = len(keys) > 1, " and ".join(parts)
-    if np.isinf(relative):
-        return f"nothing tells {names}{' apart' if many else ''}"
-    return f"{names}{' trade off: each' if many else ':'} known to {two_digits(100.0 * relative)} % only"
-
-
-def _camera(estimate: Estimate, key: Key) -> str:
-    return estimate.stations[key.owner].camera if key.kind == "station" else key.owner
-
-
-def ratio_sd(estimate: Estimate, posterior: Posterior, camera: str, station: str) -> float:
-    """Relative standard deviation of phi over height: what a view from straight above does tell.
-
-    Raises:
-        InputError: one of them was held.
-    """
-    slopes = np.zeros(len(posterior.keys))
-    slopes[posterior.column("camera", camera, "phi")] = 1.0 / estimate.cameras[camera].phi
-    height = float(estimate.stations[station].cam_from_world.position[2])
-    slopes[posterior.column("station", station, "height")] = -1.0 / height
-    return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
 
 class Uncertainty(Frozen):
@@ -221,23 +113,35 @@ class Uncertainty(Frozen):
 
     @cached_property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """Known, weak, unknown or in conflict, of each shared number."""
-        return verdicts(self.estimate, self.posterior, self.conflicts)
+        """Known, weak, unknown or in conflict: one for each shared number, in the order of the posterior's keys."""
+        posterior = self.posterior
+        disputed = {(one.owner, one.quantity, one.unit) for one in self.conflicts if one.kind not in _GIVES_WAY}
+        bounds, values = posterior.bounds, values_of(self.estimate, posterior.keys)
+        half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
+        if posterior.followed:  # a valley that widens farther out is no better known than there
+            half = np.maximum(half, np.ptp(posterior.bounds_at(FARTHER), axis=1) / (2.0 * FARTHER))
+        sizes, open_half = natural_sizes(self.estimate, posterior.keys), half.copy()
+        low, high = values + bounds[:, 0], values + bounds[:, 1]
+        followed = np.zeros(len(values), dtype=bool)
+        for name in posterior.followed:
+            mixture = posterior.mixtures[name]
+            at = posterior.information.columns(mixture.keys)
+            followed[at] = True
+            if mixture.open_below or mixture.open_above:  # an open valley has no width, whatever it is compared with
+                along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
+                open_half[along], low[along] = np.inf, np.maximum(low[along], 0.0)
+        sd = np.where(followed, half, posterior.sd)
+        relative = np.where(followed, open_half, posterior.sd) / sizes
+        columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
+        return tuple(
+            Verdict(key, value, sigma, bottom, top, share, _word(key, share, key[1:] in disputed), by_profile, factor)
+            for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
+        )
 
     def table(self) -> list[dict[str, Any]]:
         """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""
         return [
-            {
-                "kind": one.key.kind,
-                "owner": one.key.owner,
-                "quantity": one.key.quantity,
-                "unit": one.key.unit,
-                "value": float(one.value),
-                "sd": float(one.sd),
-                "low": float(one.low),
-                "high": float(one.high),
-                "verdict": one.verdict,
-            }
+            {**one.key._asdict(), **{name: getattr(one, name) for name in ("value", "sd", "low", "high", "verdict")}}
             for one in self.verdicts
         ]
 
@@ -251,13 +155,62 @@ class Uncertainty(Frozen):
 
     @cached_property
     def weak_directions(self) -> tuple[WeakDirection, ...]:
-        """What is hardly known, weakest first, in words."""
-        return weak_directions(self.estimate, self.posterior)
+        """What is hardly known, in words: directions, weakest first, along which sigma exceeds KNOWN in natural sizes,
+        each that words tell from the rest; neither structure nor the nodes of a lens's surface are looked at.
+
+        Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes
+        some number by more than a hundredth of itself.
+        """
+        posterior = self.posterior
+        nodes = {(name, quantity) for name, camera in self.estimate.cameras.items() for quantity in camera.lens.nodes}
+        keys = [key for key in posterior.keys if key.kind != "structure" and key[1:3] not in nodes]
+        at = posterior.information.columns(keys)
+        sizes = natural_sizes(self.estimate, keys)
+        lost = posterior.spread.unknown[at] / sizes[:, None]
+        finite = posterior.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
+        values, vectors = np.linalg.eigh(finite)
+        weak = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
+        weak += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
+        every = [self._direction(keys, relative, vector) for relative, vector in weak]
+        words = [one.words for one in every]
+        return tuple(one for number, one in enumerate(every) if one.words not in words[:number])
+
+    def _direction(self, keys: Sequence[Key], relative: float, vector: Array) -> WeakDirection:
+        scaled = vector / vector[np.argmax(np.abs(vector))]
+        named = [int(i) for i in np.argsort(-np.abs(scaled)) if abs(scaled[i]) >= _IN_WORDS]
+        shares = tuple((keys[i], float(scaled[i])) for i in named)
+        return WeakDirection(self._words([keys[i] for i in named], relative), relative, shares)
+
+    def _words(self, keys: Sequence[Key], relative: float) -> str:
+        phi, stations = next((key for key in keys if key.quantity == "phi"), None), self.estimate.stations
+        heights = [key for key in keys if key.quantity == "height" and phi and stations[key.owner].camera == phi.owner]
+        if phi is not None and heights:
+            ratio = max(self.ratio_sd(key.owner) for key in heights)
+            if ratio < _TOGETHER * relative:
+                named = ", ".join(repr(key.owner) for key in heights)
+                whose = "its height" if named == repr(phi.owner) else f"the height of {named}"
+                known = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
+                return f"phi of {phi.owner!r} and {whose} trade off: {known}"
+        owners = dict.fromkeys(key.owner for key in keys)
+        parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
+        many, names = len(keys) > 1, " and ".join(parts)
+        if np.isinf(relative):
+            return f"nothing tells {names}{' apart' if many else ''}"
+        return f"{names}{' trade off: each' if many else ':'} known to {two_digits(100.0 * relative)} % only"
 
     @cached_property
     def unknown_placements(self) -> dict[str, tuple[str, ...]]:
-        """Placements of which some number is not known at all, and which."""
-        return unknown_placements(self.posterior)
+        """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
+        posterior = self.posterior
+        unknown: dict[str, tuple[str, ...]] = {}
+        every = list(posterior.placements.values())
+        if every and are_known(np.array([one.matrix for one in every]), sigma_limits(every[0].keys)):
+            return unknown
+        for name in posterior.placements:
+            lost = np.isinf(posterior.placement(name).sd)
+            if lost.any():
+                unknown[name] = tuple(q for q, is_lost in zip(PLACEMENT_QUANTITIES, lost, strict=True) if is_lost)
+        return unknown
 
     @cached_property
     def rig(self) -> tuple[RigPair, ...]:
@@ -278,8 +231,16 @@ class Uncertainty(Frozen):
         return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
     def ratio_sd(self, station: str) -> float:
-        """Relative standard deviation of phi over the station's height."""
-        return ratio_sd(self.estimate, self.posterior, self.estimate.stations[station].camera, station)
+        """Relative standard deviation of phi over the station's height: what a view from straight above does tell.
+
+        Raises:
+            InputError: one of them was held.
+        """
+        posterior, placed = self.posterior, self.estimate.stations[station]
+        slopes = np.zeros(len(posterior.keys))
+        slopes[posterior.column("camera", placed.camera, "phi")] = 1.0 / self.estimate.cameras[placed.camera].phi
+        slopes[posterior.column("station", station, "height")] = -1.0 / float(placed.cam_from_world.position[2])
+        return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
 
     def located(self, pixels: ArrayLike, height_m: float = 0.0, station: str | None = None) -> PointSpread:
         """Pixels (N, 2) located at a height, with 95 % bounds.
