@@ -30,24 +30,23 @@ def wave(pixels: Array) -> Array:
     return np.sin(2.0 * np.pi * pixels[:, 1] / PERIOD_PX)
 
 
-class Wave(Effect):
-    """Rows of pixels lie to the right and left in turn, as a sensor on a shaking mount reads them."""
+def columns_of_wave(case: Case) -> Iterator[EffectColumns]:
+    columns = case.equations.direction[:, 0] * wave(case.equations.pixel)
+    yield EffectColumns(columns[:, None], case.camera, case.cameras)
 
-    kind = "wave"
-    absorbed = True
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        columns = case.equations.direction[:, 0] * wave(case.equations.pixel)
-        yield EffectColumns(self.kind, columns[:, None], case.camera, case.cameras)
+def words_of_wave(evidence: Evidence) -> Words:
+    amount, sd = evidence.score.amount, evidence.score.sd
+    return Words(
+        f"camera {evidence.score.subject!r}: its rows of pixels sway by {amount[0]:.2f} ± {sd[0]:.2f} px "
+        f"({evidence.size})",
+        "have the sensor looked at",
+        amounts(["wave"], amount, sd, "px"),
+    )
 
-    def words(self, evidence: Evidence) -> Words:
-        amount, sd = evidence.score.amount, evidence.score.sd
-        return Words(
-            f"camera {evidence.score.subject!r}: its rows of pixels sway by {amount[0]:.2f} ± {sd[0]:.2f} px "
-            f"({evidence.size})",
-            "have the sensor looked at",
-            amounts(["wave"], amount, sd, "px"),
-        )
+
+WAVE = Effect("wave", columns_of_wave, words_of_wave, absorbed=True)
+"""Rows of pixels lie to the right and left in turn, as a sensor on a shaking mount reads them."""
 
 
 def swaying(pixels: Array) -> Array:
@@ -56,7 +55,7 @@ def swaying(pixels: Array) -> Array:
 
 @pytest.fixture(autouse=True)
 def in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EFFECTS, "wave", Wave())
+    monkeypatch.setitem(EFFECTS, "wave", WAVE)
 
 
 @pytest.fixture(scope="module")
@@ -126,16 +125,10 @@ def test_kinds_stand_under_their_own_names() -> None:
     assert all(kind == row.kind for kind, row in EFFECTS.items())
 
 
-class Shaking(Wave):
-    """The same displacement under another name."""
-
-    kind = "shaking"
-
-
 def test_what_the_data_cannot_tell_apart_is_named_by_both_names(
     calibration: Calibration, swayed: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(EFFECTS, "shaking", Shaking())
+    monkeypatch.setitem(EFFECTS, "shaking", replace(WAVE, kind="shaking"))
     (finding,) = diagnose(calibration, swayed).findings
     other = {"wave": "shaking", "shaking": "wave"}[finding.kind]
     assert finding.sentence.endswith(f"; these data do not distinguish it from {other} (overhead)")

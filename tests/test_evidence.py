@@ -179,7 +179,7 @@ def test_a_line_aside(seen: Seen) -> None:
     model, equations = seen.model, seen.model.equations
     _, group = grouped(equations.view * 100 + equations.feature, equations.is_curve)
     few = np.where(group < 5, group, -1)
-    columns = EffectColumns("feature aside", np.ones((len(equations), 1)), few, tuple("abcde"))
+    columns = EffectColumns(np.ones((len(equations), 1)), few, tuple("abcde"))
     offsets = measure_offsets(model, columns, FEATURE_ASIDE)
     lines = (few[:, None] == np.arange(5)).astype(float)
 

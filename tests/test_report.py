@@ -270,7 +270,7 @@ def test_a_fault_that_moves_places_by_little_is_counted() -> None:
     fault = replace(sound.diagnosis.findings[0], wrong="model", effect_mm=1.0)
     step = sound.diagnosis.step
     along_x = motion_columns(step.case)[:, 3:4]
-    shifted = EffectColumns("moved in", along_x, np.zeros(len(along_x), dtype=np.int64), ("overhead",))
+    shifted = EffectColumns(along_x, np.zeros(len(along_x), dtype=np.int64), ("overhead",), kind="moved in")
     cause = ScoreTest(shifted, 0, 0.0, 1, 0.0, np.ones(1), np.ones(1))
     for sigmas, level in ((0.05, "good"), (30.0, "no")):
         moved = replace(step, causes=((cause, np.array([sigmas * sd])),))

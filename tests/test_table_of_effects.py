@@ -34,24 +34,19 @@ from ceres_cal.effects.effect import Case, Effect, Evidence, Words
 from ceres_cal.effects.evidence import SizePrior
 
 
-class Sway(Effect):
+def swaying(case: Case) -> Iterator[EffectColumns]:
     """Rows of pixels lie to the right and left in turn, as a sensor on a shaking mount reads them."""
-
-    kind = "sway"
-    absorbed = True
-    prior = SizePrior(0.9, (0.1, 0.3, 1.0, 3.0))
-
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        along = case.equations.direction[:, 0] * np.sin(2.0 * np.pi * case.equations.pixel[:, 1] / {PERIOD_PX})
-        yield EffectColumns(self.kind, along[:, None], case.camera, case.cameras)
-
-    def words(self, evidence: Evidence) -> Words:
-        amount, sd = evidence.score.amount, evidence.score.sd
-        sentence = f"camera {{evidence.score.subject!r}}: its rows of pixels sway by {{amount[0]:.2f}} px"
-        return Words(sentence, "have the sensor looked at", amounts(["sway"], amount, sd, "px"))
+    along = case.equations.direction[:, 0] * np.sin(2.0 * np.pi * case.equations.pixel[:, 1] / {PERIOD_PX})
+    yield EffectColumns(along[:, None], case.camera, case.cameras)
 
 
-EFFECTS = (Sway(),)
+def words(evidence: Evidence) -> Words:
+    amount, sd = evidence.score.amount, evidence.score.sd
+    sentence = f"camera {{evidence.score.subject!r}}: its rows of pixels sway by {{amount[0]:.2f}} px"
+    return Words(sentence, "have the sensor looked at", amounts(["sway"], amount, sd, "px"))
+
+
+EFFECTS = (Effect("sway", swaying, words, absorbed=True, prior=SizePrior(0.9, (0.1, 0.3, 1.0, 3.0))),)
 '''
 
 

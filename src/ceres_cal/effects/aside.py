@@ -76,7 +76,7 @@ class ObservationGroups(Frozen, ABC):
             rows = np.flatnonzero(group == number)
             sizes = np.sqrt(np.mean(every[rows] ** 2, axis=0)) if len(rows) else np.ones(every.shape[1])
             every[rows] /= np.where(sizes > 0.0, sizes, 1.0)
-        return EffectColumns(self.kind, every, np.asarray(group), tuple(map(str, chosen.tolist())))
+        return EffectColumns(every, np.asarray(group), tuple(map(str, chosen.tolist())), kind=self.kind)
 
     def name(self, number: int) -> str:
         """What one of them is, as in "line 'HalfwayLine' in frame '0003'"."""

@@ -27,19 +27,19 @@ class EffectColumns(Frozen):
     """Columns of an effect over the equations, by group: each group has amounts of its own.
 
     Attributes:
-        kind: of the effect.
         columns: (E, Q) px per unit of the Q amounts, for every equation.
         group: (E,) which group's amounts move each equation, -1 for none.
         subjects: what each group is about. frames: at which frame; empty where all are about all frames.
         onwards: whether the amounts of group g move the groups after g instead of group g itself.
+        kind: of the effect.
     """
 
-    kind: str
     columns: Array
     group: Indices
     subjects: tuple[str, ...]
     frames: tuple[str, ...] = ()
     onwards: bool = False
+    kind: str = ""
 
     def of(self, number: int) -> Array:
         """(E, Q) columns of one group over all equations."""

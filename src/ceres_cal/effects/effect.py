@@ -5,14 +5,14 @@ What is found of it: the cause by name, how large, how sure; and what is solved 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import ClassVar, Literal, NamedTuple
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.evidence import SizePrior
@@ -231,7 +231,7 @@ class Evidence(Frozen):
         digits = 1 if mm >= 0.1 else 2
         return f"{px:.2f} px, {mm:.{digits}f} mm rms, {two_digits(self.noise_ratio)} of the noise"
 
-    def most_px(self, rows: Mask) -> float:
+    def most_px(self, rows: Mask | bool = True) -> float:
         """The largest displacement among some equations that take part."""
         return float(np.max(np.abs((self.shift * rows)[self.case.model.used])))
 
@@ -244,42 +244,46 @@ class Words(NamedTuple):
     amounts: tuple[Amount, ...] = ()
 
 
-class Effect(ABC):
+Displaces = Callable[[Case, str, Array], Array | None]
+"""A displacement by case, camera and pixels, see `Effect`."""
+
+
+class Effect(Frozen):
     """A row of the table of effects: what may displace the observations besides the free numbers.
 
     Attributes:
-        kind: its name. wrong: what is where it is found, see `Finding`. absorbed: whether its displacement is what the
-            calibration's free numbers could not have taken up of it.
+        kind: its name. over: of a case, its columns over the equations. words: what the finding of one of its groups
+            says. absorbed: whether its displacement is what the calibration's free numbers could not have taken up of
+            it. wrong: what is where it is found, see `Finding`.
         built: the kind of what `calibrate` solves for by itself as the target is built, "" of none.
+        displacement: of what a camera does to its picture besides, (N, 2, Q) px at its pixels (N, 2) per unit of its
+            amounts; None where the camera solves for them.
         prior: what is expected of its amounts, in their own unit, of one whose size `calibrate` estimates: it solves
-            for it where it is likely, and states no number better than with it in doubt.
+            for it where it is likely, and states no number better than with it in doubt. reach: by how much more is
+            expected of a group, by how large what it is about is. concerns: whether it may displace any observations.
+        together: the findings of several of its groups, as they are told.
     """
 
     kind: str
-    wrong: ClassVar[Wrong] = "model"
-    absorbed: ClassVar[bool] = False
+    over: Callable[[Case], Iterator[EffectColumns]]
+    words: Callable[[Evidence], Words]
+    absorbed: bool = False
+    wrong: Wrong = "model"
     built: str = ""
-    prior: ClassVar[SizePrior | None] = None
+    displacement: Displaces | None = None
+    prior: SizePrior | None = None
+    reach: Callable[[EffectColumns, int, Case], float] = lambda columns, number, case: 1.0
+    concerns: Callable[[Observations], bool] = lambda observations: True
+    together: Callable[[Sequence[Finding]], Iterable[Finding]] = tuple
 
-    def concerns(self, observations: Observations) -> bool:
-        """Whether it may displace any of them."""
-        return True
-
-    def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
-        """The prior of one of its groups, where it depends on how large what it is about is."""
-        return self.prior
-
-    @abstractmethod
     def columns(self, case: Case) -> Iterator[EffectColumns]:
         """Its columns over the equations."""
+        for columns in self.over(case):
+            yield replace(columns, kind=self.kind)
 
-    @abstractmethod
-    def words(self, evidence: Evidence) -> Words:
-        """What the finding of one of its groups says."""
-
-    def together(self, findings: Sequence[Finding]) -> Iterator[Finding]:
-        """The findings of several of its groups, as they are told."""
-        yield from findings
+    def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
+        """The prior of one of its groups."""
+        return self.prior and self.prior.times(self.reach(columns, number, case))
 
     def evidence(self, case: Case, score: ScoreTest, others: Linearised, left_over: Array) -> Evidence:
         """For one of its groups, beside other effects in a model, which all together leave so much (E,)."""
@@ -329,25 +333,21 @@ class Effect(ABC):
         )  # fmt: skip
 
 
-class CameraEffect(Effect):
+def camera_effect(kind: str, displacement: Displaces, words: Callable[[Evidence], Words]) -> Effect:
     """What a camera does to its picture besides."""
+    return Effect(kind, partial(_over_cameras, displacement), words, absorbed=True, displacement=displacement)
 
-    absorbed = True
 
-    @abstractmethod
-    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        """(N, 2, Q) px at pixels (N, 2) per unit of its amounts; None where the camera solves for them."""
-
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        equations, group, parts = case.equations, case.camera.copy(), []
-        for number, name in enumerate(case.cameras):
-            own = np.flatnonzero(case.camera == number)
-            displaced = self.displacement(case, name, equations.pixel[own])
-            if displaced is None:
-                group[own] = -1
-            else:
-                parts.append((own, np.sum(equations.direction[own, :, None] * displaced, axis=1)))
-        columns = np.zeros((len(equations), max((part.shape[1] for _, part in parts), default=1)))
-        for own, part in parts:
-            columns[own, : part.shape[1]] = part
-        yield EffectColumns(self.kind, columns, group, case.cameras)
+def _over_cameras(displacement: Displaces, case: Case) -> Iterator[EffectColumns]:
+    equations, group, parts = case.equations, case.camera.copy(), []
+    for number, name in enumerate(case.cameras):
+        own = np.flatnonzero(case.camera == number)
+        displaced = displacement(case, name, equations.pixel[own])
+        if displaced is None:
+            group[own] = -1
+        else:
+            parts.append((own, np.sum(equations.direction[own, :, None] * displaced, axis=1)))
+    columns = np.zeros((len(equations), max((part.shape[1] for _, part in parts), default=1)))
+    for own, part in parts:
+        columns[own, : part.shape[1]] = part
+    yield EffectColumns(columns, group, case.cameras)

@@ -18,7 +18,7 @@ from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.effects.effect import CameraEffect, Finding
+from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.table import EFFECTS, JointStep
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import thinned
@@ -80,7 +80,7 @@ def faulty_map(
 
 
 def _is_of_camera(fault: Finding) -> bool:
-    return isinstance(EFFECTS.get(fault.kind), CameraEffect)
+    return fault.kind in EFFECTS and EFFECTS[fault.kind].displacement is not None
 
 
 def sigmas_of_cameras(known: Uncertainty, step: JointStep | None) -> float:

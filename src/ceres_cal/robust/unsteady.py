@@ -28,7 +28,7 @@ from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
 from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RepeatedAmounts, shifts_by
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model, without_shared
-from ceres_cal.effects.table.lens import LensChanged
+from ceres_cal.effects.table.lens import lens_changes
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
@@ -136,7 +136,7 @@ def find_unsteady(
         some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
         if before is not None or _seem_displaced(model_of(*some.built_as(estimate), of_poses=True)):
             model = model_of(some)
-            if before is None and any(LensChanged().columns(Case(observations, some, estimate, model))):
+            if before is None and any(lens_changes(Case(observations, some, estimate, model))):
                 continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` tells that
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own:

@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
-from ceres_cal.effects.effect import CameraEffect, Case, Effect
+from ceres_cal.effects.effect import Case, Effect
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.quantities import free_keys
@@ -67,9 +67,9 @@ class JointStep(Frozen):
         """(N, 2) px by which a camera displaces besides what it shows at pixels (N, 2)."""
         total = np.zeros((len(pixels), 2))
         for score, amount in self.causes:
-            effect = EFFECTS[score.effect.kind]
-            if isinstance(effect, CameraEffect) and score.subject == camera:
-                by = effect.displacement(self.case, camera, pixels)
+            displacement = EFFECTS[score.effect.kind].displacement
+            if displacement is not None and score.subject == camera:
+                by = displacement(self.case, camera, pixels)
                 total += 0.0 if by is None else by @ amount[: by.shape[2]]
         return total
 

@@ -4,65 +4,64 @@ shifted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, numbers_of
 from ceres_cal.base.transforms import Pose, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import CameraEffect, Case, Effect, Evidence, Words, amounts
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.quantities import pixel_slopes
 
 
-class Moved(Effect):
+def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
     """Each station turned about the camera's axes, shifted in the world: from some frame on, or in one frame alone."""
+    equations = case.equations
+    frames = [(view.station, view.frame) for view in case.observations.views]
+    known = list(dict.fromkeys(frames))
+    frame = numbers_of(frames, known)[equations.view]
+    bounds = zip(equations.bounds, equations.bounds[1:], strict=False)
+    several = np.array([bool(np.any(frame[start:stop] != frame[start])) for start, stop in bounds])
+    tied = np.array([key.placement not in case.problem.private for key in equations.sights.keys])
+    of_station = np.array([key.station for key in equations.sights.keys])
+    columns = motion_columns(case)
+    for station in case.observations.stations:
+        present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
+        names, last = tuple(known[number][1] for number in present), len(present) - 1
+        # In the first or last frame alone is the same as from there on.
+        tested = last > 0 if onwards else (group > 0) & (group < last)
+        group = np.where(tested, group, -1)
+        if np.any(group >= 0):
+            yield EffectColumns(columns, group, (station,) * len(names), names, onwards)
 
-    def __init__(self, kind: str, advice: str, *, onwards: bool) -> None:
-        self.kind, self._advice, self._onwards = kind, advice, onwards
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        equations = case.equations
-        frames = [(view.station, view.frame) for view in case.observations.views]
-        known = list(dict.fromkeys(frames))
-        frame = numbers_of(frames, known)[equations.view]
-        bounds = zip(equations.bounds, equations.bounds[1:], strict=False)
-        several = np.array([bool(np.any(frame[start:stop] != frame[start])) for start, stop in bounds])
-        tied = np.array([key.placement not in case.problem.private for key in equations.sights.keys])
-        of_station = np.array([key.station for key in equations.sights.keys])
-        columns = motion_columns(case)
-        for station in case.observations.stations:
-            present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
-            names, last = tuple(known[number][1] for number in present), len(present) - 1
-            # In the first or last frame alone is the same as from there on.
-            tested = last > 0 if self._onwards else (group > 0) & (group < last)
-            group = np.where(tested, group, -1)
-            if np.any(group >= 0):
-                yield EffectColumns(self.kind, columns, group, (station,) * len(names), names, self._onwards)
-
-    def words(self, evidence: Evidence) -> Words:
-        score, others = evidence.score, evidence.others
-        turn, step, both = (others.freed(score.columns[:, part]) for part in (slice(3), slice(3, 6), slice(6)))
-        angle, angle_sd = np.degrees(_length(turn.amount, turn.sd))
-        mm, mm_sd = 1e3 * np.array(_length(step.amount, step.sd))
-        ways = [
-            (turn.decrease, f"turned by {angle:.3f} ± {angle_sd:.3f} degrees"),
-            (step.decrease, f"shifted by {mm:.1f} ± {mm_sd:.1f} mm"),
-        ]
-        ways.sort(key=lambda way: -way[0])
-        whole = max(both.decrease, 1e-300)
-        how = " or ".join(f"{text} (explains {100.0 * min(part / whole, 1.0):.0f} %)" for part, text in ways)
-        when = f"after frame {score.frame!r}" if self._onwards else f"in frame {score.frame!r} alone"
-        turns, steps = [f"turn about the camera's {axis}" for axis in "xyz"], [f"shift along {axis}" for axis in "xyz"]
-        return Words(
-            f"station {score.subject!r} moved {when}: {how}; {evidence.size}",
-            self._advice,
-            (
-                *amounts(turns, np.degrees(score.amount[:3]), np.degrees(score.sd[:3]), "deg"),
-                *amounts(steps, 1e3 * score.amount[3:], 1e3 * score.sd[3:], "mm"),
-            ),
-        )
+def _of_move(evidence: Evidence) -> Words:
+    score, others = evidence.score, evidence.others
+    turn, step, both = (others.freed(score.columns[:, part]) for part in (slice(3), slice(3, 6), slice(6)))
+    angle, angle_sd = np.degrees(_length(turn.amount, turn.sd))
+    mm, mm_sd = 1e3 * np.array(_length(step.amount, step.sd))
+    ways = [
+        (turn.decrease, f"turned by {angle:.3f} ± {angle_sd:.3f} degrees"),
+        (step.decrease, f"shifted by {mm:.1f} ± {mm_sd:.1f} mm"),
+    ]
+    ways.sort(key=lambda way: -way[0])
+    whole = max(both.decrease, 1e-300)
+    how = " or ".join(f"{text} (explains {100.0 * min(part / whole, 1.0):.0f} %)" for part, text in ways)
+    frames_after = f"after frame {score.frame!r}", "give the frames after it a station of their own"
+    one_frame = f"in frame {score.frame!r} alone", "leave this frame out, or give it a station of its own"
+    when, advice = frames_after if score.effect.onwards else one_frame
+    turns, steps = [f"turn about the camera's {axis}" for axis in "xyz"], [f"shift along {axis}" for axis in "xyz"]
+    return Words(
+        f"station {score.subject!r} moved {when}: {how}; {evidence.size}",
+        advice,
+        (
+            *amounts(turns, np.degrees(score.amount[:3]), np.degrees(score.sd[:3]), "deg"),
+            *amounts(steps, 1e3 * score.amount[3:], 1e3 * score.sd[3:], "mm"),
+        ),
+    )
 
 
 def motion_columns(case: Case) -> Array:
@@ -84,42 +83,31 @@ def _length(vector: Array, sd: Array) -> tuple[float, float]:
     return length, float(np.linalg.norm(vector[known] * sd[known])) / max(length, 1e-300)
 
 
-class Skew(CameraEffect):
+def _leaning(case: Case, camera: str, pixels: Array) -> Array | None:
     """The axes of the pixels are not perpendicular: x grows with y."""
-
-    kind = "skew"
-
-    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        one = case.estimate.cameras[camera]
-        if intrinsic_names(one.lens).index("skew") in case.problem.layout.free[camera]:
-            return None
-        return np.asarray(one.offsets(pixels)[:, 1:, None] * [[1.0], [0.0]])
-
-    def words(self, evidence: Evidence) -> Words:
-        skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        return Words(
-            f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad "
-            f"({evidence.size})",
-            "calibrate with --free-skew, which no other program reads; better take pictures as the sensor gives them, "
-            "neither warped nor stabilised",
-            amounts(["skew"], skew, sd, "mrad"),
-        )
+    one = case.estimate.cameras[camera]
+    if intrinsic_names(one.lens).index("skew") in case.problem.layout.free[camera]:
+        return None
+    return np.asarray(one.offsets(pixels)[:, 1:, None] * [[1.0], [0.0]])
 
 
-class HeldNumbers(CameraEffect):
+def _of_skew(evidence: Evidence) -> Words:
+    skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    return Words(
+        f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad "
+        f"({evidence.size})",
+        "calibrate with --free-skew, which no other program reads; better take pictures as the sensor gives them, "
+        "neither warped nor stabilised",
+        amounts(["skew"], skew, sd, "mrad"),
+    )
+
+
+def _held(places: list[int], case: Case, camera: str, pixels: Array) -> Array | None:
     """Numbers of the pixels that are held, by their places in the intrinsics vector."""
-
-    def __init__(self, kind: str, places: list[int], words: Callable[[Evidence], Words]) -> None:
-        self.kind, self._places, self._words = kind, places, words
-
-    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        if set(self._places) & set(case.problem.layout.free[camera].tolist()):
-            return None
-        one = case.estimate.cameras[camera].at(Pose.identity())
-        return pixel_slopes(one, one.rays(pixels)).intrinsics[:, :, self._places]
-
-    def words(self, evidence: Evidence) -> Words:
-        return self._words(evidence)
+    if set(places) & set(case.problem.layout.free[camera].tolist()):
+        return None
+    one = case.estimate.cameras[camera].at(Pose.identity())
+    return pixel_slopes(one, one.rays(pixels)).intrinsics[:, :, places]
 
 
 def _of_aspect(evidence: Evidence) -> Words:
@@ -157,37 +145,33 @@ def _of_phi(evidence: Evidence) -> Words:
 _HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
 
 
-class PointsShifted(Effect):
+def _shifted(case: Case) -> Iterator[EffectColumns]:
     """A camera's points lie aside of its curves: two detectors that count pixels from different places."""
+    is_curve, camera = case.equations.is_curve, case.camera
+    both = np.isin(camera, camera[is_curve & case.model.used])
+    group = np.where(~is_curve & both, camera, -1)
+    yield EffectColumns(case.equations.direction * ~is_curve[:, None], group, case.cameras)
 
-    kind = "points shifted"
-    absorbed = True
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        is_curve, camera = case.equations.is_curve, case.camera
-        both = np.isin(camera, camera[is_curve & case.model.used])
-        group = np.where(~is_curve & both, camera, -1)
-        yield EffectColumns(self.kind, case.equations.direction * ~is_curve[:, None], group, case.cameras)
-
-    def words(self, evidence: Evidence) -> Words:
-        # How near to half a pixel a shift must be to be called that: in standard deviations, and px.
-        half_sd, half_px = 3.0, 0.1
-        px, sd = evidence.score.amount, evidence.score.sd
-        half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(half_sd * sd, half_px)))
-        return Words(
-            f"camera {evidence.score.subject!r}: its points are shifted against its curves by ({px[0]:+.2f} ± "
-            f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px ({evidence.size})",
-            f"{_HALF if half else ''}let both detectors count from the centre of the top-left pixel",
-            amounts(("x", "y"), px, sd, "px"),
-        )
+def _of_shift(evidence: Evidence) -> Words:
+    # How near to half a pixel a shift must be to be called that: in standard deviations, and px.
+    half_sd, half_px = 3.0, 0.1
+    px, sd = evidence.score.amount, evidence.score.sd
+    half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(half_sd * sd, half_px)))
+    return Words(
+        f"camera {evidence.score.subject!r}: its points are shifted against its curves by ({px[0]:+.2f} ± "
+        f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px ({evidence.size})",
+        f"{_HALF if half else ''}let both detectors count from the centre of the top-left pixel",
+        amounts(("x", "y"), px, sd, "px"),
+    )
 
 
 EFFECTS = (
-    Moved("moved after", "give the frames after it a station of their own", onwards=True),
-    Moved("moved in", "leave this frame out, or give it a station of its own", onwards=False),
-    Skew(),
-    HeldNumbers("aspect", [1], _of_aspect),
-    HeldNumbers("principal point", [2, 3], _of_principal_point),
-    HeldNumbers("phi", [0], _of_phi),
-    PointsShifted(),
+    Effect("moved after", partial(_moves, onwards=True), _of_move),
+    Effect("moved in", partial(_moves, onwards=False), _of_move),
+    camera_effect("skew", _leaning, _of_skew),
+    camera_effect("aspect", partial(_held, [1]), _of_aspect),
+    camera_effect("principal point", partial(_held, [2, 3]), _of_principal_point),
+    camera_effect("phi", partial(_held, [0]), _of_phi),
+    Effect("points shifted", _shifted, _of_shift, absorbed=True),
 )

@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array, numbers_of
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_all
-from ceres_cal.effects.effect import SMALL, CameraEffect, Case, Effect, Evidence, Words, amounts, half_diagonals
+from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.problem.parameters import OF_PIXELS, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens
@@ -22,38 +22,35 @@ from ceres_cal.scene.lens import LENSES, Lens
 _WAVES = range(5, 25)
 
 
-class Radius(CameraEffect):
+def _along_radius(case: Case, camera: str, pixels: Array) -> Array | None:
     """Residuals follow the radius: the polynomial is too short."""
+    radial_basis = 3  # powers of the radius past the lens's: enough for any trend that one more power mends
+    if case.estimate.cameras[camera].lens.roughness:
+        return _waves(case, camera, pixels)
+    return _growing(case.estimate.cameras[camera], pixels, _missing_powers(case, camera)[:radial_basis])
 
-    kind = "radius"
 
-    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        radial_basis = 3  # powers of the radius past the lens's: enough for any trend that one more power mends
-        if case.estimate.cameras[camera].lens.roughness:
-            return _waves(case, camera, pixels)
-        return _growing(case.estimate.cameras[camera], pixels, _missing_powers(case, camera)[:radial_basis])
-
-    def words(self, evidence: Evidence) -> Words:
-        case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
-        if case.estimate.cameras[name].lens.roughness:
-            return Words(
-                f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px "
-                f"({evidence.size}): the lens is finer than its knots, and phi, the slope at its axis, may be off by "
-                "more than its standard deviation",
-                "rays are about as wrong as those pixels; for phi by itself look at a lens that has a formula, too",
-            )
-        powers = _missing_powers(case, name)
-        displaced = _growing(case.estimate.cameras[name], case.equations.pixel, powers)
-        columns = np.sum(case.equations.direction[:, :, None] * displaced, axis=1) * own[:, None]
-        decreases = evidence.others.decreases(columns)
-        power, decrease = powers[int(np.argmax(decreases))], float(np.max(decreases))
-        share = 100.0 * min(1.0, decrease / evidence.others.freed(evidence.score.columns).decrease)
-        judged = "is too short" if evidence.noise_ratio >= SMALL else "is too short by little"
-        sentence = (
-            f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px ({evidence.size}): "
-            f"the radial polynomial {judged}; one more power, r^{power}, explains {share:.0f} % of it"
+def _of_radius(evidence: Evidence) -> Words:
+    case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
+    if case.estimate.cameras[name].lens.roughness:
+        return Words(
+            f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px "
+            f"({evidence.size}): the lens is finer than its knots, and phi, the slope at its axis, may be off by "
+            "more than its standard deviation",
+            "rays are about as wrong as those pixels; for phi by itself look at a lens that has a formula, too",
         )
-        return Words(sentence, _longer(case, name, power))
+    powers = _missing_powers(case, name)
+    displaced = _growing(case.estimate.cameras[name], case.equations.pixel, powers)
+    columns = np.sum(case.equations.direction[:, :, None] * displaced, axis=1) * own[:, None]
+    decreases = evidence.others.decreases(columns)
+    power, decrease = powers[int(np.argmax(decreases))], float(np.max(decreases))
+    share = 100.0 * min(1.0, decrease / evidence.others.freed(evidence.score.columns).decrease)
+    judged = "is too short" if evidence.noise_ratio >= SMALL else "is too short by little"
+    sentence = (
+        f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px ({evidence.size}): "
+        f"the radial polynomial {judged}; one more power, r^{power}, explains {share:.0f} % of it"
+    )
+    return Words(sentence, _longer(case, name, power))
 
 
 def _longer(case: Case, camera: str, power: int) -> str:
@@ -108,36 +105,33 @@ def _waves(case: Case, camera: str, pixels: Array) -> Array:
     return np.asarray(outward[:, :, None] * np.cos(np.pi * np.array(_WAVES) * share[:, None, None]))
 
 
-class Decentring(CameraEffect):
+def _decentred(case: Case, camera: str, pixels: Array) -> Array | None:
     """Brown's tangential displacement, where the lens does not solve for it."""
+    one = case.estimate.cameras[camera]
+    parts = _tangential(one.lens)
+    if parts and set(parts) <= case.free_coefficients(camera):
+        return None
+    x, y = half_diagonals(one, pixels).T
+    r2 = x * x + y * y
+    return np.stack([[2.0 * x * y, r2 + 2.0 * x * x], [r2 + 2.0 * y * y, 2.0 * x * y]]).transpose(2, 0, 1)
 
-    kind = "decentring"
 
-    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        one = case.estimate.cameras[camera]
-        parts = _tangential(one.lens)
-        if parts and set(parts) <= case.free_coefficients(camera):
-            return None
-        x, y = half_diagonals(one, pixels).T
-        r2 = x * x + y * y
-        return np.stack([[2.0 * x * y, r2 + 2.0 * x * x], [r2 + 2.0 * y * y, 2.0 * x * y]]).transpose(2, 0, 1)
-
-    def words(self, evidence: Evidence) -> Words:
-        name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
-        lens = evidence.case.estimate.cameras[name].lens
-        own = _tangential(lens)
-        kind, names = next((kind, lens.decentring) for kind, lens in LENSES.items() if lens.decentring)
-        if own and not set(own) <= set(lens.names):
-            advice = f"calibrate with --terms tangential, which frees {' and '.join(own)}"
-        elif own:
-            advice = f"let {' and '.join(own)} free"
-        else:
-            advice = f"calibrate with --lens {kind}, which has {' and '.join(names)}"
-        return Words(
-            f"camera {name!r}: its lens is not centred: a tangential displacement of up to "
-            f"{evidence.most_px(every):.2f} px ({evidence.size})",
-            advice,
-        )
+def _of_decentring(evidence: Evidence) -> Words:
+    name = evidence.score.subject
+    lens = evidence.case.estimate.cameras[name].lens
+    own = _tangential(lens)
+    kind, names = next((kind, lens.decentring) for kind, lens in LENSES.items() if lens.decentring)
+    if own and not set(own) <= set(lens.names):
+        advice = f"calibrate with --terms tangential, which frees {' and '.join(own)}"
+    elif own:
+        advice = f"let {' and '.join(own)} free"
+    else:
+        advice = f"calibrate with --lens {kind}, which has {' and '.join(names)}"
+    return Words(
+        f"camera {name!r}: its lens is not centred: a tangential displacement of up to "
+        f"{evidence.most_px():.2f} px ({evidence.size})",
+        advice,
+    )
 
 
 def _tangential(lens: Lens) -> tuple[str, ...]:
@@ -146,64 +140,56 @@ def _tangential(lens: Lens) -> tuple[str, ...]:
     return own or lens.more_terms.get("tangential", ())
 
 
-class Prism(CameraEffect):
+def _one_way(case: Case, camera: str, pixels: Array) -> Array | None:
     """OpenCV's thin prism, where the lens does not solve for it: all is displaced one way, by r^2 and r^4."""
+    one = case.estimate.cameras[camera]
+    parts = one.lens.more_terms.get("prism", ())
+    if parts and set(parts) <= case.free_coefficients(camera):
+        return None
+    r2 = np.sum(half_diagonals(one, pixels) ** 2, axis=1)[:, None, None]
+    return np.concatenate([r2 * np.eye(2), r2**2 * np.eye(2)], axis=2)
 
-    kind = "prism"
 
-    def displacement(self, case: Case, camera: str, pixels: Array) -> Array | None:
-        one = case.estimate.cameras[camera]
-        parts = one.lens.more_terms.get("prism", ())
-        if parts and set(parts) <= case.free_coefficients(camera):
-            return None
-        r2 = np.sum(half_diagonals(one, pixels) ** 2, axis=1)[:, None, None]
-        return np.concatenate([r2 * np.eye(2), r2**2 * np.eye(2)], axis=2)
-
-    def words(self, evidence: Evidence) -> Words:
-        name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
-        kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
-        own = evidence.case.estimate.cameras[name].lens.kind == kind
-        return Words(
-            f"camera {name!r}: its picture is displaced one way towards its rim, as by a thin prism, by up to "
-            f"{evidence.most_px(every):.2f} px ({evidence.size})",
-            f"calibrate with {'' if own else f'--lens {kind} '}--terms prism",
-        )
+def _of_prism(evidence: Evidence) -> Words:
+    name = evidence.score.subject
+    kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
+    own = evidence.case.estimate.cameras[name].lens.kind == kind
+    return Words(
+        f"camera {name!r}: its picture is displaced one way towards its rim, as by a thin prism, by up to "
+        f"{evidence.most_px():.2f} px ({evidence.size})",
+        f"calibrate with {'' if own else f'--lens {kind} '}--terms prism",
+    )
 
 
 _NUMBERS = ("phi", "cx", "cy")
 _PLACES = [OF_PIXELS.index(name) for name in _NUMBERS]
 
 
-class LensChanged(Effect):
+def lens_changes(case: Case) -> Iterator[EffectColumns]:
     """phi and the principal point of a camera are others in the frames after one, by boards that are held up."""
+    frames = [(view.camera, view.frame) for view in case.observations.views]
+    known = list(dict.fromkeys(frames))
+    frame = numbers_of(frames, known)[case.equations.view]
+    # Over a field a knock turns the camera, too, and a turn looks like another principal point.
+    private = np.array([key.placement in case.problem.private for key in case.equations.sights.keys], dtype=bool)
+    held_up = private[case.equations.sight]
+    for number, name in enumerate(case.cameras):
+        present, group = grouped(frame, held_up & (case.camera == number))
+        names = tuple(known[one][1] for one in present)
+        columns = case.equations.intrinsics[:, _PLACES]
+        if len(names) > 1:
+            yield from _where_likely(case, EffectColumns(columns, group, (name,) * len(names), names, onwards=True))
 
-    kind = "lens changed"
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        frames = [(view.camera, view.frame) for view in case.observations.views]
-        known = list(dict.fromkeys(frames))
-        frame = numbers_of(frames, known)[case.equations.view]
-        # Over a field a knock turns the camera, too, and a turn looks like another principal point.
-        private = np.array([key.placement in case.problem.private for key in case.equations.sights.keys], dtype=bool)
-        held_up = private[case.equations.sight]
-        for number, name in enumerate(case.cameras):
-            present, group = grouped(frame, held_up & (case.camera == number))
-            names = tuple(known[one][1] for one in present)
-            columns = case.equations.intrinsics[:, _PLACES]
-            if len(names) > 1:
-                yield from _where_likely(
-                    case, EffectColumns(self.kind, columns, group, (name,) * len(names), names, onwards=True)
-                )
-
-    def words(self, evidence: Evidence) -> Words:
-        score = evidence.score
-        parts = zip(_NUMBERS, score.amount, score.sd, strict=True)
-        change = ", ".join(f"{name} {by:+.1f} ± {sd:.1f} px" for name, by, sd in parts)
-        return Words(
-            f"camera {score.subject!r} has another lens after frame {score.frame!r}: {change} ({evidence.size})",
-            "give the frames after it a camera of their own: it was knocked or zoomed, or they are another camera's",
-            amounts(_NUMBERS, score.amount, score.sd, "px"),
-        )
+def _of_change(evidence: Evidence) -> Words:
+    score = evidence.score
+    parts = zip(_NUMBERS, score.amount, score.sd, strict=True)
+    change = ", ".join(f"{name} {by:+.1f} ± {sd:.1f} px" for name, by, sd in parts)
+    return Words(
+        f"camera {score.subject!r} has another lens after frame {score.frame!r}: {change} ({evidence.size})",
+        "give the frames after it a camera of their own: it was knocked or zoomed, or they are another camera's",
+        amounts(_NUMBERS, score.amount, score.sd, "px"),
+    )
 
 
 def _where_likely(case: Case, every: EffectColumns) -> Iterator[EffectColumns]:
@@ -230,4 +216,9 @@ def _where_likely(case: Case, every: EffectColumns) -> Iterator[EffectColumns]:
         yield replace(every, group=after, subjects=every.subjects[:2], frames=names)
 
 
-EFFECTS = (Radius(), Decentring(), Prism(), LensChanged())
+EFFECTS = (
+    camera_effect("radius", _along_radius, _of_radius),
+    camera_effect("decentring", _decentred, _of_decentring),
+    camera_effect("prism", _one_way, _of_prism),
+    Effect("lens changed", lens_changes, _of_change),
+)

@@ -4,7 +4,8 @@ at one place than around it, or with a field that is painted out of square.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import first_of
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
-from ceres_cal.effects.evidence import FLOOR_OFF, SizePrior
+from ceres_cal.effects.evidence import FLOOR_OFF
 from ceres_cal.observations import Observations
 from ceres_cal.problem.structure import WARP, dimension_slopes, dimensions_of
 from ceres_cal.scene.targets import Arc, Segment
@@ -26,36 +27,22 @@ _FEWEST_ON_CURVE = 8
 _FEWEST_OF_POINT = 2
 
 
-class StructureTest(Effect):
+def _offsets(places: slice, case: Case, *, curves: bool = False) -> Iterator[EffectColumns]:
     """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
 
     Args:
-        kind, built: see `Effect`. places: of the numbers, as in `Equations.built`. words: what a finding says.
-        curves: whether of curves, or of points.
+        places: of the numbers, as in `Equations.built`. curves: whether of curves, or of points.
     """
-
-    def __init__(
-        self, kind: str, built: str, places: slice, words: Callable[[Evidence], Words], *, curves: bool = False
-    ) -> None:
-        self.kind, self.built, self._places, self._words, self._curves = kind, built, places, words, curves
-        self._fewest = _FEWEST_ON_CURVE if curves else 2 * _FEWEST_OF_POINT
-
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        equations, structure = case.equations, case.whole_structure
-        slot, own = (slots[:, self._places.start] for slots in case.slots)
-        solved = (own >= 0) & (own < case.estimate.structure.own)
-        rows = (equations.is_curve == self._curves) & (slot >= 0) & ~solved
-        numbers, group = grouped(slot, rows)
-        counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
-        group = np.where(counts[group] >= self._fewest, group, -1)
-        names = tuple(feature_of(structure.names[number]) for number in numbers)
-        yield EffectColumns(self.kind, equations.built[:, self._places], group, names)
-
-    def words(self, evidence: Evidence) -> Words:
-        return self._words(evidence)
-
-    def together(self, findings: Sequence[Finding]) -> Iterator[Finding]:
-        yield from _of_each_target(findings)
+    fewest = _FEWEST_ON_CURVE if curves else 2 * _FEWEST_OF_POINT
+    equations, structure = case.equations, case.whole_structure
+    slot, own = (slots[:, places.start] for slots in case.slots)
+    solved = (own >= 0) & (own < case.estimate.structure.own)
+    rows = (equations.is_curve == curves) & (slot >= 0) & ~solved
+    numbers, group = grouped(slot, rows)
+    counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
+    group = np.where(counts[group] >= fewest, group, -1)
+    names = tuple(feature_of(structure.names[number]) for number in numbers)
+    yield EffectColumns(equations.built[:, places], group, names)
 
 
 def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
@@ -119,28 +106,25 @@ def _of_point(evidence: Evidence) -> Words:
     )
 
 
-class OtherLength(Effect):
+def _lengths(case: Case) -> Iterator[EffectColumns]:
     """A length that a target is drawn by is another one: many of its lines and points lie elsewhere, in proportion."""
+    structure, targets = case.whole_structure, case.observations.targets
+    asked = [name for name in dimensions_of(targets) if name not in case.estimate.structure.dimensions]
+    slopes = dimension_slopes(structure.names, targets, asked)[1]
+    for name, moved in zip(asked, case.equations.built_along(structure, slopes).T, strict=True):
+        yield EffectColumns(moved[:, None], np.where(moved != 0.0, 0, -1), (name,))
 
-    kind = "other length"
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        structure, targets = case.whole_structure, case.observations.targets
-        asked = [name for name in dimensions_of(targets) if name not in case.estimate.structure.dimensions]
-        slopes = dimension_slopes(structure.names, targets, asked)[1]
-        for name, moved in zip(asked, case.equations.built_along(structure, slopes).T, strict=True):
-            yield EffectColumns(self.kind, moved[:, None], np.where(moved != 0.0, 0, -1), (name,))
-
-    def words(self, evidence: Evidence) -> Words:
-        name = evidence.score.subject
-        target, _, dimension = name.partition("/")
-        drawn_m = evidence.case.observations.targets[target].dimensions[dimension]
-        by, sd = evidence.score.amount, evidence.score.sd
-        return Words(
-            f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says ({evidence.size})",
-            f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}",
-            amounts((dimension,), 1e3 * by, 1e3 * sd, "mm"),
-        )
+def _of_length(evidence: Evidence) -> Words:
+    name = evidence.score.subject
+    target, _, dimension = name.partition("/")
+    drawn_m = evidence.case.observations.targets[target].dimensions[dimension]
+    by, sd = evidence.score.amount, evidence.score.sd
+    return Words(
+        f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says ({evidence.size})",
+        f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}",
+        amounts((dimension,), 1e3 * by, 1e3 * sd, "mm"),
+    )
 
 
 def _of_board(evidence: Evidence) -> Words:
@@ -161,98 +145,74 @@ def _of_board(evidence: Evidence) -> Words:
     )
 
 
-class _Floor(Effect):
-    """What moves the places of targets that are part of the world."""
-
-    absorbed = True
-
-    def concerns(self, observations: Observations) -> bool:
-        return any(not target.movable for target in observations.targets.values())
-
-    def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
-        _, reach_m = _extent(case.equations.place[columns.group == number])
-        return self.prior and self.prior.times(reach_m)
-
-
-class FloorBowed(_Floor):
+def _bowed(case: Case) -> Iterator[EffectColumns]:
     """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
-
-    kind = "floor bowed"
-    prior = FLOOR_OFF
-
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        target, names, (x, y) = _over_targets(case)
-        heights = np.column_stack([x * x, y * y, x * y])
-        yield EffectColumns(self.kind, _moved(case, 2)[:, None] * heights, target, names)
-
-    def words(self, evidence: Evidence) -> Words:
-        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        return Words(
-            f"{evidence.score.subject}: its floor appears {_lower(mm[0])} ± {sd[0]:.1f} mm at its edges along x than "
-            f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
-            f"({evidence.size})",
-            "measure its height at some points, and give them as points of a custom target with their z",
-            amounts(("x", "y", "twist"), mm, sd, "mm"),
-        )
+    target, names, (x, y) = _over_targets(case)
+    heights = np.column_stack([x * x, y * y, x * y])
+    yield EffectColumns(_moved(case, 2)[:, None] * heights, target, names)
 
 
-class FieldSheared(_Floor):
+def _of_bow(evidence: Evidence) -> Words:
+    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    return Words(
+        f"{evidence.score.subject}: its floor appears {_lower(mm[0])} ± {sd[0]:.1f} mm at its edges along x than "
+        f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
+        f"({evidence.size})",
+        "measure its height at some points, and give them as points of a custom target with their z",
+        amounts(("x", "y", "twist"), mm, sd, "mm"),
+    )
+
+
+def _sheared(case: Case) -> Iterator[EffectColumns]:
     """What runs along x is not at right angles to what runs along y."""
+    target, names, (x, y) = _over_targets(case)
+    yield EffectColumns((_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
 
-    kind = "field sheared"
-    prior = FLOOR_OFF
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        target, names, (x, y) = _over_targets(case)
-        yield EffectColumns(self.kind, (_moved(case, 0) * y + _moved(case, 1) * x)[:, None], target, names)
-
-    def words(self, evidence: Evidence) -> Words:
-        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        return Words(
-            f"{evidence.score.subject} is out of square: its edges lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves "
-            f"({evidence.size})",
-            "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are",
-            amounts(("shear",), mm, sd, "mm"),
-        )
+def _of_shear(evidence: Evidence) -> Words:
+    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    return Words(
+        f"{evidence.score.subject} is out of square: its edges lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves "
+        f"({evidence.size})",
+        "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are",
+        amounts(("shear",), mm, sd, "mm"),
+    )
 
 
 def _lower(mm: float) -> str:
     return f"{'higher' if mm > 0.0 else 'lower'} by {abs(mm):.1f}"
 
 
-class FloorUneven(_Floor):
+def _uneven(case: Case) -> Iterator[EffectColumns]:
     """The floor is higher or lower at one place."""
+    # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted.
+    # Nothing changes from half to double.
+    fewest_at_place = 8
+    cell_m = 1.0  # of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
+    target, names = _target_of(case)
+    cell = np.floor(case.equations.place[:, :2] / cell_m + 0.5).astype(np.int64)
+    span = 2 * int(np.abs(cell).max(initial=0)) + 1
+    key = (np.maximum(target, 0) * span + cell[:, 0] + span // 2) * span + cell[:, 1] + span // 2
+    numbers, group = grouped(key, target >= 0)
+    counts = np.bincount(group[(group >= 0) & case.model.used], minlength=len(numbers) + 1)
+    group = np.where((group >= 0) & (counts[group] >= fewest_at_place), group, -1)
+    subjects = []
+    for number in numbers.tolist():
+        rest, y = divmod(number, span)
+        of, x = divmod(rest, span)
+        at = [(place - span // 2) * cell_m for place in (x, y)]
+        subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
+    yield EffectColumns(_moved(case, 2)[:, None], group, tuple(subjects))
 
-    kind = "floor uneven"
 
-    def columns(self, case: Case) -> Iterator[EffectColumns]:
-        # Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted.
-        # Nothing changes from half to double.
-        fewest_at_place = 8
-        cell_m = 1.0  # of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
-        target, names = _target_of(case)
-        cell = np.floor(case.equations.place[:, :2] / cell_m + 0.5).astype(np.int64)
-        span = 2 * int(np.abs(cell).max(initial=0)) + 1
-        key = (np.maximum(target, 0) * span + cell[:, 0] + span // 2) * span + cell[:, 1] + span // 2
-        numbers, group = grouped(key, target >= 0)
-        counts = np.bincount(group[(group >= 0) & case.model.used], minlength=len(numbers) + 1)
-        group = np.where((group >= 0) & (counts[group] >= fewest_at_place), group, -1)
-        subjects = []
-        for number in numbers.tolist():
-            rest, y = divmod(number, span)
-            of, x = divmod(rest, span)
-            at = [(place - span // 2) * cell_m for place in (x, y)]
-            subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
-        yield EffectColumns(self.kind, _moved(case, 2)[:, None], group, tuple(subjects))
-
-    def words(self, evidence: Evidence) -> Words:
-        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-        return Words(
-            f"{evidence.score.subject} the floor is {abs(mm[0]):.0f} ± {sd[0]:.0f} mm "
-            f"{'higher' if mm[0] > 0.0 else 'lower'} than around it ({evidence.size})",
-            "look for what lies under the carpet, and leave out what was observed there",
-            amounts(["height"], mm, sd, "mm"),
-        )
+def _of_place(evidence: Evidence) -> Words:
+    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    return Words(
+        f"{evidence.score.subject} the floor is {abs(mm[0]):.0f} ± {sd[0]:.0f} mm "
+        f"{'higher' if mm[0] > 0.0 else 'lower'} than around it ({evidence.size})",
+        "look for what lies under the carpet, and leave out what was observed there",
+        amounts(["height"], mm, sd, "mm"),
+    )
 
 
 def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
@@ -291,10 +251,28 @@ def _extent(places: Array) -> tuple[Array, float]:
     return 0.5 * (low + high), max(0.5 * float(np.max(high - low)), 1e-9)
 
 
-CURVE_ASIDE = StructureTest("curve aside", "lines", slice(0, 3), _of_curve, curves=True)
+def _has_floor(observations: Observations) -> bool:
+    return any(not target.movable for target in observations.targets.values())
+
+
+def _reach_m(columns: EffectColumns, number: int, case: Case) -> float:
+    return _extent(case.equations.place[columns.group == number])[1]
+
+
+_of_target = partial(Effect, together=_of_each_target)
+CURVE_ASIDE = _of_target("curve aside", partial(_offsets, slice(0, 3), curves=True), _of_curve, built="lines")
 """A line or an arc is not painted as drawn."""
-POINT_ASIDE = StructureTest("point aside", "points", slice(0, 2), _of_point)
+POINT_ASIDE = _of_target("point aside", partial(_offsets, slice(0, 2)), _of_point, built="points")
 """A point does not lie where it is drawn."""
-BOARD_BENT = StructureTest("board bent", "warp", slice(2, 2 + len(WARP)), _of_board)
+BOARD_BENT = _of_target("board bent", partial(_offsets, slice(2, 2 + len(WARP))), _of_board, built="warp")
 """A board is bowed along its sides, twisted or wavy."""
-EFFECTS = (FloorBowed(), FloorUneven(), FieldSheared(), OtherLength(), CURVE_ASIDE, POINT_ASIDE, BOARD_BENT)
+_of_floor = partial(Effect, absorbed=True, prior=FLOOR_OFF, reach=_reach_m, concerns=_has_floor)
+EFFECTS = (
+    _of_floor("floor bowed", _bowed, _of_bow),
+    Effect("floor uneven", _uneven, _of_place, absorbed=True),
+    _of_floor("field sheared", _sheared, _of_shear),
+    Effect("other length", _lengths, _of_length),
+    CURVE_ASIDE,
+    POINT_ASIDE,
+    BOARD_BENT,
+)
