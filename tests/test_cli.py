@@ -505,7 +505,7 @@ def test_says_how_two_cameras_agree(say: Say, tmp_path: Path) -> None:
     say("simulate", "two-cameras", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json")
     assert "seam      left - right: ± 0.65 mm on the floor" in said.out
-    assert "found 1.5 mm where 1.6 were expected (rms of 41 points and stretches that both observed)" in said.out
+    assert "found 1.5 mm where 1.7 were expected (rms of 41 points and stretches that both observed)" in said.out
 
 
 def test_says_what_rings_do_not_tell(say: Say) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scenes import camera, side_by_side
 
@@ -51,6 +51,7 @@ def own_sd(stated: Information, keys: tuple[Key, ...] = KEYS) -> Array:
 
 
 @given(st.integers(0, 2**31))
+@example(12000)
 @settings(max_examples=40)
 def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
     """However far the shifts are; what was stated of nothing is as wide as the shifts have it."""
@@ -59,12 +60,11 @@ def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
     shifts = list(size * rng.standard_normal((3, len(KEYS))))
     told = Posterior(seen + stated, stated=stated)
     wider = (told.widened(KEYS, shifts), told.with_alternatives(KEYS, shifts, [0.3, 0.2, 0.1]))
+    # A statement that says 1e-9 of what observations do beside it is below rounding: infinite before anything widens.
+    limit = np.where(np.isinf(told.spread.sd), np.inf, np.fmax(own_sd(stated), told.spread.sd))
     for posterior in wider:
-        assert np.all(posterior.spread.sd <= ROUNDING * own_sd(stated))
-        each, limit = (
-            posterior.mixture(),
-            np.where(np.isinf(told.spread.sd), np.inf, np.fmax(own_sd(stated), told.spread.sd)),
-        )
+        each = posterior.mixture()
+        assert np.all(posterior.spread.sd <= ROUNDING * limit)
         assert np.all(each.sd <= ROUNDING * limit) and np.all(each.variances <= ROUNDING * limit**2)
         assert np.all(np.abs(each.steps) <= ROUNDING * limit)
         assert np.all(posterior.sd <= ROUNDING * own_sd(stated))

@@ -46,7 +46,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
     phi_px: float = 0.0
     open_below: bool = False
     open_above: bool = False
-    lenses: list[tuple[int, int]] = []
+    lenses: list[list[int]] = []
 
     @classmethod
     def of(cls, mixture: Mixture) -> MixtureFile:
@@ -63,7 +63,7 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
             mixture.phi_px,
             mixture.open_below,
             mixture.open_above,
-            list(mixture.lenses.items()),
+            [[component, *of] for component, of in mixture.lenses.items()],
         )
 
     def mixture(self, name: str, known: Collection[Key]) -> Mixture:
@@ -85,7 +85,10 @@ class MixtureFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True
             raise InputError(f"{where} does not begin with phi of camera {name!r}: calibrate again")
         numbers = np.array(self.weights), np.array(self.steps).reshape(-1, len(self.keys)), tuple(every)
         valley = self.phi_px, self.open_below, self.open_above
-        return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, dict(self.lenses))
+        if any(len(one) not in (2, 3) for one in self.lenses):
+            raise InputError(f"{where}.lenses: of each component its lens and the one that is alike: calibrate again")
+        lenses = {one[0]: (one[1], one[2] if one[2:] else 0) for one in self.lenses}  # of pairs: as of before
+        return Mixture(tuple(self.keys), *numbers, np.array(self.at), chains, *valley, lenses)
 
 
 class SeenFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -172,9 +175,9 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         stated = information_from(self.stated, self.stated_keys, "posterior.stated")
         lenses = tuple(one.estimate() for one in self.lenses)
         if any(
-            not (0 < lens < len(lenses) and 0 <= component < len(mixture.weights))
+            not (0 < lens < len(lenses) and {component, alike} <= set(range(len(mixture.weights))))
             for mixture in mixtures.values()
-            for component, lens in mixture.lenses.items()
+            for component, (lens, alike) in mixture.lenses.items()
         ):
             raise InputError("posterior.mixtures names lenses that posterior.lenses has not: calibrate again")
         return Posterior(information, placements, freedom, mixtures, by_model or None, self.dependence, stated, lenses)
@@ -283,5 +286,5 @@ class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
         minima = over(ends[~bent], self.keys, information.keys)
         if len(minima):
             likely = np.full(len(minima), 1.0 / (len(minima) + 1.0))
-            mixture = (mixture or Mixture.of_one(information)).with_alternatives(likely, minima, information)
+            mixture = (mixture or Mixture.of_one(information)).shifted_also(likely, minima[:, None])
         return mixture

@@ -401,14 +401,14 @@ def _of_components(mixture: Mixture, estimate: Estimate, shown: Functional, widt
 
 
 def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], shown: Functional) -> None:
-    """Values (C, N, 2) of components that are another lens: by how much it shows them elsewhere, wherever it shows
-    anything.
+    """Values (C, N, 2) of components that are another lens: by how much it shows them elsewhere than the component that
+    is alike but for it, wherever it shows anything.
     """
     if mixture.lenses:
         near = shown.values(lenses[0])
-        for component, number in mixture.lenses.items():
-            off = shown.values(lenses[number]) - near
-            values[component] = np.where(np.isfinite(off), off, values[component])
+        off = [shown.values(lens) - near for lens in lenses]
+        for component, (lens, alike) in mixture.lenses.items():
+            values[component] = np.where(np.isfinite(off[lens]), values[alike] + off[lens], values[component])
 
 
 def _covariance(information: Information, there: Estimate, shown: Functional, width: float) -> Array:

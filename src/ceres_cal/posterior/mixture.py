@@ -55,7 +55,8 @@ class Mixture(Frozen):
         information: (I) about the numbers, one that it has no key of is held. at: (C,) which of these each has.
         chains: of components along phi. phi_px: by the estimate; 0 where there is no chain.
         open_below, open_above: the valley does not rise to the 95 % bound as far as lenses go.
-        lenses: of components that are another lens, which one: their steps are how the numbers follow it.
+        lenses: of components that are another lens, which one, and the component that is alike but for the lens: their
+            steps are how the numbers follow it.
     """
 
     keys: tuple[Key, ...]
@@ -67,7 +68,7 @@ class Mixture(Frozen):
     phi_px: float = 0.0
     open_below: bool = False
     open_above: bool = False
-    lenses: Mapping[int, int] = field(default_factory=dict)
+    lenses: Mapping[int, tuple[int, int]] = field(default_factory=dict)
 
     @classmethod
     def of_one(cls, information: Information) -> Mixture:
@@ -123,29 +124,29 @@ class Mixture(Frozen):
         """With other information in each component."""
         return replace(self, information=tuple(map(how, self.information)))
 
-    def with_alternatives(
-        self, weights: Array, steps: Array, information: Information, lenses: Sequence[int] = ()
-    ) -> Mixture:
-        """With further components of these weights (S,) at steps (S, K); other lenses by their numbers."""
-        number = next((n for n, one in enumerate(self.information) if one is information), len(self.information))
-        return replace(
-            self,
-            lenses={**self.lenses, **{len(self.weights) + count: lens for count, lens in enumerate(lenses)}},
-            weights=np.concatenate([(1.0 - weights.sum()) * self.weights, weights]),
-            steps=np.concatenate([self.steps, steps]),
-            information=(*self.information[:number], information, *self.information[number + 1 :]),
-            at=np.concatenate([self.at, np.full(len(weights), number)]),
-        )
-
-    def shifted_also(self, weights: Array, shifts: Array) -> Mixture:
-        """With all of it once more for each of the weights (S,), shifted by (S, C, K) or (S, 1, K)."""
+    def shifted_also(self, weights: Array, shifts: Array, lenses: Sequence[int] = ()) -> Mixture:
+        """With all of it once more for each of the weights (S,), shifted by (S, C, K) or (S, 1, K). Where these are
+        other lenses, their numbers (S,).
+        """
         every, count = [1.0 - weights.sum(), *weights], len(self.weights)
+        shown = {
+            copy * count + component: (lens, copy * count + alike)
+            for copy in range(len(every))
+            for component, (lens, alike) in self.lenses.items()
+        }
+        shown |= {
+            copy * count + component: (lens, component)
+            for copy, lens in enumerate(lenses, 1)
+            for component in range(count)
+            if component not in self.lenses
+        }
         steps = np.concatenate([self.steps, *(self.steps + shift for shift in shifts)])
         chains = tuple(
             Chain(chain.at + copy * count, chain.roots) for copy in range(len(every)) for chain in self.chains
         )
         of_all = np.concatenate([weight * self.weights for weight in every])
-        return replace(self, weights=of_all, steps=steps, at=np.tile(self.at, len(every)), chains=chains)
+        at = np.tile(self.at, len(every))
+        return replace(self, weights=of_all, steps=steps, at=at, chains=chains, lenses=shown)
 
     def off_valley(self, shifts: Array) -> Array:
         """(S, K) of shifts (S, K) what is beside the first chain, phi held: along it they change nothing."""

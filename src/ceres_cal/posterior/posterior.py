@@ -73,14 +73,15 @@ class Posterior(Frozen):
         """The posterior where something else may be true: shifts (S, K) of some numbers, with the probability of each.
 
         Where these follow other lenses, the estimate with the chosen one is given, and with each of them. They are
-        components of the mixtures, each as wide as all of it, and in the information by their second moments.
+        components of the mixtures, which have all else once more beside them, and in the information by their second
+        moments.
         """
         if not len(shifts):
             return self
         whole, likely = over(np.array(shifts), keys, self.keys), np.asarray(weights, dtype=float)
         limited = self._beside_stated(whole)
         numbers = range(1, len(lenses))
-        mixtures = {"": self.mixture().with_alternatives(likely, limited, self.information, numbers)}
+        mixtures = {"": self.mixture().shifted_also(likely, limited[:, None], numbers)}
         for name in self.followed:
             mine = self.mixtures[name]
             off = mine.off_valley(over(limited, self.keys, mine.keys))

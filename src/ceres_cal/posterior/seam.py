@@ -180,13 +180,14 @@ def disagreement(
         observations: that the calibration was made from, without those that were taken out.
         scales: noise scales of points and curves.
     """
+    fitted = Posterior(posterior.by_model or posterior.information)  # what else may be true takes up no noise
     a, b = (dict(_sightings(observations, estimate, station, scales)) for station in pair)
     common = [thing for thing in a if thing in b]
     places = np.array([a[thing].place for thing in common]).reshape(-1, 3)
     covariances = np.full((len(common), 2, 2), np.nan)
     for height_m in distinct(places[:, 2]):
         here = places[:, 2] == height_m
-        reading, visible = predicted(estimate, posterior, pair, places[here, :2], float(height_m))
+        reading, visible = predicted(estimate, fitted, pair, places[here, :2], float(height_m))
         covariances[np.flatnonzero(here)[visible]] = reading.covariance
     gaps = [_gap(a[thing], b[thing], covariance) for thing, covariance in zip(common, covariances, strict=True)]
     known = [number for number, (_, expected) in enumerate(gaps) if np.isfinite(expected)]

@@ -194,8 +194,8 @@ class Uncertainty(Frozen):
         owners = dict.fromkeys(key.owner for key in keys)
         parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
         many, names = len(keys) > 1, " and ".join(parts)
-        if np.isinf(relative):
-            return f"nothing tells {names}{' apart' if many else ''}"
+        if relative >= 1.0:  # known to its own size or worse: a percentage would say nothing
+            return f"{'nothing' if np.isinf(relative) else 'hardly anything'} tells {names}{' apart' if many else ''}"
         return f"{names}{' trade off: each' if many else ':'} known to {two_digits(100.0 * relative)} % only"
 
     @cached_property
