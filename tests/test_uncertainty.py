@@ -204,7 +204,7 @@ def test_another_lens_is_followed_over_the_floor() -> None:
     step = 1e-3 * natural_sizes(near, keys) * np.random.default_rng(2).standard_normal(len(keys))
     fisheye = nearest(camera, KannalaBrandt((0.0, 0.0, 0.0, 0.0)))
     lenses = others_of(near, moved(near, keys, step), replace(near, cameras={"overhead": fisheye.at(Pose.identity())}))
-    shifts = shifts_to_lenses(lenses, keys, near)
+    shifts = shifts_to_lenses(lenses, keys, [near])[0]
     pixels = camera.principal_point + 200.0 * np.random.default_rng(3).uniform(-1.0, 1.0, (50, 2))
     slopes = locate_slopes(near, keys, "overhead", pixels, 0.0)
     for other, shift, left in zip(lenses.others, shifts, (0.02, 0.7), strict=True):  # 0.004 and 0.5
@@ -217,7 +217,7 @@ def test_another_lens_is_followed_where_no_floor_is_seen() -> None:
     near = calibrated(25.0).estimate
     keys = [key for key in calibrated(25.0).uncertainty.posterior.keys if key.kind == "camera"]
     step = np.array([{"phi": 5.0, "cx": 2.0}.get(key.quantity, 0.0) for key in keys])
-    (shift,) = shifts_to_lenses(others_of(near, moved(near, keys, step)), keys, near)
+    (shift,) = shifts_to_lenses(others_of(near, moved(near, keys, step)), keys, [near])[0]
     assert dict(zip([key.quantity for key in keys], shift, strict=True))["phi"] == pytest.approx(5.0, rel=0.03)
 
 

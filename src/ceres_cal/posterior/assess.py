@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import numerical
+from ceres_cal.base.arrays import Array, numerical
 from ceres_cal.base.frozen import replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.dependence import Scatter
@@ -130,19 +130,42 @@ def _inflation(posterior: Posterior, camera: str) -> float:
 
 
 def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> Mixture:
-    """The valley as seen from the estimate, across it as wide as the data scatter with phi held."""
+    """The valley as seen from the estimate, across it as wide as the data scatter with phi held.
+
+    By as much as all directions scatter more, those at a node do; beyond that its numbers scatter so that the same
+    places do. Numbers one by one tell nothing of places: the higher a node, the closer position and tilt go together.
+    """
     stated_sd = dict(zip(posterior.keys, posterior.stated_sd.tolist(), strict=True))
     along = profile(camera, nodes, estimate, posterior.half_width, stated_sd)
     if posterior.by_model is None:
         return along
-    others = [key for key in posterior.keys if key != along.keys[0]]
+    from ceres_cal.posterior.other_lenses import shifts_along
+
+    others, keys = [key for key in posterior.keys if key != along.keys[0]], along.keys[1:]
     held = (i.less(posterior.stated).given(others) for i in (posterior.information, posterior.by_model))
-    factors = widths_over(*(one.marginal(along.keys[1:]).spread for one in held))
+    factor, excess = _excess(*(one.marginal(keys).spread.covariance for one in held))
+    there = [moved(estimate, along.keys, step) for step in along.steps]
+    shifts = shifts_along(keys, camera, estimate, there, excess)
 
-    def scattered(seen: Information) -> Information:
-        return Information(seen.keys, seen.matrix / factors[:, None] / factors)
+    def wider(across: Information, own: Array) -> Information:
+        return posterior.wider(across, lambda seen: Information(keys, seen.matrix / factor).widened(own))
 
-    return along.with_information(lambda across: posterior.wider(across, scattered))
+    return replace(along, information=tuple(map(wider, along.information, shifts)))
+
+
+def _excess(covariance: Array, of_model: Array) -> tuple[float, Array]:
+    """By which factor at least a covariance (K, K) is that of a model, and (S, K) whose products with themselves are
+    what it is more.
+    """
+    none = 1e-9  # share of the largest variance, in units of each number's own: rounding
+    unit = np.sqrt(np.maximum(np.diagonal(of_model), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(of_model / unit[:, None] / unit)
+    told = values > none * values[-1]
+    root = vectors[:, told] * np.sqrt(values[told])
+    back = vectors[:, told] / np.sqrt(values[told])
+    ratios, turned = np.linalg.eigh(back.T @ (covariance / unit[:, None] / unit) @ back)
+    least = float(max(ratios[0], none))
+    return least, (unit[:, None] * root @ turned * np.sqrt(ratios - least)).T
 
 
 def _is_lens(camera: Camera) -> bool:
@@ -199,12 +222,13 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
     # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
     keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
     weights = counted(lenses.weights)
-    shifts, every = shifts_to_lenses(lenses, keys, lenses.near), (lenses.near, *lenses.others)
+    every = (lenses.near, *lenses.others)
+    shifts = shifts_to_lenses(lenses, keys, every[:1])[0]
     wider = posterior.with_alternatives(keys, shifts, weights.tolist(), every)
     mixtures = dict(wider.mixtures)
     for name in posterior.followed:
         mine = posterior.mixtures[name]
         nodes = [moved(estimate, mine.keys, step) for step in mine.steps]
-        along = np.array([shifts_to_lenses(lenses, mine.keys[1:], node) for node in nodes])
+        along = shifts_to_lenses(lenses, mine.keys[1:], nodes)
         mixtures[name] = mine.shifted_also(weights, over(np.swapaxes(along, 0, 1), mine.keys[1:], mine.keys))
     return replace(wider, mixtures=mixtures)

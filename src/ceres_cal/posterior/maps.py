@@ -295,24 +295,21 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     x, y = image_grid(own.image_size)
     pixels = grid_places(x, y)
 
-    def known(picture: Picture) -> Reading:
-        shown = Functional(
-            lambda there: picture.shift(there.cameras[camera].at(Pose.identity())),
-            lambda there, keys: picture_slopes(picture.of(there.cameras[camera]), keys, camera),
-        )
-        return read(posterior, estimate, shown, camera)
-
     picture = Picture(own, pixels, 0.0)
-    with_turns = known(picture).sd
+    with_turns = read(posterior, estimate, shown_by(camera, picture), camera).sd
     picture = replace(picture, weights=1.0 / np.maximum(with_turns, exact_px))
-    radius = known(picture).radius_95
+    radius = read(posterior, estimate, shown_by(camera, picture), camera).radius_95
     return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
 
 
-def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
-    """(N, 2, K) px per unit of each of the keys: 0 of what is not this camera's."""
-    own = [key for key in keys if key[:2] == ("camera", camera)]
-    return over(picture.slopes([key.quantity for key in own]), own, keys)
+def shown_by(camera: str, picture: Picture) -> Functional:
+    """By how many px a camera shows its rays elsewhere than a picture of it does."""
+
+    def slopes(there: Estimate, keys: Sequence[Key]) -> Array:
+        own = [key for key in keys if key[:2] == ("camera", camera)]
+        return over(picture.of(there.cameras[camera]).slopes([key.quantity for key in own]), own, keys)
+
+    return Functional(lambda there: picture.shift(there.cameras[camera].at(Pose.identity())), slopes)
 
 
 # ---- anything that is read off an estimate -------------------------------------------------------------------------

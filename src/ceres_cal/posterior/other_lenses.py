@@ -20,6 +20,7 @@ lens is. By what the free numbers take up of them they are off.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from ceres_cal.effects.linearised import Linearised, equation_weights, linearise
 from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.posterior.maps import Picture, locate_slopes, picture_slopes
+from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes
@@ -67,36 +68,14 @@ class OtherLenses(Frozen):
     @cached_property
     def pixels(self) -> dict[str, Array]:
         """Camera -> (N, 2) of a grid over its image, as far as it was observed."""
-        pixels = {}
-        for name, reach_px in self.reach_px.items():
-            camera = self.near.cameras[name]
-            x, y = (np.linspace(0.0, side - 1.0, _PLACES) for side in camera.image_size)
-            places = grid_places(x, y)
-            pixels[name] = places[np.linalg.norm(places - camera.principal_point, axis=1) <= reach_px]
-        return pixels
+        return {name: _places_of(self.near.cameras[name], reach_px) for name, reach_px in self.reach_px.items()}
 
-    @cached_property
-    def pictures(self) -> dict[str, Picture]:
-        """Camera -> what the chosen lens shows there."""
-        every = self.pixels.items()
-        return {name: Picture(self.near.cameras[name].at(Pose.identity()), pixels) for name, pixels in every}
 
-    def shifts(self, camera: str) -> Array:
-        """(L, N, 2) px by how much the others show rays elsewhere, turned as well as can be."""
-        return np.array([self.pictures[camera].shift(one.cameras[camera].at(Pose.identity())) for one in self.others])
-
-    def offsets(self, station: str, height_m: float) -> Array:
-        """(L, N, 2) m by how much the others locate pixels elsewhere; every node of a valley asks for the same."""
-        if (station, height_m) not in self._offsets:
-            pixels = self.pixels[self.near.stations[station].camera]
-            located = self.near.camera_at(station).locate(pixels, height_m)
-            every = [one.camera_at(station).locate(pixels, height_m) - located for one in self.others]
-            self._offsets[station, height_m] = np.array(every)
-        return self._offsets[station, height_m]
-
-    @cached_property
-    def _offsets(self) -> dict[tuple[str, float], Array]:
-        return {}
+def _places_of(camera: Camera, reach_px: float = np.inf) -> Array:
+    """(N, 2) px of a grid over a camera's image, so far from its principal point."""
+    x, y = (np.linspace(0.0, side - 1.0, _PLACES) for side in camera.image_size)
+    places = grid_places(x, y)
+    return np.asarray(places[np.linalg.norm(places - camera.principal_point, axis=1) <= reach_px])
 
 
 def counted(weights: Sequence[float]) -> Array:
@@ -106,48 +85,61 @@ def counted(weights: Sequence[float]) -> Array:
     return np.asarray(each / max(1.0, float(each.sum()) / most))
 
 
-def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> list[Array]:
-    """(K,) of numbers of an estimate, which follow each of the others.
+def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[Estimate]) -> Array:
+    """(M, L, K) of numbers of M estimates, which follow each of the others.
 
     Args:
-        there: with the chosen lens, at its best or elsewhere in a valley along phi.
+        nodes: with the chosen lens, at its best or elsewhere in a valley along phi.
     """
+    shown = list(_shown(keys, lenses.near, lenses.pixels))
+    near = [one.values(lenses.near) for _, one in shown]
+    others = [[one.values(other) - at for (_, one), at in zip(shown, near, strict=True)] for other in lenses.others]
+    return _following(shown, keys, nodes, [[one.ravel() for one in offsets] for offsets in others])
+
+
+def shifts_along(keys: Sequence[Key], camera: str, here: Estimate, nodes: Sequence[Estimate], shifts: Array) -> Array:
+    """(M, S, K) of numbers of M estimates, which show the same elsewhere as shifts (S, K) of one of them show."""
+    shown = list(_shown(keys, here, {camera: _places_of(here.cameras[camera])}))
+    slopes = [one.slopes(here, keys).reshape(-1, len(keys)) for _, one in shown]
+    return _following(shown, keys, nodes, [[slope @ shift for slope in slopes] for shift in shifts])
+
+
+def _following(
+    shown: Sequence[tuple[float, Functional]], keys: Sequence[Key], nodes: Sequence[Estimate], offsets: Any
+) -> Array:
+    """(M, S, K) of numbers of M estimates, by which they show everything elsewhere by S offsets, by least squares."""
     followed = 1e-4  # of the largest singular value: directions that show less are not moved along
-    every = list(_compared(lenses, keys, there))
-    if not every:
-        return []
-    slopes, offsets = zip(*every, strict=True)
-    slope = np.concatenate([one.reshape(-1, len(keys)) for one in slopes])
-    sizes, shifts = natural_sizes(there, keys), []
-    for number in range(len(lenses.others)):
-        offset = np.concatenate([one[number].ravel() for one in offsets])
-        known = np.isfinite(slope).all(axis=1) & np.isfinite(offset)
-        step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=followed)[0]
-        shifts.append(step * sizes)
+    shifts = np.zeros((len(nodes), len(offsets), len(keys)))
+    weight = np.repeat([one for one, _ in shown], [len(offset) for offset in offsets[0]] if len(offsets) else 0)
+    for number, there in enumerate(nodes if shown else ()):
+        sizes = natural_sizes(there, keys)
+        slopes = np.concatenate([one.slopes(there, keys).reshape(-1, len(keys)) for _, one in shown]) * sizes
+        for column, offset in enumerate(offsets):
+            off = np.concatenate(offset)
+            known = np.isfinite(slopes).all(axis=1) & np.isfinite(off)
+            weighed = weight[known]
+            step = np.linalg.lstsq(weighed[:, None] * slopes[known], weighed * off[known], rcond=followed)[0]
+            shifts[number, column] = step * sizes
     return shifts
 
 
-def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iterator[tuple[Array, Array]]:
-    """Of each camera that the keys say anything of: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much
-    others show it elsewhere.
+def _shown(keys: Sequence[Key], near: Estimate, pixels: Mapping[str, Array]) -> Iterator[tuple[float, Functional]]:
+    """What pixels of cameras show that the keys say anything of, each with its weight, px per unit: places on the
+    floor, where phi is free also above it, and rays of a camera that sees no floor.
     """
     known = dict.fromkeys(key.owner for key in keys if key.kind == "station")
-    spoken_of = {key.owner for key in keys if key.kind == "camera"} | {there.stations[name].camera for name in known}
-    for name, pixels in lenses.pixels.items():
+    spoken_of = {key.owner for key in keys if key.kind == "camera"} | {near.stations[name].camera for name in known}
+    for name, places in pixels.items():
         if name not in spoken_of:
             continue
-        camera = there.cameras[name]
-        stations = [station for station in known if there.stations[station].camera == name]
+        stations = [station for station in known if near.stations[station].camera == name]
         tells_phi = any(key[:3] == ("camera", name, "phi") for key in keys)
         for station in stations:
-            px_per_m = camera.phi / max(abs(float(there.camera_at(station).position[2])), 1e-3)
+            px_per_m = near.cameras[name].phi / max(abs(float(near.camera_at(station).position[2])), 1e-3)
             for height_m, part in zip(HEIGHTS_M[: 2 if tells_phi else 1], _PARTS, strict=False):
-                slopes = locate_slopes(there, keys, station, pixels, height_m)
-                yield part * px_per_m * slopes, part * px_per_m * lenses.offsets(station, height_m)
+                yield part * px_per_m, located_by(station, places, height_m)
         if not stations:
-            picture = lenses.pictures[name]
-            picture = picture if there is lenses.near else picture.of(camera)
-            yield picture_slopes(picture, keys, name), lenses.shifts(name)
+            yield 1.0, shown_by(name, Picture(near.cameras[name].at(Pose.identity()), places))
 
 
 AGREES = 2.5
