@@ -275,6 +275,15 @@ def test_beyond_the_observations_other_lenses_are_what_they_show(seed: int) -> N
     assert np.all(off < 4.0 * points.sd_m)  # .6, 1.8, 2.1 measured; 1.9, 7.4 and 9.6 with the chosen lens alone
 
 
+@pytest.mark.parametrize("seed", [2, 7])
+def test_straight_from_above_the_floor_is_known_though_phi_is_not(seed: int) -> None:
+    """Where errors go together (2), and where the unknown direction moves the lens by rounding (7)."""
+    calibration = calibrated(0.0, seed)
+    floor = calibration.uncertainty.map_sd_mm("overhead", 0.0)
+    assert calibration.uncertainty.posterior.followed and phi_of(calibration).verdict == "unknown"
+    assert floor.mean_mm < 4.0  # 1.2 and 2.5 measured; 22 of seed 2 by the scatter of each number alone, 7 was refused
+
+
 def test_other_lenses_bend_as_the_chosen_one_does() -> None:
     """Half a field by one camera, 3 degrees off straight down: phi is known to 6 %, and goes with the height along a
     curve. Another lens that lies elsewhere on the curve moves nothing on the floor.
