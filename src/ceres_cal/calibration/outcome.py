@@ -62,12 +62,11 @@ _BEHIND = (
 
 def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
     """Raise DegenerateError where coefficients of a lens may be anything at all."""
-    # Without what bends, phi of a valley held: where that is open, so is all that goes with it.
-    followed = [key for key in posterior.keys if key.quantity == "phi" and key.owner in posterior.followed]
-    known = posterior.information.given([key for key in posterior.keys if key not in followed])
+    # Where a valley of phi is open, so may be all that goes with it: along it, or by the quadratic picture.
+    known = np.minimum(posterior.spread.sd, posterior.sd)
     for name, camera in estimate.cameras.items():
         keys = [key for key in posterior.keys if key[:2] == ("camera", name) and key.quantity in camera.lens.names]
-        sd = known.spread.sd[known.columns(keys)]
+        sd = known[posterior.information.columns(keys)]
         lost = [
             key.quantity for key, size in zip(keys, sd / natural_sizes(estimate, keys), strict=True) if size > _LOST
         ]
