@@ -70,6 +70,18 @@ def rms(values: Array, nothing: float = np.nan) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else nothing
 
 
+def largest(values: Array, nothing: float = np.nan) -> float:
+    """The largest of the values that are not NaN; `nothing` where there are none."""
+    known = values[~np.isnan(values)]
+    return float(np.max(known)) if len(known) else nothing
+
+
+def rms_and_largest(off: Array) -> tuple[float, float]:
+    """Of lengths; infinite where one is unknown, or none is there."""
+    off = np.where(np.isfinite(off), off, np.inf)
+    return rms(off, np.inf), largest(off, np.inf)
+
+
 def grid_places(x: Array, y: Array) -> Array:
     """(Y * X, 2) all places of a grid x (X,), y (Y,), row by row."""
     return np.column_stack([part.ravel() for part in np.meshgrid(x, y)])

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, rms
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.tails import log_chi2_tail, log_f_tail
 from ceres_cal.calibration import Calibration
@@ -85,11 +85,11 @@ def _noise_of(
     variance, spare = model.variance(rows), model.spare_of(rows)
     scale = own_scale * float(np.sqrt(variance / own_variance)) if own_variance > 0.0 else own_scale
     count = int(np.count_nonzero(rows)) // (1 if kind == "curves" else 2)
-    stated = float("nan") if np.all(column.sigma_px == 1.0) else float(np.sqrt(np.mean(column.sigma_px**2)))
+    stated = float("nan") if np.all(column.sigma_px == 1.0) else rms(column.sigma_px)
     log_p = 0.0
     if np.isfinite(stated) and spare >= 1.0:
         log_p = float(log_chi2_tail(variance * spare * own_scale**2 / LARGER**2, spare))
-    typical = scale * float(np.sqrt(np.mean(column.sigma_px**2)))
+    typical = scale * rms(column.sigma_px)
     correlation, pairs_log_p = _correlation(model, _neighbours(observations, model, kind), variance)
     agree = max(correlation, 0.0) if np.isfinite(correlation) and pairs_log_p < np.log(0.01) else 0.0
     effective = count * (1.0 - agree) / (1.0 + agree)  # of a first-order autoregression

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, grid_places
+from ceres_cal.base.arrays import Array, grid_places, rms_and_largest
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import HEIGHTS_M, at_height
 from ceres_cal.formats.format import ExportLoss, ExportRequest
@@ -38,14 +38,8 @@ def field_error_mm(
         with np.errstate(invalid="ignore"):
             on_field = np.all((true >= low - edge_m) & (true <= high + edge_m), axis=1)
         off = 1e3 * np.linalg.norm(locate(pixels[on_field], height_m) - true[on_field], axis=1)
-        errors[height_m] = _size(off)
+        errors[height_m] = rms_and_largest(off)
     return errors
-
-
-def _size(off: Array) -> tuple[float, float]:
-    """Root mean square and largest; infinite where one is unknown, or none is there."""
-    off = np.where(np.isfinite(off), off, np.inf)
-    return (float(np.sqrt(np.mean(off**2))), float(np.max(off))) if len(off) else (np.inf, np.inf)
 
 
 def field_box(targets: Mapping[str, Target]) -> Box | None:
@@ -80,7 +74,7 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
     known = np.isfinite(rays[:, 0])
     depth_m = max(abs(camera.position[2]), 1.0)
     points = camera.position + depth_m * (rays[known] @ camera.cam_from_world.rotation)
-    image_px = _size(np.linalg.norm(project(points) - pixels[known], axis=1))
+    image_px = rms_and_largest(np.linalg.norm(project(points) - pixels[known], axis=1))
     if box_m is None:
         return ExportLoss(station, {}, image_px)
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, grid_places
+from ceres_cal.base.arrays import Array, Mask, grid_places, largest
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.shown import brief, drawn
@@ -129,6 +129,11 @@ class FieldGrid(Frozen):
         """(Y * X, 2) m, row by row."""
         return grid_places(self.x_m, self.y_m)
 
+    def place_of_largest(self, values: Array) -> tuple[float, float]:
+        """Where values (Y, X) that are not negative are largest, m; NaN is nowhere."""
+        x, y = self.places[np.argmax(np.nan_to_num(values, nan=-1.0, posinf=1e300))].tolist()
+        return x, y
+
 
 class ErrorMap(FieldGrid, ABC):
     """Errors of one station over a grid."""
@@ -147,8 +152,7 @@ class ErrorMap(FieldGrid, ABC):
     @property
     def worst_mm(self) -> float:
         """Largest over what the image shows."""
-        visible = self.errors_mm[~np.isnan(self.errors_mm)]
-        return float(np.max(visible)) if len(visible) else np.nan
+        return largest(self.errors_mm)
 
 
 class FieldMap(ErrorMap):
@@ -171,8 +175,7 @@ class FieldMap(ErrorMap):
     @property
     def worst_place_m(self) -> tuple[float, float]:
         """Where that is."""
-        row, column = np.unravel_index(np.argmax(np.nan_to_num(self.sd_mm, nan=-1.0, posinf=1e300)), self.sd_mm.shape)
-        return float(self.x_m[column]), float(self.y_m[row])
+        return self.place_of_largest(self.sd_mm)
 
 
 def visible_pixels(estimate: Estimate, station: str, places: Array, height_m: float) -> Array:

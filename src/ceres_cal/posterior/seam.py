@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, rms
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Columns, Observations
@@ -139,12 +139,12 @@ class Disagreement(Frozen):
     @property
     def rms_mm(self) -> float:
         """Root mean square of the differences; NaN where the two observed nothing in common."""
-        return float(np.sqrt(np.mean(self.off_mm**2))) if len(self.off_mm) else np.nan
+        return rms(self.off_mm)
 
     @property
     def expected_rms_mm(self) -> float:
         """The same of what was expected."""
-        return float(np.sqrt(np.mean(self.expected_mm**2))) if len(self.off_mm) else np.nan
+        return rms(self.expected_mm)
 
 
 class _Sighting(Frozen):

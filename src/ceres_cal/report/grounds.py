@@ -86,10 +86,6 @@ def is_against(finding: Finding) -> bool:
     return finding.wrong in ("model", "calibration")
 
 
-def _findings(quality: Quality) -> tuple[Finding, ...]:
-    return () if quality.diagnosis is None else quality.diagnosis.findings
-
-
 def disputed(quality: Quality) -> bool:
     """Whether what was known beforehand is contradicted; a tolerance alone leaves the calibration as it is."""
     return any(conflict.kind != "tolerance" for conflict in quality.calibration.conflicts)
@@ -103,15 +99,15 @@ def noise_ratio(quality: Quality) -> float:
 
 def model_error_mm(quality: Quality) -> float:
     """The largest effect of what is wrong with the model, rms mm; 0 where nothing is known to be."""
-    return _largest_mm([finding for finding in _findings(quality) if finding.is_model_error])
+    return _largest_mm(quality.faults)
 
 
 def misfit_mm(quality: Quality) -> float:
     """By how much a refit to new data would move it, rms mm; 0 where it holds on them, or they are its own."""
-    return _largest_mm([finding for finding in _findings(quality) if finding.wrong == "calibration"])
+    return _largest_mm([finding for finding in quality.findings if finding.wrong == "calibration"])
 
 
-def _largest_mm(findings: list[Finding]) -> float:
+def _largest_mm(findings: Sequence[Finding]) -> float:
     return float(np.nanmax([0.0, *(finding.effect_mm for finding in findings)]))
 
 
@@ -156,16 +152,15 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
-    diagnosis, off_mm = quality.diagnosis, misfit_mm(quality)
-    if diagnosis is None:
+    if quality.diagnosis is None:
         return
-    wrong = [f"{finding.kind} ({finding.subject})" for finding in diagnosis.findings if finding.is_model_error]
-    if not diagnosis.findings:
+    off_mm = misfit_mm(quality)
+    if quality.faults:
+        yield _of_faults(quality)
+    elif quality.findings:
+        yield "", f"{counted(len(quality.findings), 'finding')} below. None says that the model is wrong."
+    else:
         yield "good", "The residuals look like noise."
-    elif not wrong:
-        yield "", f"{counted(len(diagnosis.findings), 'finding')} below. None says that the model is wrong."
-    if wrong:
-        yield _of_faults(quality, first_of(list(dict.fromkeys(wrong)), 4))
     if off_mm:
         yield (
             "no" if off_mm > GOOD_MM else "care",
@@ -173,7 +168,7 @@ def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
         )
 
 
-def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
+def _of_faults(quality: Quality) -> tuple[str, str]:
     """Level and line of what is wrong with the model, by how far it moves a result."""
     sigmas, places = quality.fault_sigmas, bool(quality.faulty_maps)
     left_mm = max((one.radius_mm for one in reaches(quality)), default=np.inf)
@@ -187,6 +182,7 @@ def _of_faults(quality: Quality, names: str) -> tuple[str, str]:
     counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
     moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
     wrong_mm = mm(model_error_mm(quality))
+    names = first_of(list(dict.fromkeys(f"{fault.kind} ({fault.subject})" for fault in quality.faults)), 4)
     return level, f"The model is wrong by up to {wrong_mm} rms: {names}. This moves {moved}. {counted_in}."
 
 
@@ -262,12 +258,6 @@ def reach(height_m: float, maps: Sequence[FieldMap | FaultyMap], times: float) -
     level, worst_level = level_of(most, times), level_of(farthest, times)
     level = "care" if level == "good" and worst_level == "no" else level
     return Reach(height_m, most, farthest, f"x {x:.1f}, y {y:.1f} m", level, worst_level != level_of(most, times))
-
-
-def worst_radius(one: FieldMap | FaultyMap) -> float:
-    """The largest of its 95 % radii, mm; NaN where it shows nothing."""
-    shown = one.radius_95_mm[~np.isnan(one.radius_95_mm)]
-    return float(shown.max()) if len(shown) else np.nan
 
 
 def focal(quality: Quality) -> Iterator[Verdict]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from ceres_cal.base.arrays import rms
 from ceres_cal.base.words import counted, first_of, fixed
 from ceres_cal.calibration import Calibration
 from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
@@ -60,7 +61,7 @@ def _rms_px(material: Material, frame: Frame) -> float:
     """Of the residuals that took part in a frame; 0 without any."""
     table = material.diagnosis.table
     distances = table.distance_px[np.isin(table.view, frame.views) & table.inlier]
-    return float(np.sqrt(np.mean(distances**2))) if len(distances) else 0.0
+    return rms(distances, 0.0)
 
 
 def _picture(material: Material, photographs: FramePhotographs, frame: Frame, number: int) -> PhotoFigure:

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, grid_places
+from ceres_cal.base.arrays import Array, grid_places, largest
 from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, image_grid
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Draw, Hover
 from ceres_cal.report.document import Figure, Table
-from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.residual_pictures import number_of, owner_suffix
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
@@ -120,7 +119,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         posed,
         one.height_m,
         material.fields,
-        _worst_place(one) if np.isfinite(worst_radius(one)) else None,
+        one.place_of_largest(one.radius_95_mm) if np.isfinite(largest(one.radius_95_mm)) else None,
         _within(posed.locate(material.observed(station)), one) if one.height_m == 0.0 else None,
     )
     where = sentence(at_height(one.height_m)) + ("" if one.height_m == 0.0 else ", robot height")
@@ -140,11 +139,6 @@ def _named(material: Material, station: str) -> str:
     return f", {station}" if len(material.maps) > 1 else ""
 
 
-def _worst_place(one: FieldMap) -> tuple[float, float]:
-    row, column = np.unravel_index(np.nanargmax(one.radius_95_mm), one.radius_95_mm.shape)
-    return float(one.x_m[column]), float(one.y_m[row])
-
-
 def _within(places: Array, one: FieldMap) -> Array:
     """Those that the map shows."""
     low, high = (one.x_m[0], one.y_m[0]), (one.x_m[-1], one.y_m[-1])
@@ -153,7 +147,7 @@ def _within(places: Array, one: FieldMap) -> Array:
 
 
 def _reading(one: FieldMap) -> str:
-    radius = worst_radius(one)
+    radius = largest(one.radius_95_mm)
     if np.isnan(radius):
         return "The image shows no place of the field"
     if np.isinf(radius):

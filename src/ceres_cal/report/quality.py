@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, largest
 from ceres_cal.base.errors import CalibrationError, attempt
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.words import HEIGHTS_M
@@ -169,11 +169,15 @@ class Quality(Frozen):
             return {}
         return {name: tuple(self.uncertainty.map_sd_mm(name, h) for h in HEIGHTS_M) for name in self.placed}
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Of the diagnosis."""
+        return () if self.diagnosis is None else self.diagnosis.findings
+
     @cached_property
     def faults(self) -> tuple[Finding, ...]:
         """What is wrong with the model, which no standard deviation contains."""
-        every = () if self.diagnosis is None else self.diagnosis.findings
-        return tuple(finding for finding in every if finding.is_model_error)
+        return tuple(finding for finding in self.findings if finding.is_model_error)
 
     @property
     def _step(self) -> JointStep | None:
@@ -239,6 +243,4 @@ def _of_observed(known: ImageMap, observations: Observations) -> float:
         return np.nan
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     columns, rows = (known.x_px >= left) & (known.x_px <= right), (known.y_px >= top) & (known.y_px <= bottom)
-    inside = known.radius_95_px[np.ix_(rows, columns)]
-    inside = inside[~np.isnan(inside)]
-    return float(inside.max()) if len(inside) else np.nan
+    return largest(known.radius_95_px[np.ix_(rows, columns)])

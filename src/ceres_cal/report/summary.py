@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ceres_cal.base.arrays import rms
 from ceres_cal.base.words import (
     DASH,
     HEIGHTS_M,
@@ -193,11 +194,10 @@ def _tiles(material: Material) -> Iterator[Tile]:
     fit, table = material.calibration.fit, material.diagnosis.table
     if material.diagnosis.new_data:
         distance = table.distance_px[table.inlier]
-        rms = float(np.sqrt(np.mean(distance**2))) if len(distance) else np.nan
-        yield Tile("Residuals of new data", short(rms), "px rms", f"over {counted(len(distance), 'observation')}")
+        title, size_px, count = "Residuals of new data", rms(distance), len(distance)
     else:
-        total = counted(fit.points + fit.curves, "observation")
-        yield Tile("Residuals", short(fit.rms_px), "px rms", f"over {total}")
+        title, size_px, count = "Residuals", fit.rms_px, fit.points + fit.curves
+    yield Tile(title, short(size_px), "px rms", f"over {counted(count, 'observation')}")
     out = int(np.count_nonzero(table.outlier))
     share = 100.0 * out / max(len(table), 1)
     yield Tile("Taken out", short(share), "%", f"{counted(out, 'outlier')} of {counted(len(table), 'observation')}")

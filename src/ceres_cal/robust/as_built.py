@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, rms
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.effects.aside import Explanation
@@ -175,7 +175,7 @@ def _measured(every: Sequence[AsBuilt], structure: Structure, observations: Obse
     """The same with the offsets that came out."""
     numbers = numbers_by_kind(structure, observations.targets)
     for one in every:
-        yield replace(one, rms_m=float(np.sqrt(np.mean(structure.values[numbers[one.target, one.kind]] ** 2))))
+        yield replace(one, rms_m=rms(structure.values[numbers[one.target, one.kind]]))
 
 
 # Of a dimension, its standard deviation from which on it is not measured. What nothing measures has an infinite one,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Mask, grid_places
+from ceres_cal.base.arrays import Array, Mask, grid_places, rms_and_largest
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.least_squares import least_squares
@@ -226,9 +226,7 @@ def _two(values: Array) -> tuple[float, float]:
 
 def _error(pixels: Array, wanted: Array) -> tuple[float, float]:
     """Root mean square and largest distance; infinite where there is no pixel."""
-    off = np.linalg.norm(pixels - wanted, axis=1)
-    off = np.where(np.isfinite(off), off, np.inf)
-    return float(np.sqrt(np.mean(off**2))), float(np.max(off))
+    return rms_and_largest(np.linalg.norm(pixels - wanted, axis=1))
 
 
 def _all_directions() -> Array:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median, rms
 from ceres_cal.base.errors import or_none
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import kept_signals
@@ -67,9 +67,7 @@ class PlaneSight(Frozen):
     def size_px(self) -> float:
         """Spread of the observations over the image; 0 where there are none on the plane."""
         offsets = self.pixels[len(self.points) :]
-        if not len(offsets):
-            return 0.0
-        return float(np.sqrt(np.mean(np.sum((offsets - offsets.mean(axis=0)) ** 2, axis=1))))
+        return rms(np.linalg.norm(offsets - offsets.mean(axis=0), axis=1)) if len(offsets) else 0.0
 
 
 def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:

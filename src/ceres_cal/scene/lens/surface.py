@@ -13,7 +13,7 @@ from functools import cache, lru_cache
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, grid_places, median
+from ceres_cal.base.arrays import Array, grid_places, median, rms
 
 _SPLINES = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 # Powers of the place that other terms of the lens and the camera displace by are none of the surface's: it has a
@@ -50,7 +50,7 @@ class Surface(Struct, frozen=True, eq=False):
         """Root mean square of the displacements over such a part of its sides."""
         x, y = (part * np.linspace(-1.0, 1.0, 4 * count) for count in self.heights.shape[:2])
         places = grid_places(x, y) * self.extents
-        return float(np.sqrt(np.mean(np.sum(self.at(places)[0] ** 2, axis=1))))
+        return rms(np.linalg.norm(self.at(places)[0], axis=1))
 
 
 def _cells(place: Array, count: int) -> tuple[Array, Array, Array]:
