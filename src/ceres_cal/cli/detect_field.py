@@ -89,8 +89,7 @@ class FieldArguments(QuietArguments):
 def _run(args: FieldArguments) -> Document:
     images, videos = images_and_videos(args.images)
     files.require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
-    files.require_output(args.picture, [*images, *videos])
-    files.require_ending(args.picture, "pictures are", ".png")
+    files.require_output(args.picture, [*images, *videos], "pictures are", ".png")
     one = median_path(args.output, [*images, *videos]) if videos or args.median else None
     _require_fitting(args)
     from ceres_cal.calibration import Calibration

@@ -29,7 +29,7 @@ def _run(
     ),
 ) -> Document:
     files.require_outputs(args, [calibration, *observations])
-    files.require_ending(output, "the table is", ".csv", ".json", ".npz")
+    files.require_output(output, [], "the table is", ".csv", ".json", ".npz")
     if not 0.0 < false_alarms < 1.0:
         raise InputError(f"--false-alarms must lie between 0 and 1, not {false_alarms:g}")
     if held_out and new_data:

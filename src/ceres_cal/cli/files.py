@@ -135,8 +135,10 @@ def station_of(path: Path, station: str | None, calibration: Calibration) -> str
 # ---- files ----------------------------------------------------------------------------------------------------------
 
 
-def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:
-    """Raise InputError, before any long work, where a result cannot be written or would replace an input."""
+def require_output(path: Path | None, inputs: Iterable[str | Path], what: str = "", *endings: str) -> None:
+    """Raise InputError, before any long work, where a result cannot be written or would replace an input, or its ending
+    is none of those that it is written with; `what` such as "the table is".
+    """
     if path is None:
         return
     if not path.parent.is_dir():
@@ -147,6 +149,9 @@ def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:
         raise InputError(f"{path}: cannot be written: Permission denied: name another place")
     if path.exists() and any(Path(given).exists() and path.samefile(given) for given in inputs):
         raise InputError(f"{path}: is an input, and the output would replace it: name another file")
+    if what and path.suffix not in endings:
+        known = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
+        raise InputError(f"{path}: {what} written as {known}: give {'one of these endings' if endings[1:] else 'that'}")
 
 
 def require_folder(path: Path) -> None:
@@ -157,28 +162,19 @@ def require_folder(path: Path) -> None:
 
 def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> None:
     """`require_output` of a file of observations."""
-    require_output(path, inputs)
-    require_ending(path, "observations are", ".json", ".npz")
-
-
-def require_ending(path: Path | None, what: str, *endings: str) -> None:
-    """Raise InputError where a file's ending is none of those that can be written; `what` such as "the table is"."""
-    if path is not None and path.suffix not in endings:
-        known = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
-        raise InputError(f"{path}: {what} written as {known}: give {'one of these endings' if endings[1:] else 'that'}")
+    require_output(path, inputs, "observations are", ".json", ".npz")
 
 
 def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
     """`require_output` of output and report, that they are two files, and that the report is called like a page."""
     require_output(args.output, inputs)
-    require_output(args.report, inputs)
     if (
         args.output is not None
         and args.report is not None
         and os.path.realpath(args.output) == os.path.realpath(args.report)
     ):
         raise InputError(f"{args.report}: is named as output and as report: give them two names")
-    require_ending(args.report, "a report is", ".html", ".htm")
+    require_output(args.report, inputs, "a report is", ".html", ".htm")
 
 
 @contextmanager

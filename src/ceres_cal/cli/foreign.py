@@ -12,7 +12,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import replace
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
 from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch
-from ceres_cal.cli.files import read_calibration, require_ending, require_output, save
+from ceres_cal.cli.files import read_calibration, require_output, save
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -229,8 +229,7 @@ def _listen(
 ) -> Document:
     from ceres_cal.formats import geometry_content, received_geometry
 
-    require_output(output, [])
-    require_ending(output, "a field is", ".json", ".pb", ".yml", ".yaml")
+    require_output(output, [], "a field is", ".json", ".pb", ".yml", ".yaml")
     heard = received_geometry(_group(args), seconds)
     if output.suffix == ".json":
         return _write_target(heard.field, output, heard.sender)

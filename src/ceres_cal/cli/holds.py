@@ -18,7 +18,6 @@ from ceres_cal.cli.files import (
     read_calibration,
     read_observations,
     require_different,
-    require_ending,
     require_output,
     save,
 )
@@ -272,8 +271,7 @@ def _compare(
     over_image: bool = switch("intrinsics, over the image in px; default where there is no field"),
     without_turn: bool = switch("the same without the turn that brings them nearest to each other"),
 ) -> Document:
-    require_output(picture, [a, b])
-    require_ending(picture, "pictures are", ".svg")
+    require_output(picture, [a, b], "pictures are", ".svg")
     first, second = read_calibration(a), read_calibration(b)
     if not (over_image or without_turn or all(target.movable for target in first.targets.values())):
         return _over_field(first, second, arguments.metres(height_mm), station, picture)

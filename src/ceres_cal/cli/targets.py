@@ -10,7 +10,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import output_option, parse_board
 from ceres_cal.cli.command import argument, command, option
-from ceres_cal.cli.files import require_ending, require_output, save, spelled_target
+from ceres_cal.cli.files import require_output, save, spelled_target
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -42,29 +42,27 @@ def _run(
 ) -> Document:
     from ceres_cal.scene.targets import TARGET_KINDS
 
-    if picture is not None:
-        require_output(picture, [])
-        require_ending(picture, "pictures are", ".svg")
-        if target is None:
-            raise InputError("--picture draws one target: name it, such as vss-3")
+    require_output(picture, [], "pictures are", ".svg")
     if target is None:
+        if picture is not None:
+            raise InputError("--picture draws one target: name it, such as vss-3")
         kinds = {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}
         return Document((Section("", _kinds_text().splitlines(), {"kinds": kinds}),))
     targets = _targets(target)
     if picture is not None:
-        _draw(targets, target, picture)
+        from ceres_cal.report.target_pictures import target_svg
+
+        name, drawn = _only(targets, target, "--picture draws one of them")
+        save(picture, target_svg(drawn, name).encode())
     data = {"targets": {name: _target_data(target) for name, target in targets.items()}}
     text = "\n\n".join(_target_text(name, target) for name, target in targets.items())
     return Document((Section("", text.splitlines(), data),))
 
 
-def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
-    from ceres_cal.report.target_pictures import target_svg
-
+def _only(targets: dict[str, Target], wanted: str, what_to_do: str) -> tuple[str, Target]:
     if len(targets) > 1:
-        raise InputError(f"{wanted}: it has several targets: {', '.join(targets)}: --picture draws one of them")
-    ((name, target),) = targets.items()
-    save(picture, target_svg(target, name).encode())
+        raise InputError(f"{wanted}: it has several targets: {', '.join(targets)}: {what_to_do}")
+    return next(iter(targets.items()))
 
 
 @command(
@@ -77,16 +75,12 @@ def _print(
     target: str = argument("BOARD", 'such as 9x6x25mm, as `ceres-cal targets` has it, or {"kind": ...} as in files'),
     output: Path = output_option("the sheet (.pdf)"),
 ) -> Document:
-    require_output(output, [])
-    require_ending(output, "sheets are", ".pdf")
+    require_output(output, [], "sheets are", ".pdf")
     import json
 
     from ceres_cal.report.target_pictures import sheet_pdf
 
-    targets = _targets(target)
-    if len(targets) > 1:
-        raise InputError(f"{target}: it has several targets: {', '.join(targets)}: give the description of one")
-    (board,) = targets.values()
+    _, board = _only(_targets(target), target, "give the description of one")
     save(output, sheet_pdf(board, json.dumps(board.spec)))
     return Document((Section("written", [str(output)], {"output": str(output), "spec": board.spec}),))
 
