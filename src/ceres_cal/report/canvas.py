@@ -180,3 +180,8 @@ def key(axes: Axes, columns: int = 4) -> None:
 def plain(value: float, _: float) -> str:
     """A tick of a logarithmic axis: 0.01, 1, 100, 1e+07."""
     return f"{value:g}"
+
+
+def clipped(text: str, most: int) -> str:
+    """A label of so many letters at most."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"

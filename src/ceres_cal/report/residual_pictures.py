@@ -307,7 +307,7 @@ def outliers(material: Material) -> Figure | None:
             axes.annotate(
                 text, (number, place), (3, 0), textcoords="offset points", va="center", fontsize=6.5, color=INK
             )
-        names = [_short_name(name, several) for name, _ in named]
+        names = [canvas.clipped(name if several else name.partition("/")[2], 30) for name, _ in named]
         axes.set_yticks(places, names, fontsize=6.5)
         axes.tick_params(axis="y", length=0)
         axes.invert_yaxis()
@@ -315,7 +315,20 @@ def outliers(material: Material) -> Figure | None:
         axes.grid(visible=False, axis="y")
         axes.spines["left"].set_color(QUIET)
 
-    order = rows[np.argsort(-_sigmas(material, rows), kind="stable")]
+    off = np.abs(table.distance_px[rows])
+    sigmas = off / (table.sigma_px[rows] * table.scale[rows])
+    sigmas = np.where(np.isfinite(sigmas), sigmas, np.inf)
+    farthest = np.argsort(-sigmas, kind="stable")
+    cells = (
+        (
+            table.id_of(row),
+            table.features[table.feature[row]],
+            str(table.views[table.view[row]]["frame"]),
+            fixed(px, 2),
+            short(sigma) if sigma < np.inf else "",
+        )
+        for row, px, sigma in zip(*(column[farthest].tolist() for column in (rows, off, sigmas)), strict=True)
+    )
     return Figure(
         "outliers",
         "Outliers, by feature",
@@ -323,34 +336,6 @@ def outliers(material: Material) -> Figure | None:
         f"({material.calibration.options.reject_sigma:g} sigma and more). A few are normal. Most of one feature "
         "means a wrong label, or paint that is off its nominal position.",
         draw,
-        Table(
-            ("farthest first", "feature", "frame", "px off", "sigma"),
-            tuple(_outlier_row(material, int(row)) for row in order),
-        ),
+        Table(("farthest first", "feature", "frame", "px off", "sigma"), tuple(cells)),
         0.2 + 0.055 * max(len(named), 6),
     )
-
-
-def _sigmas(material: Material, rows: Indices) -> Array:
-    table = material.diagnosis.table
-    sigmas = np.abs(table.distance_px[rows]) / (table.sigma_px[rows] * table.scale[rows])
-    return np.where(np.isfinite(sigmas), sigmas, np.inf)
-
-
-def _outlier_row(material: Material, row: int) -> tuple[str, ...]:
-    table = material.diagnosis.table
-    frame = str(table.views[table.view[row]]["frame"])
-    sigma = float(_sigmas(material, np.array([row]))[0])
-    off = float(abs(table.distance_px[row]))
-    return (
-        table.id_of(row),
-        table.features[table.feature[row]],
-        frame,
-        fixed(off, 2),
-        short(sigma) if sigma < np.inf else "",
-    )
-
-
-def _short_name(name: str, several: bool) -> str:
-    text = name if several else name.partition("/")[2]
-    return text if len(text) <= 30 else f"{text[:29]}…"

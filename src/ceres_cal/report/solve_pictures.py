@@ -84,7 +84,7 @@ def label(key: Key, others: Sequence[Key]) -> str:
     same = {other.owner for other in others if (other.kind, other.quantity) == (key.kind, key.quantity)}
     name = key.quantity.replace("_", " ")
     whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure", "dimension") else name
-    return whole if len(whole) <= 22 else f"{whole[:21]}…"
+    return canvas.clipped(whole, 22)
 
 
 def _pairs(matrix: Array, labels: Sequence[str]) -> Table:

@@ -59,7 +59,7 @@ def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Se
 
 def _verdict(quality: Quality) -> Section:
     """The headline of the report, and what stands behind it and was not said yet."""
-    judged, findings = grounds.judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
+    judged, findings = grounds.judge_quality(quality), quality.findings
     cause = grounds.disputed(quality)
     named = [one for one in findings if grounds.is_against(one) and not cause][:_MOST_FINDINGS]
     lines = [judged.headline, *(f"{one.kind}: {one.sentence}" for one in named)]
