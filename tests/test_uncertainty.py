@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -28,7 +30,7 @@ from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.bent import valley
-from ceres_cal.posterior.maps import locate_slopes, spread_of_points, visible_pixels
+from ceres_cal.posterior.maps import locate_slopes, located_by, read, spread_of_points, visible_pixels
 from ceres_cal.posterior.mixture import quantiles, radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
@@ -566,3 +568,18 @@ def test_a_file_says_the_same(tilt_deg: float, tmp_path: Path) -> None:
     assert back.uncertainty.weak_directions == calibration.uncertainty.weak_directions
     one, other = (c.uncertainty.map_sd_mm(height_m=0.15) for c in (calibration, back))
     assert np.array_equal(one.sd_mm, other.sd_mm, equal_nan=True)
+
+
+def test_a_place_whose_slopes_nothing_tells_is_unknown() -> None:
+    """As where a lens folds at one component of a mixture: infinite, and no warning of NumPy."""
+    known = calibrated(3.0).uncertainty
+    pixels = np.array([[300.0, 300.0], [640.0, 480.0]])
+    places = located_by("overhead", pixels, 0.0)
+
+    def slopes(there: Estimate, keys: Sequence[Key]) -> Array:
+        return np.asarray(places.slopes(there, keys) * np.array([np.nan, 1.0])[:, None, None])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        said = read(known.posterior, known.estimate, replace(places, slopes=slopes), "overhead")
+    assert np.isinf(said.radius_95).tolist() == [True, False] and np.isfinite(said.sd).tolist() == [False, True]

@@ -360,8 +360,9 @@ def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: st
     mixture, width = posterior.mixture(camera), posterior.half_width
     values, covariances = _of_components(mixture, estimate, shown, width)
     _show_lenses(values, mixture, posterior.lenses, shown)
-    lost = np.asarray(np.isnan(values).any(axis=(0, 2)))
-    weights, means, known = mixture.refined(np.where(lost[:, None], 0.0, values), covariances)
+    lost = np.asarray(np.isnan(values).any(axis=(0, 2)) | np.isnan(covariances).any(axis=(0, 2, 3)))
+    values[:, lost], covariances[:, lost] = 0.0, 0.0
+    weights, means, known = mixture.refined(values, covariances)
     variances = np.diagonal(known, axis1=-2, axis2=-1)
     low, high = quantiles(weights, means, variances, width)
     radius = radii(weights, means, known) * width / NORMAL_95

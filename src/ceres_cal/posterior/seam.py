@@ -215,10 +215,13 @@ def _sightings(
     for target, feature, rows in _rows(observations, points, station):
         drawn = np.broadcast_to(target.point_array[feature], (len(rows), 3))
         yield (target.point_names[feature], 0), _sighting(camera, points, rows, drawn, scales[0])
-    for target, feature, rows in _rows(observations, curves, station):
-        name, tracks = target.curve_names[feature], target.tracks[curves.side[rows], feature]
-        curve, is_arc, height_m = target.curves[name], bool(target.is_arc[feature]), float(tracks[0, 0, 2])
-        located = camera.locate(curves.pixels[rows], height_m)
+    for target, feature, every in _rows(observations, curves, station):
+        name, is_arc = target.curve_names[feature], bool(target.is_arc[feature])
+        curve, height_m = target.curves[name], float(target.tracks[0, feature, 0, 2])
+        located = camera.locate(curves.pixels[every], height_m)
+        shown = np.isfinite(located[:, 0])  # others lie where the lens folds
+        rows, located = every[shown], located[shown]
+        tracks = target.tracks[curves.side[rows], feature]
         s = nearest_on_track(tracks, is_arc, np.column_stack([located, np.full(len(rows), height_m)]))
         feet, start = along_track(tracks, is_arc, s), curve.parameter_range[0]
         length = (turned_on(curve, s) - start) * np.linalg.norm(tracks[:, 1], axis=1)
