@@ -9,7 +9,7 @@ from scenes import LENSES, camera
 
 from ceres_cal import Calibration, Camera
 from ceres_cal.base.arrays import Array
-from ceres_cal.formats.format import ImportedCameras
+from ceres_cal.formats.format import calibration_of
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import overhead_pose
@@ -26,13 +26,13 @@ def with_lens(lens: str | Lens, aspect: float = 1.0, number: int = 0) -> Camera:
 
 def over_field(camera: Camera, name: str = "overhead") -> Calibration:
     """The calibration of one camera over a division B field."""
-    return ImportedCameras({name: camera}, {"field": ssl_field("B")}).calibration("a test")
+    return calibration_of("a test", {name: camera}, {"field": ssl_field("B")})
 
 
 def two_cameras(lens: str | Lens) -> Calibration:
     """Of two, named so that they keep their ids."""
     cameras = {f"camera{number}": with_lens(lens, number=number) for number in (0, 1)}
-    return ImportedCameras(cameras, {"field": ssl_field("B")}).calibration("a test")
+    return calibration_of("a test", cameras, {"field": ssl_field("B")})
 
 
 def places(camera: Camera, count: int = 1000, margin_px: float = 0.0) -> tuple[Array, Array]:

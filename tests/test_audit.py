@@ -14,7 +14,7 @@ from ceres_cal import Calibration, Camera, InputError, Observations, Options, au
 from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.formats import export
-from ceres_cal.formats.format import ImportedCameras
+from ceres_cal.formats.format import calibration_of
 from ceres_cal.simulate import simulate
 
 CALIBRATED: dict[tuple[str, str], Calibration] = {}
@@ -57,14 +57,14 @@ def test_a_sound_one_is_trusted_to_so_many_millimetres() -> None:
 
 
 def test_without_a_pose_the_best_one_is_taken() -> None:
-    bare = ImportedCameras({"other name": sound().station().at(Pose.identity())}).calibration("a test")
+    bare = calibration_of("a test", {"other name": sound().station().at(Pose.identity())})
     one = audit(bare, seen(4))["overhead"]
     assert one.holds and one.pose_free and "it says none" in one.words
     swapped = planted.FAULTS["half a pixel"](sound().station().at(Pose.identity()))
     # half a pixel is a turn by 0.03 degrees, which the pose takes up
-    assert audit(ImportedCameras({"x": swapped}).calibration("a test"), seen(4))["overhead"].holds
+    assert audit(calibration_of("a test", {"x": swapped}), seen(4))["overhead"].holds
     long = replace(sound().station(), phi=1.05 * sound().station().phi).at(Pose.identity())
-    assert not audit(ImportedCameras({"x": long}).calibration("a test"), seen(4))["overhead"].holds
+    assert not audit(calibration_of("a test", {"x": long}), seen(4))["overhead"].holds
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,7 +73,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["audit", str(tmp_path / "ours.json"), "--observations", str(tmp_path / "obs.npz")]) == 0
     assert capsys.readouterr().out.startswith("audit     yes\nstation   overhead explains the observations")
     half = planted.FAULTS["half a pixel"](sound().station())
-    export(ImportedCameras({"overhead": half}, sound().targets).calibration("x"), "opencv", tmp_path / "b.yml")
+    export(calibration_of("x", {"overhead": half}, sound().targets), "opencv", tmp_path / "b.yml")
     ask = ["audit", str(tmp_path / "b.yml"), "--observations", str(tmp_path / "obs.npz"), "--json"]
     assert main(ask) == 1
     said = json.loads(capsys.readouterr().out)["stations"]["overhead"]
@@ -82,7 +82,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_other_stations_are_refused() -> None:
-    two = ImportedCameras({"a": sound().station(), "b": sound().station()}).calibration("a test")
+    two = calibration_of("a test", {"a": sound().station(), "b": sound().station()})
     with pytest.raises(InputError, match="has stations 'a', 'b', the observations 'overhead': name them alike"):
         audit(two, seen(4))
 
@@ -105,5 +105,5 @@ def test_opencvs_own_calibration_of_real_photographs(real_data: Path) -> None:
         nothing = np.empty(0)
         made = cv2.calibrateCamera(places, [corners[n] for n in names[::2]], (640, 480), nothing, nothing, flags=flags)
         given = Camera.from_opencv((640, 480), made[1], made[2])
-        answer = audit(ImportedCameras({"camera": given}).calibration("OpenCV"), seen)["camera"]
+        answer = audit(calibration_of("OpenCV", {"camera": given}), seen)["camera"]
         assert answer.cause == cause and answer.pose_free and answer.change is not None and not answer.change.maps

@@ -18,7 +18,7 @@ from runner import Row, over, script, share_error
 from ceres_cal import CalibrationError, Camera, Options, audit, calibrate
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats import export, import_calibration
-from ceres_cal.formats.format import ImportedCameras
+from ceres_cal.formats.format import calibration_of
 from ceres_cal.moves.audits import resized
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import ssl_field
@@ -73,7 +73,7 @@ def one_run(seed: int, fault: str | None, folder: Path) -> str | None:
     except CalibrationError:  # so few coefficients fold, say: no fault to plant
         return one_run(seed + 100_000, fault, folder)
     faulty = FAULTS[fault](first.station()) if fault else first.station()
-    written = ImportedCameras({"overhead": faulty}, first.targets).calibration("this script")
+    written = calibration_of("this script", {"overhead": faulty}, first.targets)
     path = folder / f"camera-{seed}.yml"
     export(written, "opencv", path)
     given = import_calibration(path)

@@ -17,7 +17,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes
 from ceres_cal.base.threads import kept_signals
 from ceres_cal.base.transforms import Pose
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera
 
@@ -116,7 +116,7 @@ def _read(request: ImportRequest) -> Any:
     if not cameras:
         raise InputError("none of its images has a pose")
     warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")
-    return ImportedCameras(cameras, warnings=warnings).calibration("COLMAP")
+    return calibration_of("COLMAP", cameras, warnings=warnings)
 
 
 def _name(image: Any) -> str:

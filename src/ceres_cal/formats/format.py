@@ -166,59 +166,50 @@ class ImportFormat(Struct, frozen=True):
         return _options(self.read)
 
 
-class ImportedCameras(Frozen):
-    """What a file of cameras says.
+def calibration_of(
+    source: str,
+    cameras: Mapping[str, Camera | ForeignCamera],
+    targets: Mapping[str, Target] | None = None,
+    warnings: Sequence[str] = (),
+) -> Calibration:
+    """The cameras of a file, by name, as a calibration of which nobody says how well it is known.
 
-    Attributes:
-        cameras: by name, ours or others'. targets: that it describes. warnings: what to know of it, a line each.
+    A camera without a pose is the world, as one that saw only boards.
+
+    Args:
+        source: what was read, in words. cameras: ours or others'. targets: that the file describes. warnings: what to
+            know of it, a line each.
     """
+    from ceres_cal.calibration import Calibration, Fit
+    from ceres_cal.problem.parameters import Estimate, Options, Station
+    from ceres_cal.problem.structure import EXACT
+    from ceres_cal.scene.camera import Camera
 
-    cameras: Mapping[str, Camera | ForeignCamera]
-    targets: Mapping[str, Target] = field(default_factory=dict)
-    warnings: Sequence[str] = ()
-
-    def calibration(self, source: str) -> Calibration:
-        """The cameras as a calibration of which nobody says how well it is known.
-
-        A camera without a pose is the world, as one that saw only boards.
-        """
-        from ceres_cal.calibration import Calibration, Fit
-        from ceres_cal.problem.parameters import Estimate, Options, Station
-        from ceres_cal.problem.structure import EXACT
-
-        cameras, warnings = self._ours()
-        stations = {name: Station(name, camera.cam_from_world) for name, camera in cameras.items()}
-        bare = {name: camera.at(type(camera.cam_from_world).identity()) for name, camera in cameras.items()}
-        lens = next(iter(cameras.values())).lens
-        options = Options(lens=lens.kind, powers=lens.powers, terms=lens.terms, usual_camera=False)
-        return Calibration(
-            Estimate(bare, stations, {}, EXACT),
-            dict(self.targets),
-            Fit(0, 0, 0.0, 0.0, 1.0, 1.0, 0),
-            (),
-            f"read from {source}",
-            True,
-            0,
-            (),
-            dict.fromkeys(cameras, "file"),
-            tuple(warnings),
-            options,
-            "",
-        )
-
-    def _ours(self) -> tuple[dict[str, Camera], list[str]]:
-        """Each camera as ours, and what to know of them."""
-        from ceres_cal.scene.camera import Camera
-
-        warnings, cameras = [*self.warnings], {}
-        for name, given in self.cameras.items():
-            if isinstance(given, Camera):
-                cameras[name] = given
-                continue
-            cameras[name], (rms, worst) = given.camera()
-            if worst > 0.0:
-                what = f"its {given.model} model is held as the nearest {cameras[name].lens.kind} lens"
-                warnings.append(f"camera {name!r}: {what}, off by {rms:.2g} px rms and {worst:.2g} px at most")
-            if given.cam_from_world is None:
-                warnings.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
-        return cameras, warnings
+    ours, told = dict[str, Camera](), [*warnings]
+    for name, given in cameras.items():
+        if isinstance(given, Camera):
+            ours[name] = given
+            continue
+        ours[name], (rms, worst) = given.camera()
+        if worst > 0.0:
+            what = f"its {given.model} model is held as the nearest {ours[name].lens.kind} lens"
+            told.append(f"camera {name!r}: {what}, off by {rms:.2g} px rms and {worst:.2g} px at most")
+        if given.cam_from_world is None:
+            told.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
+    stations = {name: Station(name, camera.cam_from_world) for name, camera in ours.items()}
+    bare = {name: camera.at(type(camera.cam_from_world).identity()) for name, camera in ours.items()}
+    lens = next(iter(ours.values())).lens
+    return Calibration(
+        Estimate(bare, stations, {}, EXACT),
+        dict(targets or {}),
+        Fit(0, 0, 0.0, 0.0, 1.0, 1.0, 0),
+        (),
+        f"read from {source}",
+        True,
+        0,
+        (),
+        dict.fromkeys(ours, "file"),
+        tuple(told),
+        Options(lens=lens.kind, powers=lens.powers, terms=lens.terms, usual_camera=False),
+        "",
+    )

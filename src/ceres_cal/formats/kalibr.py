@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, require_rotation
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
@@ -61,7 +61,7 @@ def _read(request: ImportRequest) -> Any:
             raise InputError(f"{key} has no T_cn_cnm1: where it stands is not said")
         name = str(entry.get("rostopic") or key).strip("/").split("/")[0]
         cameras[key if name in cameras else name] = _camera(entry, key, pose)
-    return ImportedCameras(cameras).calibration("a Kalibr camchain")
+    return calibration_of("a Kalibr camchain", cameras)
 
 
 def _pose(entry: Mapping[str, Any], key: str) -> Pose:

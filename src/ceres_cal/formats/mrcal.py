@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
 from ceres_cal.base.transforms import Pose
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera
@@ -67,7 +67,7 @@ def _read(request: ImportRequest) -> Any:
     fx, fy, cx, cy = values[:4]
     matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     camera = ForeignCamera.opencv([int(s) for s in size], matrix, values[4:], _pose(data))
-    return ImportedCameras({request.path.stem: camera}).calibration("an mrcal .cameramodel")
+    return calibration_of("an mrcal .cameramodel", {request.path.stem: camera})
 
 
 def _pose(data: Mapping[str, Any]) -> Pose:

@@ -21,9 +21,9 @@ from ceres_cal.formats.format import (
     ExportLoss,
     ExportRequest,
     ImageSize,
-    ImportedCameras,
     ImportFormat,
     ImportRequest,
+    calibration_of,
 )
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.scene.camera import LARGEST
@@ -146,9 +146,9 @@ def _read(
             first = cameras[stations[0]].pose
             between = Pose(_mat(storage, ("R",), (3, 3)), _mat(storage, ("T",), (3, 1)).ravel())
             cameras[stations[1]] = replace(cameras[stations[1]], cam_from_world=between @ first)
-        return ImportedCameras(cameras).calibration("OpenCV")
+        return calibration_of("OpenCV", cameras)
     name = stations[0] if stations else camera
-    return ImportedCameras({name: _camera(storage, image_size, "")}).calibration("OpenCV")
+    return calibration_of("OpenCV", {name: _camera(storage, image_size, "")})
 
 
 def _camera(storage: Any, image_size: str, number: str) -> ForeignCamera:

@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, euler_from_rotation
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.camera import Camera
@@ -67,7 +67,7 @@ def _read(request: ImportRequest) -> Any:
     pose = Pose.looking(numbers("t", 3), turn)
     camera = Camera((int(width), int(height)), phi, (k[2], k[5]), lens, k[4] / k[0], pose)
     camera.require_monotone(request.path.stem)
-    return ImportedCameras({request.path.stem: camera}).calibration("the paper's numbers")
+    return calibration_of("the paper's numbers", {request.path.stem: camera})
 
 
 FORMATS = (

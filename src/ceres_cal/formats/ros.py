@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, quaternion, rotation_of
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
@@ -70,7 +70,7 @@ def _read(request: ImportRequest) -> Any:
     size, fisheye = (sizes[0] or 0, sizes[1] or 0), model == _MODELS[FISHEYE]
     camera = ForeignCamera.opencv(size, matrix, coefficients, _pose(data), fisheye=fisheye)
     name = str(data.get("camera_name") or "camera")
-    return ImportedCameras({name: camera}).calibration("a ROS camera_info")
+    return calibration_of("a ROS camera_info", {name: camera})
 
 
 def _values(data: Mapping[str, Any], name: str, count: int | None) -> Array:

@@ -15,9 +15,9 @@ from ceres_cal.formats.format import (
     ExportFormat,
     ExportRequest,
     ImageSize,
-    ImportedCameras,
     ImportFormat,
     ImportRequest,
+    calibration_of,
 )
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import CameraIds, as_before, to_cameras, to_entries
@@ -110,7 +110,7 @@ def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
     warnings.append(
         "a message does not say whether ssl-vision's OpenCV mode wrote it: then its distortion is OpenCV's k1"
     )
-    return ImportedCameras(cameras, {"field": target_of(data["field"])}, warnings).calibration("an SSL geometry")
+    return calibration_of("an SSL geometry", cameras, {"field": target_of(data["field"])}, warnings)
 
 
 def _recognises_packet(content: bytes) -> bool:

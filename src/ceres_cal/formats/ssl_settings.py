@@ -19,9 +19,9 @@ from ceres_cal.formats.format import (
     ExportFormat,
     ExportRequest,
     ImageSize,
-    ImportedCameras,
     ImportFormat,
     ImportRequest,
+    calibration_of,
 )
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import NAMES, CameraIds, to_cameras, to_entries
@@ -190,7 +190,7 @@ def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
                 f"camera 'camera{number}': ssl-vision's OpenCV mode is on, which ignores all distortion when it "
                 "locates: what was read are the numbers of its own model"
             )
-    return ImportedCameras(cameras, {"field": settings_target(values)}, warnings).calibration("ssl-vision's settings")
+    return calibration_of("ssl-vision's settings", cameras, {"field": settings_target(values)}, warnings)
 
 
 def _entry(number: int, there: Mapping[str, _Var]) -> dict[str, Any]:
