@@ -168,6 +168,13 @@ class FieldMap(ErrorMap):
     radius_95_mm: Array
     __repr__, plot = brief, _plot
 
+    @classmethod
+    def of_visible(cls, grid: FieldGrid, station: str, visible: Mask, sd_m: Array, radius_95_m: Array) -> FieldMap:
+        """Of a grid's places (Y * X,), of which those that are visible are known so well."""
+        values = np.full((2, len(visible)), np.nan)
+        values[:, visible] = 1e3 * sd_m, 1e3 * radius_95_m
+        return cls(grid.height_m, grid.x_m, grid.y_m, station, *values.reshape(2, *grid.shape))
+
     @property
     def errors_mm(self) -> Array:
         return self.sd_mm
@@ -198,11 +205,8 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     """
     pixels = visible_pixels(estimate, station, grid.places, grid.height_m)
     visible = np.isfinite(pixels[:, 0])
-    sd_mm, radius_mm = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
     spread = spread_of_points(estimate, posterior, station, pixels[visible], grid.height_m)
-    sd_mm[visible], radius_mm[visible] = 1e3 * spread.sd_m, 1e3 * spread.radius_95_m
-    values = (part.reshape(grid.shape) for part in (sd_mm, radius_mm))
-    return FieldMap(grid.height_m, grid.x_m, grid.y_m, station, *values)
+    return FieldMap.of_visible(grid, station, visible, spread.sd_m, spread.radius_95_m)
 
 
 _STEPS = 32  # along the longer side

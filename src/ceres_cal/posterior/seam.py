@@ -94,15 +94,13 @@ def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], gr
     Raises:
         InputError: see `maps.station_keys`.
     """
+    both = " - ".join(pair)
     if {estimate.stations[s].camera for s in pair if s in estimate.stations} & set(posterior.followed):
         a, b = (field_map(estimate, posterior, station, grid) for station in pair)
         sd_mm, radius_mm = np.hypot(a.sd_mm, b.sd_mm), np.hypot(a.radius_95_mm, b.radius_95_mm)
-    else:
-        known, visible = predicted(estimate, posterior, pair, grid.places, grid.height_m)
-        sd_mm, radius_mm = np.full((2, len(visible)), np.nan)
-        sd_mm[visible], radius_mm[visible] = 1e3 * known.sd, 1e3 * known.radius_95
-    sd_mm, radius_mm = sd_mm.reshape(grid.shape), radius_mm.reshape(grid.shape)
-    return FieldMap(grid.height_m, grid.x_m, grid.y_m, " - ".join(pair), sd_mm, radius_mm)
+        return replace(a, station=both, sd_mm=sd_mm, radius_95_mm=radius_mm)
+    known, visible = predicted(estimate, posterior, pair, grid.places, grid.height_m)
+    return FieldMap.of_visible(grid, both, visible, known.sd, known.radius_95)
 
 
 def predicted(
