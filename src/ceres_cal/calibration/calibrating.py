@@ -172,9 +172,9 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
     if too_few or (seen.as_built and not chosen.built.every):
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
         # all views leave in the same places need not show in the few of them that lenses were compared by.
-        near = replace(seen.end.solution.estimate, structure=EXACT)
+        near = replace(seen.end.estimate, structure=EXACT)
         before, anew = chosen, replace(start, estimate=near)
-        built = Built(seen.as_built, seen.end.solution.estimate.structure)
+        built = Built(seen.as_built, seen.end.estimate.structure)
         chosen = choose_lens(observations, options, anew, built, by_most=too_few)
         if chosen.choice.chosen != before.choice.chosen:
             seen, chosen = chosen.first_solved(seen_with, papers(options), start)

@@ -118,7 +118,7 @@ def compared_kinds(
             built = estimate_as_built(end.problem, few, end)
             if built.every:
                 sights = built.held(sights, few)
-                end, used = _solved(few, options, sights, replace(end.solution.estimate, structure=EXACT), [used])
+                end, used = _solved(few, options, sights, replace(end.estimate, structure=EXACT), [used])
         seen = InlierRows(few, end, options, sights, built)
         compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)

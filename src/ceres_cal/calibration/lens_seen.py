@@ -221,12 +221,12 @@ class InlierRows(Frozen):
 
     @cached_property
     def _profiles(self) -> dict[str, LensProfile]:
-        return profiles_of(self.end.solution.estimate, self.sights)
+        return profiles_of(self.end.estimate, self.sights)
 
     def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
         """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
         options = forms[0].of(self.options, max_iterations=_MOST_STEPS)
-        start = self.end.solution.estimate
+        start = self.end.estimate
 
         def near_best() -> Kind:
             problem, estimate = self._problem(options, start), start
@@ -246,7 +246,7 @@ class InlierRows(Frozen):
         def near_best() -> Kind:
             problem = problem_of(self.observations, self.every, options, start)
             end = solve_robustly(problem, self.observations, start, most_rounds=MOST_ROUNDS)
-            estimate = end.solution.estimate
+            estimate = end.estimate
             problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
             return self._near_best(forms, problem, estimate)
 

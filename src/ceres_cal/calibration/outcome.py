@@ -79,7 +79,7 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
 
 def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
     """Warnings of cameras whose phi the observations leave open."""
-    known = Uncertainty(end.solution.estimate, posterior, {})
+    known = Uncertainty(end.estimate, posterior, {})
     for name in posterior.followed:
         verdict = known.verdict("camera", name, "phi")
         if verdict.verdict == "unknown":
@@ -88,7 +88,7 @@ def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
 
 def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
     """Words about cameras whose phi rests on what is usual."""
-    estimate, reduced = end.solution.estimate, end.reduced
+    estimate, reduced = end.estimate, end.reduced
     usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
     if reduced is None or not usual:
         return
@@ -109,7 +109,7 @@ def unusual_pixels(end: RobustSolution, problem: Problem, observations: Observat
     """
     unusual = 0.01  # of fy / fx: of the public cameras tried it is up to 0.006 off
     turned = {view.camera for view in observations.views if view.placement is not None}
-    for name, camera in end.solution.estimate.cameras.items():
+    for name, camera in end.estimate.cameras.items():
         free = problem.layout.free.get(name, ())
         if OF_PIXELS.index("aspect") in free and name not in turned and abs(camera.aspect - 1.0) > unusual:
             yield _OBLONG.format(name, camera.aspect, two_digits(100.0 * abs(camera.aspect - 1.0)))
@@ -142,7 +142,7 @@ def came_out(
     out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
     far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
     return Calibration(
-        end.solution.estimate,
+        end.estimate,
         observations.targets,
         _fit(end, problem.layout),
         _rejected(observations, out, far, explanations),

@@ -140,7 +140,7 @@ class Explained(Frozen):
         if conflicts.answer is None:
             return self
         problem = replace(self.problem, priors=conflicts.answer.problem.priors)
-        shown = residuals(self.task.observations, problem.sights, conflicts.answer.solution.estimate)
+        shown = residuals(self.task.observations, problem.sights, conflicts.answer.estimate)
         return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
 
 
@@ -188,11 +188,11 @@ def known_of(seen: Explained) -> Calibration:
     posterior = None
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)
-        alike = seen_alike(seen.others, seen.end.solution.estimate, posterior.half_width)
+        alike = seen_alike(seen.others, seen.end.estimate, posterior.half_width)
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
         strange = (
             *unusual_pixels(seen.end, seen.problem, observations),
-            *seen_from_behind(seen.end.solution.estimate, observations),
+            *seen_from_behind(seen.end.estimate, observations),
         )
         warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
     calibration = seen.came_out
@@ -220,7 +220,7 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
         unsteady = find_unsteady(seen.problem, observations, seen.end, unsteady)
         if unsteady is None:  # or what seemed to move was what the lens or the target left
             return None
-        start = replace(seen.end.solution.estimate, structure=first.start.estimate.structure)
+        start = replace(seen.end.estimate, structure=first.start.estimate.structure)
         named = first.problem.options
         options = replace(problem.options, powers=named.powers, terms=named.terms)
         again = problem_of(observations, problem.sights, options, start)
@@ -239,7 +239,7 @@ def _solved(task: Task, start: Start, problem: Problem, built: Built) -> Explain
     seen = Explained(task, problem, start, end)
     if task.before is None:
         seen = _as_long_as_asked(seen)
-        require_measured(seen.end.problem, seen.end.solution.estimate)
+        require_measured(seen.end.problem, seen.end.estimate)
     return seen
 
 
@@ -255,7 +255,7 @@ def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
     if task.before is None:
         seen = _of_targets(seen, solved, built)
     require_fits(seen.end, seen.problem)
-    require_possible(observations, seen.problem.sights, seen.end.solution.estimate, seen.end.residuals)
+    require_possible(observations, seen.problem.sights, seen.end.estimate, seen.end.residuals)
     return seen
 
 
@@ -271,8 +271,8 @@ def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
         problem, end = beside.problem, beside.end
     others: tuple[Solution, ...] = ()
     if end.problem.sights.equations == problem.sights.equations:
-        least, others = least_of_few(end.problem, end.solution.estimate, seen.start.others)
-        if least is not end.solution.estimate:
+        least, others = least_of_few(end.problem, end.estimate, seen.start.others)
+        if least is not end.estimate:
             end = replace(end.moved_to(least, observations, problem), reduced=None)
     return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside, others)
 
@@ -282,7 +282,7 @@ def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]
     end, posterior = _assess(seen)
     is_new = seen.task.before is None
     if is_new:
-        require_lens_told(end.solution.estimate, posterior)
+        require_lens_told(end.estimate, posterior)
     known = seen if end is seen.end else replace(seen, end=end)
     if is_new and known.leaves_alike:
         posterior = posterior.widened(*shifts_by_roughness(end, seen.task.observations))
@@ -296,7 +296,7 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
     """
     end, before, observations = seen.end, seen.task.before, seen.task.observations
     known = end.problem if before is None else replace(end.problem, layout=before)
-    estimate = end.solution.estimate
+    estimate = end.estimate
     reduced = end.reduced if before is None else None
     reduced = reduced or information(known, estimate)
 
@@ -331,7 +331,7 @@ def _as_long_as_asked(seen: Explained) -> Explained:
     longer = replace(options, terms=tuple(options.blank_lens.more_terms))
     may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
     if may_grow and LeftOver.of_end(end).in_cells > AGREES:
-        near = _seen_longer(end.solution.estimate, longer)
+        near = _seen_longer(end.estimate, longer)
         try_of = problem_of(observations, problem.sights, longer, near)
         # quiet: the lens without these terms stays; what it leaves is diagnosed
         found = attempt(lambda: solve_robustly(try_of, observations, near, progress=progress))
@@ -359,5 +359,5 @@ def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
 def _shows_all(end: RobustSolution) -> bool:
     """Whether no lens folds inside what was observed."""
     sights = end.problem.sights
-    cameras = end.solution.estimate.cameras.items()
+    cameras = end.estimate.cameras.items()
     return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)

@@ -195,7 +195,7 @@ def with_doubts(
     Args:
         explanations: of which the less probable one counts as far as it is probable. others: minima beside the end.
     """
-    estimate = end.solution.estimate
+    estimate = end.estimate
     disputed = 1.0 / (len(conflicts.shifts) + 1.0)  # as likely to be right as any of what contradicts it
     posterior = posterior.with_alternatives(conflicts.keys, conflicts.shifts, [disputed] * len(conflicts.shifts))
     for doubt in conflicts.doubts:  # of which nothing is known for certain any more

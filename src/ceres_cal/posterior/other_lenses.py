@@ -38,7 +38,7 @@ from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes
-from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.problem.reduced import ReducedInformation
 from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
@@ -177,7 +177,7 @@ class LeftOver(Frozen):
     def of_end(cls, end: RobustSolution, sights: Sights | None = None) -> LeftOver:
         """At the end of all rounds, of some sights or of all that took part."""
         sights = end.problem.sights if sights is None else sights
-        return cls.of(sights, end.residuals, end.problem.weighting.scales, end.solution.estimate)
+        return cls.of(sights, end.residuals, end.problem.weighting.scales, end.estimate)
 
     @property
     def in_cells(self) -> float:
@@ -259,16 +259,16 @@ def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tupl
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
     lenses do to them.
     """
-    reduced = end.reduced or information(end.problem, end.solution.estimate)
+    reduced = end.told
     model = _linearised(end, observations, reduced)
-    shifts = [_shifts_of(model, name, camera) for name, camera in end.solution.estimate.cameras.items()]
+    shifts = [_shifts_of(model, name, camera) for name, camera in end.estimate.cameras.items()]
     return reduced.shared.keys, [shift for own in shifts for shift in own]
 
 
 def _linearised(end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> Linearised:
     """Some sights' equations, beside their share of what was known before."""
     most_equations = 12_000  # that tell how rough a lens is: of more, those of some views
-    problem, estimate = end.problem, end.solution.estimate
+    problem, estimate = end.problem, end.estimate
     every = max(1, -(-problem.sights.equations // most_equations))
     sights = problem.sights[::every]
     equations = equations_of(observations, sights, estimate, end.residuals)

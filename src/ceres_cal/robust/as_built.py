@@ -80,16 +80,16 @@ def solve_as_built(
         problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
             drawn as `built`. solver: of some of the observations, see `compete`.
     """
-    options, stated = problem.options, end.solution.estimate.structure
+    options, stated = problem.options, end.estimate.structure
 
     def solved(there: Built) -> RobustSolution:
         held = taking_part(_held(problem, there, observations), observations, explanations)
-        return solve_robustly(held, observations, replace(end.solution.estimate, structure=stated), is_near=True)
+        return solve_robustly(held, observations, replace(end.estimate, structure=stated), is_near=True)
 
     def freed(there: Built) -> Structure:
         tolerances = {**options.tolerances, **tolerances_of(there.every)}
         structure = make_structure(observations.targets, tolerances, options.dimensions)
-        return structure.carrying(there.whole, end.solution.estimate.structure)
+        return structure.carrying(there.whole, end.estimate.structure)
 
     now = estimate_as_built(problem, observations, _freed(end, problem, freed(built)) if built.every else end)
     if not now.every:
@@ -109,14 +109,14 @@ def solve_as_built(
         end, explanations = compete(_held(problem, before, observations), observations, end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
-    estimate = replace(end.solution.estimate, structure=structure)
+    estimate = replace(end.estimate, structure=structure)
     part = taking_part(problem, observations, explanations)
     if {view.target for view in observations.views if view.placement is None} & {one.target for one in every}:
         end = solve_robustly(part, observations, estimate, is_near=True)
     else:
         settled = replace(end.solution, estimate=estimate)
         end = replace(judge_at(part, observations, estimate), solution=settled, rounds=end.rounds)
-    end, structure = end.moved_to(end.solution.estimate, observations, problem), end.solution.estimate.structure
+    end, structure = end.moved_to(end.estimate, observations, problem), end.estimate.structure
     return end, problem, explanations, tuple(_measured(every, structure, observations))
 
 
@@ -143,7 +143,7 @@ def _held(problem: Problem, built: Built, observations: Observations) -> Problem
 def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> RobustSolution:
     """The end of a problem that was held, as one of targets that are built like that."""
     sights = problem.used(end.inliers.points, end.inliers.curves).sights
-    estimate = replace(end.solution.estimate, structure=structure)
+    estimate = replace(end.estimate, structure=structure)
     solution = replace(end.solution, estimate=estimate)
     return replace(end, problem=replace(end.problem, sights=sights), solution=solution)
 
@@ -254,7 +254,7 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
     most_screened, most_sights = 12, 200  # of a camera: that are asked first, and that tell the sigma
     structure, tolerances = whole_structure(observations.targets), problem.options.tolerances
     dimensions = problem.options.dimensions
-    stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.solution.estimate.structure)
+    stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.estimate.structure)
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
         return Built((), structure.carrying(stated))
@@ -300,7 +300,7 @@ def _equations(
     stated: Structure, observations: Observations, end: RobustSolution, sights: Sights
 ) -> tuple[Equations, Weights]:
     """Of some sights, with the residuals to the drawing, offsets that were found before taken off."""
-    estimate = end.solution.estimate
+    estimate = end.estimate
     equations = equations_of(observations, sights, estimate, end.residuals)
     stated_alone = stated.carrying(estimate.structure)
     before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
@@ -318,7 +318,7 @@ def _columns(structure: Structure, equations: Equations, weights: Weights) -> Sp
 
 def _drawn(equations: Equations, weights: Weights, stated: Structure, end: RobustSolution) -> Linearised:
     """The linear model of the targets as drawn, smooth displacements of the image free besides."""
-    estimate = replace(end.solution.estimate, structure=stated)
+    estimate = replace(end.estimate, structure=stated)
     problem = end.problem.of_sights(np.flatnonzero([key in equations.sights.keys for key in end.problem.sights.keys]))
     model = make_linear_model(problem, estimate, equations, weights)
     return model.with_columns(smooth_image(equations, estimate))

@@ -115,7 +115,7 @@ class Bulk:
 
     def standing_out(self, end: RobustSolution) -> Indices:
         """Views whose residuals are the largest at a solution of a part, and those with most outliers."""
-        looked = self.look(self._engine, end.solution.estimate, end.problem.weighting, _bounds(end))[1]
+        looked = self.look(self._engine, end.estimate, end.problem.weighting, _bounds(end))[1]
         spare = np.maximum(looked.equations, 1.0)
         above = (looked.squares / spare - 1.0) * np.sqrt(spare) * (looked.equations > 0)
         worst = [looked.view[np.argsort(-by, kind="stable")[:_STANDING_OUT]] for by in (above, looked.beyond)]
@@ -236,7 +236,7 @@ class _SumRounds(Rounds[_SumRound]):
         points, curves = np.split(shown_rows(self._few, self._core), [len(self._few.points)])
         self._placed, self._before = (points, curves), end
         self._along: tuple[tuple[str, Estimate], ...] = ()
-        self._unknowns = problem.unknowns(end.solution.estimate)
+        self._unknowns = problem.unknowns(end.estimate)
 
     def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _BulkResiduals:
         name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
@@ -288,7 +288,7 @@ class _SumRounds(Rounds[_SumRound]):
         elsewhere = state.problem.elsewhere
         assert isinstance(elsewhere, SharedObservations)
         here = replace(elsewhere, feet_along=self._along)  # else shares would seek those of before again
-        reduced = information(replace(state.problem, elsewhere=here), state.solution.estimate)
+        reduced = information(replace(state.problem, elsewhere=here), state.estimate)
         points, curves = state.seen.inside(state.noise)
         redundancy = by_leverage((2 * points, curves), reduced.leverages)
         return self._round(state.problem, state.solution, state.seen, redundancy, state.rounds, reduced)
@@ -297,7 +297,7 @@ class _SumRounds(Rounds[_SumRound]):
         """The end of the rounds, with what all observations say there."""
         most_rounds = 8
         before = self._before
-        seen = self._look(before.solution.estimate, _bounds(before), before.problem.weighting)
+        seen = self._look(before.estimate, _bounds(before), before.problem.weighting)
         redundancy = by_count(sum(seen.looked.equations), self._unknowns)
         state = self.to_rest(self._round(self._problem, before.solution, seen, redundancy, 0), most_rounds)
         state = state if state.reduced is not None else self.with_leverages(state)

@@ -106,7 +106,7 @@ def compete(
             end = trial.end
     if not taking_part.all():
         end = end if some is every else solver(every.without(~taking_part), every)
-        end = replace(end, residuals=residuals(observations, problem.sights, end.solution.estimate))
+        end = replace(end, residuals=residuals(observations, problem.sights, end.estimate))
     return end, tuple(explanations)
 
 
@@ -124,7 +124,7 @@ def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanatio
         return one
     # Where that fails the doubt stays as large as it was.
     other = part.end if one.is_taken else _solved(part.without(one.rows), part, solver)
-    return one if other is None else replace(one, other=other.solution.estimate)
+    return one if other is None else replace(one, other=other.estimate)
 
 
 @or_none  # quiet: whoever asks goes on without it
@@ -237,7 +237,7 @@ class _Competition:
         without = self._without(groups, numbers)
         if without is None:
             return None
-        there = residuals(self._some.observations, self._some.problem.sights, without.solution.estimate)
+        there = residuals(self._some.observations, self._some.problem.sights, without.estimate)
         chosen, offsets = self._offsets(replace(without, residuals=there), groups, numbers)
         if offsets is None:
             return None
@@ -251,7 +251,7 @@ class _Competition:
                 in_its_place = int(chosen[rival])
                 instead = f"the whole of {groups.name(in_its_place)} does not belong"
                 rivals = self._without(groups, tuple(in_its_place if one == number else one for one in numbers))
-                other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
+                other = other if rivals is None or odds < 0.0 else rivals.estimate
             aside_px = float(medians_known(lengths[own]))
             explanations.append(Explanation(groups.name(number), own, aside_px, odds, groups.remedy, instead, other))
         rows, least = groups.among(numbers) & self._taking_part, min(one.log_odds for one in explanations)
@@ -265,12 +265,12 @@ class _Competition:
         gone = groups.among(numbers)
         end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
         every = self._some.problem
-        there = residuals(self._some.observations, every.sights, end.solution.estimate)
+        there = residuals(self._some.observations, every.sights, end.estimate)
         require_fits(replace(end, residuals=there), every)
         if isinstance(groups, FeatureGroups):
             return end
         alone = self._some.of_rows(gone).weighted(replace(end.problem.weighting, loss="cauchy"))
-        estimate = with_placements_at_best(alone, end.solution.estimate)
+        estimate = with_placements_at_best(alone, end.estimate)
         return replace(end, solution=replace(end.solution, estimate=estimate))
 
     def _offsets(
@@ -286,7 +286,7 @@ class _Competition:
         sights = self._some.of_rows(rows).sights
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
-        equations = write_equations(observations, sights, end.solution.estimate, end.residuals)
+        equations = write_equations(observations, sights, end.estimate, end.residuals)
         weights = end.weights_of(observations, equations)
         here = recalled[equations.observation]
         used = weights.used | here
@@ -303,7 +303,7 @@ class _Competition:
         if len(chosen) < 2:
             return chosen, None
         weights = replace(weights, used=used, robust=np.where(here, 1.0, weights.robust))
-        model = make_linear_model(problem, end.solution.estimate, equations, weights)
+        model = make_linear_model(problem, end.estimate, equations, weights)
         prior = groups.prior  # that it is one of those that are compared
         return chosen, measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
 

@@ -64,9 +64,9 @@ class Rest(NamedTuple):
 
 def linear_rest(statement: Statement, end: RobustSolution) -> Rest:
     """By the linear picture where the problem with the statement was solved."""
-    estimate, freedom = end.solution.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
+    estimate, freedom = end.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
-        reduced = end.reduced or information(end.problem, estimate)
+        reduced = end.told
         stated = Information.nothing(statement.keys).beside_all(prior.information for prior in statement.priors)
         at = reduced.shared.columns(stated.keys)
         slope = np.zeros(len(stated.keys))
@@ -116,10 +116,10 @@ def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 def rest_at(statement: Statement, end: RobustSolution, known: Information | None = None) -> Rest:
     """Where a problem without the statement was solved, by what is known of its numbers there; else by the model."""
-    reduced = end.reduced or information(end.problem, end.solution.estimate)
+    reduced = end.told
     freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     known = (known or reduced.shared).marginal(statement.keys)
-    return Rest(end.solution.estimate, np.zeros(len(statement.keys)), known, freedom)
+    return Rest(end.estimate, np.zeros(len(statement.keys)), known, freedom)
 
 
 def worst_test(statement: Statement, rest: Rest) -> WaldTest:
@@ -226,10 +226,10 @@ def find_conflicts(
             without an outlier; None where the answer stays. shifts_at: by which numbers scatter besides.
     """
     most = 4  # solves
-    every = tuple(statements(problem, observations, end.solution.estimate))
+    every = tuple(statements(problem, observations, end.estimate))
     if not every:
         return Conflicts()
-    reduced = end.reduced or information(end.problem, end.solution.estimate)
+    reduced = end.told
     search = _ForwardSelection(problem, end, observations, usual, every, shifts_at)
     while search.solves < most and search.leave_out_the_worst():
         pass
@@ -241,7 +241,7 @@ def find_conflicts(
     if answer is None:
         shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.places[1:]]
     else:
-        moved = difference(answer.solution.estimate, end.solution.estimate, reduced.shared.keys)
+        moved = difference(answer.estimate, end.estimate, reduced.shared.keys)
         shifts = [place - moved for place in search.places[:-1]]
     return Conflicts(named, reduced.shared.keys, tuple(shifts), answer, tuple(search.doubts))
 
@@ -250,7 +250,7 @@ def without_suspicious(problem: Problem, observations: Observations, end: Robust
     """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
     others. Tolerances stay: a line that its own one does not hold is a line aside.
     """
-    estimate = end.solution.estimate
+    estimate = end.estimate
     for one in statements(problem, observations, estimate):
         if one.kind in ("earlier", "tolerance"):
             continue
@@ -295,7 +295,7 @@ def _solved(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
 ) -> RobustSolution | None:
     """The problem solved from where another one ended; None where it cannot be."""
-    after = solve_robustly(replace(problem, feet=end.residuals.feet), observations, end.solution.estimate, usual)
+    after = solve_robustly(replace(problem, feet=end.residuals.feet), observations, end.estimate, usual)
     return None if after.solution.failed else after
 
 
@@ -322,8 +322,8 @@ class _ForwardSelection:
         self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
         self.doubts: list[Doubt] = []
         self._level = float(np.log(LEVEL / len(self.every)))
-        self._first = self.end.reduced or information(self.end.problem, self.end.solution.estimate)
-        self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.solution.estimate
+        self._first = self.end.told
+        self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.estimate
 
     def leave_out_the_worst(self) -> bool:
         """Judge the most suspicious statement; False where none is."""
@@ -340,14 +340,14 @@ class _ForwardSelection:
         rivals = [
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
-        freed = suspect.left_out(self.problem, self.end.solution.estimate)
+        freed = suspect.left_out(self.problem, self.end.estimate)
         after = None if suspect.kind == "earlier" else _solved(freed, self.observations, self.end, self.usual)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
             likely = _wrong(test.squared)
             if after is not None and suspect.kind == "prior" and likely > doubtful:
-                shift = difference(after.solution.estimate, self.end.solution.estimate, self._first.shared.keys)
+                shift = difference(after.estimate, self.end.estimate, self._first.shared.keys)
                 words = doubted(suspect, test, len(self.every) == 1, likely)
                 self.doubts.append(Doubt(suspect.keys, likely, shift, words))
             return True
@@ -355,7 +355,7 @@ class _ForwardSelection:
         here = self.places[-1]
         self.places += [here + _along(self._first, t.key, t.seen[0] - t.stated[0]) for _, t in rivals]
         if after is not None:
-            self.places.append(difference(after.solution.estimate, self._start, self._first.shared.keys))
+            self.places.append(difference(after.estimate, self._start, self._first.shared.keys))
             self.problem, self.end = freed, after
         return True
 
@@ -372,8 +372,8 @@ class _ForwardSelection:
 
     def _known(self, end: RobustSolution) -> Information:
         """About the shared numbers at an end, as the observations scatter."""
-        estimate = end.solution.estimate
-        reduced = end.reduced or information(end.problem, estimate)
+        estimate = end.estimate
+        reduced = end.told
         known = scattered(reduced, measure_scatter(self.observations, end.problem, end.residuals, estimate, reduced))
         if self.shifts_at is None:
             return known
@@ -389,7 +389,7 @@ class _ForwardSelection:
         test = worst_test(statement, rest_at(statement, after, self._known(after)))
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
-        starts = (without, rest.estimate), (bound, self.end.solution.estimate)
+        starts = (without, rest.estimate), (bound, self.end.estimate)
         ends = attempt(lambda: [solve(*start).cost for start in starts])  # quiet: the linear test decides
         if isinstance(ends, CalibrationError):
             return test

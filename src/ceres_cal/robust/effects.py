@@ -69,11 +69,11 @@ def solve_beside_effects(
         off = amounts.displacement(len(off))
         shifts = -off[:points], -off[points:]
         displaced = replace(part, sights=part.sights.displaced(*shifts))
-        end = solve_robustly(displaced, observations, end.solution.estimate, is_near=True)
+        end = solve_robustly(displaced, observations, end.estimate, is_near=True)
         before, amounts = amounts, amounts_at(displaced, end)
         if amounts.stay(before):
             break
-    last, solved = end, end.solution.estimate
+    last, solved = end, end.estimate
 
     def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
         # Along a valley, and without what was stated, numbers go together differently.
@@ -118,7 +118,7 @@ class _Amounts(Frozen):
         cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array, solves: bool
     ) -> _Amounts:
         """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
-        estimate = end.solution.estimate
+        estimate = end.estimate
         equations = write_equations(observations, problem.sights, estimate, end.residuals)
         equations = replace(equations, residual=equations.residual - equations.along(off))
         model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))

@@ -58,6 +58,16 @@ class RobustSolution(Frozen):
     rounds: int
     reduced: ReducedInformation | None = None
 
+    @property
+    def estimate(self) -> Estimate:
+        """Where it is."""
+        return self.solution.estimate
+
+    @property
+    def told(self) -> ReducedInformation:
+        """What observations and priors say there."""
+        return self.reduced or information(self.problem, self.estimate)
+
     def judged_like(self, before: Self, no_change: float) -> bool:
         """Whether nothing worth another solve changed since another round."""
         return self.inliers.same_as(before.inliers, no_change)
@@ -217,9 +227,9 @@ class _RowRounds(Rounds[RobustSolution]):
             visible = visible_from(self._observations, state.residuals)
             if not _much_below(visible.scales, self._scales):
                 break
-            state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
+            state = self._rough(state.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
-        stated = any(not prior.is_usual for prior in self._problem.priors_at(state.solution.estimate))
+        stated = any(not prior.is_usual for prior in self._problem.priors_at(state.estimate))
         if self._problem.smoothness:  # which tells as much, of fewer sights
             return state
         mixed = stated or all(kind.equations for kind in self._problem.sights.by_kind)
@@ -268,7 +278,7 @@ class _RowRounds(Rounds[RobustSolution]):
         """One more solve, from where the last one ended, of what was judged to be inliers; with the same rows where
         others are as good.
         """
-        solution = solve(state.problem, state.solution.estimate, self._progress, precision=self._end)
+        solution = solve(state.problem, state.estimate, self._progress, precision=self._end)
         return self._judged(solution, state.residuals, state.rounds + 1, state.inliers)
 
     def mended(
@@ -279,7 +289,7 @@ class _RowRounds(Rounds[RobustSolution]):
         """
         weighting = state.problem.weighting
         everything = self._problem.weighted(replace(weighting, loss="cauchy"))
-        estimate, lost = with_lost_boards_posed(everything, state.inliers, state.solution.estimate)
+        estimate, lost = with_lost_boards_posed(everything, state.inliers, state.estimate)
         estimate, turned, undecided = without_mirrored_poses(state.problem, estimate, undecided)
         if lost + turned:
             state = self._judged(replace(state.solution, estimate=estimate), state.residuals, state.rounds)
@@ -304,17 +314,17 @@ class _RowRounds(Rounds[RobustSolution]):
 
     def _anew(self, state: RobustSolution) -> tuple[Inliers, ReducedInformation]:
         """Noise and inliers by the leverages there, and what they were taken from."""
-        reduced = information(state.problem, state.solution.estimate)
-        if any(camera.lens.roughness for camera in state.solution.estimate.cameras.values()):
+        reduced = information(state.problem, state.estimate)
+        if any(camera.lens.roughness for camera in state.estimate.cameras.values()):
             from ceres_cal.effects.smoothness import with_smoothness
 
-            self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
+            self._problem, reduced, self._moving = with_smoothness(self._problem, state.estimate, reduced)
         sights = state.problem.sights
         points, curves = reduced.leverages
         taken = points + self._problem.taken_up, curves
         self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
         inliers, rows = self._judge(state.solution, state.residuals), state.inliers.rows
-        estimate, there = state.solution.estimate, state.residuals
+        estimate, there = state.estimate, state.residuals
         fitted = Fitted(self._problem, self._observations, estimate, there, rows, reduced)
         return by_deleted_residuals(inliers, fitted), reduced
 

@@ -39,7 +39,7 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
     if end.solution.failed:
         raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
     points, curves = end.residuals.lengths
-    for name, camera in end.solution.estimate.cameras.items():
+    for name, camera in end.estimate.cameras.items():
         own = problem.sights.of_camera(name)
         limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
         met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
@@ -148,7 +148,7 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
         wholes: (N + M,) of each the observations that were taken out as one.
     """
     warnings = []
-    for name, camera in end.solution.estimate.cameras.items():
+    for name, camera in end.estimate.cameras.items():
         width, height = camera.image_size
         off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
         own = end.problem.sights.of_camera(name)
