@@ -105,8 +105,8 @@ def compared_kinds(
     """
     least_rows, most_rows, share, fewest_frames = 1_000, 12_000, 0.025, 24  # of the observations, how many take part
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
-    total = len(observations.points) + len(observations.curves)
-    few = thinned(observations, most_rows if by_most else max(least_rows, int(share * total)), fewest_frames)
+    most = most_rows if by_most else max(least_rows, int(share * observations.rows))
+    few = thinned(observations, most, fewest_frames)
     sights = built.held(gather_sights(few), few)
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
@@ -124,7 +124,7 @@ def compared_kinds(
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)
         if len(tried) == 1 or best.least > _QUIETER * least:
-            return seen, compared, (len(few.points) + len(few.curves)) / total
+            return seen, compared, few.rows / observations.rows
         tried = [best.forms]
 
 

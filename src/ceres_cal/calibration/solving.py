@@ -160,7 +160,7 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
     """Solve and explain what is left; see `solved_from`."""
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     observations = task.observations
-    takes_long = len(observations.points) + len(observations.curves) > long_to_digest
+    takes_long = observations.rows > long_to_digest
     digest = meanwhile(lambda: observations.digest) if takes_long and task.settle is None else None
     seen, may_move = _solved(task, start, problem, built), task.chosen and not task.settle
     steady = _made_steady(seen, problem) if may_move else None

@@ -66,6 +66,11 @@ class Content(Frozen):
     priors: tuple[Prior, ...] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def rows(self) -> int:
+        """How many observations there are, of points and of curves."""
+        return len(self.points) + len(self.curves)
+
     def feature_name(self, kind: str, row: int) -> str:
         """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
         column: Columns = self.points if kind == "point" else self.curves

@@ -362,7 +362,7 @@ MANY = 2_000_000
 
 def is_bulk(observations: Observations) -> bool:
     """Whether a part is to decide."""
-    if len(observations.points) + len(observations.curves) <= MANY:
+    if observations.rows <= MANY:
         return False
     world = np.array([view.placement is None for view in observations.views])
     return sum(int(np.diff(ends)[world].sum()) for ends in observations.ends) > MANY
@@ -375,7 +375,7 @@ def column_of(observations: Observations, name: str) -> AnyArray:
 
 def shown_rows(content: Content, sights: Sights) -> Mask:
     """(N + M,) the observations that sights show, points by row and then curves by row."""
-    rows = np.zeros(len(content.points) + len(content.curves), dtype=bool)
+    rows = np.zeros(content.rows, dtype=bool)
     rows[sights.point_rows] = rows[len(content.points) + sights.curve_rows] = True
     return rows
 
@@ -390,11 +390,10 @@ def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
 
 def thinned(observations: Observations, most: int, fewest_frames: int = 40) -> Observations:
     """Evenly spread frames, and of these evenly spread observations, about `most` in all."""
-    total = len(observations.points) + len(observations.curves)
-    if total <= most:
+    if observations.rows <= most:
         return observations
     names, frame = frames_of(observations)
-    count = max(min(fewest_frames, len(names)), int(len(names) * most / total))
+    count = max(min(fewest_frames, len(names)), int(len(names) * most / observations.rows))
     taken = np.zeros(len(names), dtype=bool)
     taken[np.linspace(0, len(names) - 1, count).round().astype(int)] = True
     chosen = taken[frame]

@@ -138,7 +138,7 @@ class Bulk:
         """
         every = tuple(replace(one, rows=self._rows_of(one, part)) for one in explanations)
         taken = [(mine.rows, one.rows) for mine, one in zip(explanations, every, strict=True) if one.is_taken]
-        gone, engine = np.zeros(len(part.observations.points) + len(part.observations.curves), dtype=bool), self._engine
+        gone, engine = np.zeros(part.observations.rows, dtype=bool), self._engine
         if taken:
             gone = np.any([mine for mine, _ in taken], axis=0)
             engine = self._engine_without(self._also(np.any([rows for _, rows in taken], axis=0)))

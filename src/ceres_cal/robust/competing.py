@@ -95,7 +95,7 @@ def compete(
     part = compared_part(every)
     some = _freed(part, solver)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
-    taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
+    taking_part = np.ones(observations.rows, dtype=bool)
     for trial in trials:
         groups = every.kinds[some.kinds.index(trial.suspects[0])]
         own = [groups.among([number]) & taking_part for number in trial.suspects[1]]
@@ -168,7 +168,7 @@ class _Competition:
     def __init__(self, some: Subproblem, solver: Solver) -> None:
         self._some, self._solver = some, solver
         self._tried: set[tuple[int, ...]] = set()
-        self._taking_part = np.ones(len(some.observations.points) + len(some.observations.curves), dtype=bool)
+        self._taking_part = np.ones(some.observations.rows, dtype=bool)
 
     def decided(self) -> list[_Trial]:
         """The trials of groups that do not belong, one after the other; the last one may be in doubt."""
@@ -245,7 +245,7 @@ class _Competition:
         for number, place in zip(numbers, places, strict=True):
             odds, rival = offsets.odds(place, places)
             own = groups.among([number]) & self._taking_part
-            other = (end if odds > 0.0 else without).solution.estimate
+            other = (end if odds > 0.0 else without).estimate
             instead = "it belongs"
             if rival is not None and abs(odds) < DOUBTFUL:
                 in_its_place = int(chosen[rival])

@@ -57,7 +57,7 @@ def solve_beside_effects(
         problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
         solves: whether likely effects are; where the observations are a part of those that count, they only widen.
     """
-    points, off = len(observations.points), np.zeros((len(observations.points) + len(observations.curves), 2))
+    points, off = len(observations.points), np.zeros((observations.rows, 2))
 
     def amounts_at(under: Problem, end: RobustSolution) -> _Amounts:
         return _Amounts.of(under, observations, end, off, solves)

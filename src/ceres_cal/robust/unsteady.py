@@ -119,7 +119,7 @@ def find_unsteady(
     Args:
         problem: of all the observations, what was found `before` taken off. end: of its rounds.
     """
-    count, estimate = len(observations.points) + len(observations.curves), end.estimate
+    count, estimate = observations.rows, end.estimate
     off = np.zeros((count, 2)) if before is None else before.displacement
     weights_of = partial(end.weights_of, observations)
 
