@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
 from ceres_cal.base.frozen import Frozen, replace
@@ -124,27 +125,22 @@ def _responses(
     grey: Array32, course: Course, reach_px: float, blur_px: Array | float, band_px: float
 ) -> tuple[Array, Array]:
     """Steps (S,) px along the normals, and (N, S) how much brighter a line there is than bands to either side."""
-    width_px = np.maximum(course.width_px, np.maximum(_AS_WIDE * np.asarray(blur_px), 1.0))
-    far = reach_px + float(np.max(width_px)) + band_px + 2.0
-    steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
+    half_px = 0.5 * np.maximum(course.width_px, np.maximum(_AS_WIDE * np.asarray(blur_px), 1.0))
+    count = int(reach_px / _SEARCH_STEP_PX)
+    beyond = int(np.ceil((np.max(half_px) + band_px + 1.0) / _SEARCH_STEP_PX)) + 1
+    steps = np.arange(-count - beyond, count + beyond + 1.0) * _SEARCH_STEP_PX
     light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
     # Between steps, not of them: a mean must lie as far to one side of its place as to the other.
     total = np.cumsum(np.pad(0.5 * (light[:, 1:] + light[:, :-1]), ((0, 0), (1, 0))), axis=1)
+    own, rows = sliding_window_view(total, 2 * count + 1, axis=1), np.arange(len(total))
 
     def mean(low: Array, high: Array) -> Array:
         """(N, S) mean light from `low` to `high` (N,) px beyond each step."""
         first, last = (np.round(edge / _SEARCH_STEP_PX).astype(int) for edge in (low, high))
-        places = np.arange(len(steps))
-        a = np.clip(places + first[:, None], 0, len(steps) - 2)
-        b = np.clip(places + last[:, None], a + 1, len(steps) - 1)
-        rows = np.arange(len(light))[:, None]
-        return np.asarray((total[rows, b] - total[rows, a]) / (b - a))
+        return np.asarray((own[rows, beyond + last] - own[rows, beyond + first]) / (last - first)[:, None])
 
-    half = 0.5 * width_px
-    left, right = mean(-half - 1.0 - band_px, -half - 1.0), mean(half + 1.0, half + 1.0 + band_px)
-    response = mean(-half, half) - np.maximum(left, right)
-    response[:, np.abs(steps) > reach_px] = -np.inf
-    return steps, response
+    left, right = mean(-half_px - 1.0 - band_px, -half_px - 1.0), mean(half_px + 1.0, half_px + 1.0 + band_px)
+    return steps[beyond:-beyond], mean(-half_px, half_px) - np.maximum(left, right)
 
 
 def _preferred(response: Array, away: Array) -> Array:
@@ -152,8 +148,7 @@ def _preferred(response: Array, away: Array) -> Array:
     more paint: a boundary line beside the field's own is wider.
     """
     bright, usual = np.maximum(response, 0.0), max(median(np.max(response, axis=1)), _TINY)
-    preferred = _is_peak(response) * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2)
-    return np.where(np.isfinite(response), preferred, -np.inf)
+    return np.asarray(_is_peak(response) * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2))
 
 
 def _is_peak(response: Array) -> Mask:

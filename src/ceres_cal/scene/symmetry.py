@@ -52,15 +52,14 @@ def _is_along(curve: Curve, sent: Array, other: Curve) -> bool:
 
 def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
     """The turns about the upright through its middle that put the painted curves onto themselves; the first is none."""
-    most_turns = 12
+    counts = np.arange(12, 1, -1)  # the most first
     painted = _painted(target, curves)
     middle, samples = middle_of(target, curves), _samples(painted)
-    for count in range(most_turns, 1, -1):
-        sent = _turn(2.0 * np.pi / count, middle).transform(samples)
-        away = np.min([distance_to_curve(curve, sent) for curve in painted], axis=0)
-        if np.max(away) < _SAME_M * max(1.0, float(np.max(np.abs(sent)))):
-            return [_turn(2.0 * np.pi * number / count, middle) for number in range(count)]
-    return [Pose.identity()]
+    sent = np.array([_turn(2.0 * np.pi / count, middle).transform(samples) for count in counts])
+    away = np.min([distance_to_curve(curve, sent.reshape(-1, 3)) for curve in painted], axis=0).reshape(len(counts), -1)
+    same = np.max(away, axis=1) < _SAME_M * np.maximum(1.0, np.max(np.abs(sent), axis=(1, 2)))
+    count = int(counts[same].max(initial=1))
+    return [_turn(2.0 * np.pi * number / count, middle) for number in range(count)]
 
 
 def middle_of(target: Target, curves: Collection[str]) -> Array:

@@ -8,9 +8,9 @@ from time import thread_time
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array32
+from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.base.transforms import Pose, chained, inverted
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
@@ -23,7 +23,6 @@ from ceres_cal.problem.structure import redrawn
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Target
 
 _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
@@ -49,7 +48,6 @@ class FieldSearch(Frozen):
     """A photograph and the target that it may show.
 
     Attributes:
-        turns: of the target that put its painted curves onto themselves; the first is none.
         others: the target drawn with other lengths, where some are not known.
         until_s: of this thread's processor time, after which no further camera is looked at.
         looked_at: cameras of candidates so far. reached: what was followed. refused: those of it that are surely not
@@ -59,7 +57,6 @@ class FieldSearch(Frozen):
     grey: Array32
     stroke_map: StrokeMap
     grid: LineGrid
-    turns: tuple[Pose, ...]
     others: tuple[LineGrid, ...] = ()
     until_s: float = np.inf
     looked_at: list[Camera] = field(default_factory=list)
@@ -79,6 +76,11 @@ class FieldSearch(Frozen):
         """Names of those that are painted."""
         return self.grid.curves
 
+    @property
+    def turns(self) -> tuple[Pose, ...]:
+        """Of the target that put its painted curves onto themselves; the first is none."""
+        return self.grid.turns
+
 
 def prepare_search(
     grey: Array32, target: Target, curves: Collection[str], lengths: Sequence[Prior] = ()
@@ -92,8 +94,8 @@ def prepare_search(
         InputError: the target has too few straight lines.
     """
     grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
-    until_s, turns = thread_time() + BUDGET_S, tuple(turns_of(target, curves))
-    return FieldSearch(grey, _stroke_map(grey, find_strokes(grey)), grid, turns, tuple(others), until_s)
+    until_s = thread_time() + BUDGET_S
+    return FieldSearch(grey, _stroke_map(grey, find_strokes(grey)), grid, tuple(others), until_s)
 
 
 def narrowed(search: FieldSearch) -> FieldSearch:
@@ -156,7 +158,8 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
             break
     distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
     likely = _likely(search, [(camera, drawn[id(camera)]) for camera in distinct])
-    new = [one for one in likely if not any(_same_place(one[0], other, search.turns) for other in search.looked_at)]
+    before = _poses(search.looked_at)
+    new = [one for one in likely if not np.any(_same_place(one[0].cam_from_world.matrix, before, search.turns))]
     search.looked_at.extend(camera for camera, _ in new)
     return new
 
@@ -223,19 +226,26 @@ def _distinct(
     scored: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
 ) -> list[Camera]:
     """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
-    chosen: list[Camera] = [] if known is None else [known]
-    for score, camera in scored:
-        if len(chosen) > _MOST_ALIKE or score < least * scored[0][0]:
-            break
-        if not any(_same_place(camera, other, turns) for other in chosen):
-            chosen.append(camera)
-    return chosen if known is None else chosen[1:]
+    given = [] if known is None else [known]
+    cameras = [*given, *(camera for score, camera in scored if score >= least * scored[0][0])]
+    left, chosen = np.arange(len(cameras)), list[Camera]()
+    poses = _poses(cameras)
+    while len(left) and len(chosen) <= _MOST_ALIKE:
+        chosen.append(cameras[left[0]])
+        left = left[~_same_place(poses[left[0]], poses[left], turns)]
+    return chosen[len(given) :]
 
 
-def _same_place(one: Camera, other: Camera, turns: Sequence[Pose]) -> bool:
-    for turn in turns:
-        between = (one.cam_from_world @ turn) @ other.cam_from_world.inverse
-        near = np.linalg.norm(between.translation) < _SAME_PLACE * max(one.position[2], other.position[2])
-        if near and np.linalg.norm(rotation_log(between.rotation)) < _SAME_TURN:
-            return True
-    return False
+def _poses(cameras: Sequence[Camera]) -> Array:
+    """(N, 3, 4) [R t]."""
+    return np.reshape([camera.cam_from_world.matrix for camera in cameras], (-1, 3, 4))
+
+
+def _same_place(pose: Array, others: Array, turns: Sequence[Pose]) -> Mask:
+    """(N,) which of the others (N, 3, 4) are about the one (3, 4), or that after a turn of the target."""
+    ways, back = chained(pose, np.array([turn.matrix for turn in turns])), inverted(others)
+    between = chained(ways[:, None], back)
+    height = np.maximum(-pose[:, 2] @ pose[:, 3], back[:, 2, 3])
+    near = np.linalg.norm(between[..., 3], axis=2) < _SAME_PLACE * height
+    cosine = 0.5 * (np.trace(between[..., :3], axis1=2, axis2=3) - 1.0)
+    return np.asarray(np.any(near & (cosine > np.cos(_SAME_TURN)), axis=0))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice, product
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -46,6 +47,8 @@ _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX, _NEARLY_PX = 0.02, 0.3  # the second where it is only asked whether this is the field
 _SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
+
+Made = TypeVar("Made")
 
 
 def follow(
@@ -121,7 +124,7 @@ class _Tracker:
     free: FreeIntrinsics
     missing: tuple[str, ...] = ()
     reached: list[Followed] = field(default_factory=list)
-    rested: list[tuple[Camera, tuple[object, ...], Followed]] = field(default_factory=list)
+    known: list[tuple[Camera, tuple[object, ...], Any]] = field(default_factory=list)
     rest_px: float = _AT_REST_PX
 
     def followed(self, camera: Camera, lines: Lines) -> Followed:
@@ -208,11 +211,20 @@ class _Tracker:
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more, or no less than before."""
+        return self._once(camera, (names,), lambda: self._at_rest(camera, names))
+
+    def _once(self, camera: Camera, what: tuple[object, ...], made: Callable[[], Made]) -> Made:
+        """What is made from a camera, of these lines: the same ones are asked for time and again."""
+        asked = *what, tuple(self.curves), self.target.spec
+        for start, before, came in self.known:
+            if start is camera and before == asked:
+                return cast(Made, came)
+        came = made()
+        self.known.append((camera, asked, came))
+        return came
+
+    def _at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         no_nearer = 0.8  # of the last step: lines that are taken in turns, or none that fit, come to no rest
-        asked = names, tuple(self.curves), self.target.spec
-        for start, what, came in self.rested:  # other dimensions are tried from the same cameras, time and again
-            if start is camera and what == asked:
-                return came
         tracker, lines, moved, there = self, self.measured(camera), np.inf, camera
         for _ in range(_ROUNDS):
             if np.count_nonzero(lines.found) < _FEWEST:
@@ -225,9 +237,7 @@ class _Tracker:
             lines = tracker.measured(there, is_even=lines.is_even)
             if moved < self.rest_px or moved > no_nearer * last:
                 break
-        came = tracker.followed(there, lines)
-        self.rested.append((camera, asked, came))
-        return came
+        return tracker.followed(there, lines)
 
     def refined(self, followed: Followed) -> Followed:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
@@ -276,7 +286,9 @@ class _Tracker:
 
     def squared(self, followed: Followed) -> Followed:
         """The same lines through a camera with square pixels."""
-        camera = replace(followed.camera, phi=followed.camera.phi * followed.camera.aspect**0.5, aspect=1.0)
+        camera = followed.camera
+        if camera.aspect != 1.0:
+            camera = replace(camera, phi=camera.phi * camera.aspect**0.5, aspect=1.0)
         return self._with(followed).at_rest(camera, _free(camera))
 
     def without_aside(self, followed: Followed) -> Followed:
@@ -381,6 +393,9 @@ class _Tracker:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
     def measured(self, camera: Camera, *, is_even: bool = False) -> Lines:
+        return self._once(camera, ("lines", is_even), lambda: self._measured(camera, is_even))
+
+    def _measured(self, camera: Camera, is_even: bool) -> Lines:
         course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
         clear = clear_px(self.target, camera, course, self.curves)
         return measure(self.grey, course, _LAST_REACH_PX, clear, is_even=is_even)

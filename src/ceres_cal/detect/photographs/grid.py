@@ -9,6 +9,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.curves import Arc, Segment, curve_points
 from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Target
@@ -23,14 +24,14 @@ class LineGrid(Frozen):
     """A target's lines in its main direction and across.
 
     Attributes:
-        curves: names of the painted ones. turns: in how many turns they look the same.
+        curves: names of the painted ones. turns: that put these onto themselves; the first is none.
         turn: (2, 2) target from grid: columns are the main direction and the one across.
         along, across: the offsets of lines that run so, and of the arcs' tangents, in the grid's y and x.
     """
 
     target: Target
     curves: tuple[str, ...]
-    turns: int
+    turns: tuple[Pose, ...]
     turn: Array
     along: Array
     across: Array
@@ -80,7 +81,7 @@ def grid_of(target: Target, curves: Collection[str]) -> LineGrid:
         numbers = [len(_offsets(lines, turn, axis)) for axis in (0, 1)]
         if max(numbers) > 1 and min(numbers) > 0:
             both = offsets_of(target, curves, turn)
-            return LineGrid(target, tuple(curves), len(turns_of(target, curves)), turn, *both)
+            return LineGrid(target, tuple(curves), tuple(turns_of(target, curves)), turn, *both)
     raise InputError(
         "a field is found without a start by straight lines at right angles, two one way and one across at least: "
         "this target has fewer; start from a calibration or from corners"

@@ -132,7 +132,7 @@ def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorL
     kept = 250
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     scored: list[tuple[float, Array, Array]] = []
-    for quarters in range(4 // gcd(4, grid.turns)):
+    for quarters in range(4 // gcd(4, len(grid.turns))):
         turned = replace(upright, rotation=upright.rotation @ _QUARTERS[quarters])
         hypotheses = _hypotheses(lines.turned(quarters), grid)
         score = _scores(stroke_map, turned, hypotheses, few)

@@ -11,6 +11,8 @@ that straightens them. Of a floor that is seen from straight above no line tells
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ceres_cal.base.arrays import Array
@@ -31,7 +33,6 @@ _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
 _ROUNDS = 12
-_STEP = 1e-5  # of bend and log phi, for slopes
 # Of the strokes, in the direction that has fewer: a floor needs both. Nothing changes from half to double. And of what
 # the target has there: fields without touch lines have little.
 _LEAST_SHARE, _LEAST_OF_OWN = 0.06, 0.3
@@ -89,12 +90,12 @@ def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0)
     for bend in BENDS:
         for phi in PHIS:
             optics = Upright(bend, phi, _DOWN, 0.0)
-            value = _score(_normals(optics, ends), weights, rotations, _ROUGH, least) - lean
+            value = _score(_normals(bend, phi, ends)[0], weights, rotations, _ROUGH, least) - lean
             for best in np.argsort(-value)[:_FROM_EACH]:
                 turned = replace(optics, rotation=rotations[best].astype(float))
                 scored.append((float(value[best]) - _penalty(optics), turned))
     scored.sort(key=lambda one: -one[0])
-    refined = [_refined(one, ends, weights, least) for _, one in scored[:_REFINED]]
+    refined = _refined([one for _, one in scored[:_REFINED]], ends, weights, least)
     refined.sort(key=lambda one: -(one.share - _penalty(one)))
     chosen: list[Upright] = []
     for one in refined:
@@ -119,16 +120,22 @@ def _rotations() -> Array:
     return np.array(rotations, dtype=np.float32)
 
 
-def _normals(optics: Upright, ends: Array) -> Array:
-    """(N, 3) unit normals of the planes through the camera and the strokes."""
-    (a, b, c), (x, y, z) = optics.rays(ends[:, 0]).T, optics.rays(ends[:, 1]).T
-    normal = np.column_stack([b * z - c * y, c * x - a * z, a * y - b * x])
-    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Array, Array]:
+    """(..., N, 3) normals of the planes through the camera and the strokes, of any length, and their slopes by bend;
+    bend and phi are (...), or one number.
+    """
+    (x, y), (u, v) = ends[:, 0].T, ends[:, 1].T
+    near, far = x**2 + y**2, u**2 + v**2
+    phi, bend = np.asarray(phi)[..., None], np.asarray(bend)[..., None, None]
+    by_bend = np.stack([y * far - v * near, u * near - x * far, np.zeros(len(ends))], axis=-1)
+    flat = np.stack(np.broadcast_arrays(y - v, u - x, (x * v - u * y) / phi), axis=-1)
+    return flat + bend * by_bend, by_bend
 
 
 def _score(normals: Array, weights: Array, rotations: Array, tolerance: float, least: float) -> Array:
     """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
     single = np.float32  # twice as fast, and good enough for a share
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     axes = np.moveaxis(rotations[:, :, :2].astype(single), 2, 0).reshape(-1, 3)
     off = (axes @ normals.T.astype(single) / single(tolerance)).reshape(2, len(rotations), -1)
     along, weight = np.exp(-(off**2)), (weights / weights.sum()).astype(single)  # (2, B, N), (N,)
@@ -142,43 +149,43 @@ def _penalty(optics: Upright) -> float:
     return float(_PRIOR_WEIGHT * (phi**2 + ((optics.bend - _USUAL_BEND) / _BEND_SIGMA) ** 2 + tilt**2))
 
 
-def _moved(one: Upright, step: Array) -> Upright:
-    return replace(
-        one,
-        bend=max(one.bend + float(step[3]), _MOST_BENT),
-        phi=one.phi * float(np.exp(step[4])),
-        rotation=one.rotation @ rotation_exp(step[:3]),
-    )
-
-
-def _refined(one: Upright, ends: Array, weights: Array, least: float) -> Upright:
-    """Gauss-Newton on turn, bend and log phi, robust and ever finer."""
+def _refined(starts: Sequence[Upright], ends: Array, weights: Array, least: float) -> list[Upright]:
+    """Gauss-Newton on turn, bend and log phi, robust and ever finer; of all starts at once."""
+    bend, phi = np.array([(one.bend, one.phi) for one in starts]).T
+    rotation, share = np.array([one.rotation for one in starts]), weights / weights.sum()
+    prior = _PRIOR_WEIGHT * np.array([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(USUAL_PHI_FACTOR) ** -2])
     for tolerance in np.geomspace(_ROUGH, _FINE, _ROUNDS):
-        base, columns = _deviation(one, ends)
-        weight = weights / weights.sum() * np.exp(-((base / tolerance) ** 2)) / tolerance**2
-        prior = _PRIOR_WEIGHT * np.diag([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(USUAL_PHI_FACTOR) ** -2])
-        off = np.array([0.0, 0.0, 0.0, one.bend - _USUAL_BEND, np.log(one.phi / USUAL_PHI)])
-        normal = (columns * weight) @ columns.T + prior + 1e-9 * np.eye(5)
-        step = np.linalg.solve(normal, -(columns * weight) @ base - prior @ off)
-        one = _moved(one, np.clip(step, -0.1, 0.1))
-    normals = _normals(one, ends)
-    return replace(one, share=float(_score(normals, weights, one.rotation[None], 2.0 * _FINE, least)[0]))
+        base, columns = _deviation(bend, phi, rotation, ends)
+        weighted = columns * (share * np.exp(-((base / tolerance) ** 2)) / tolerance**2)[:, None]
+        off = np.stack([0.0 * bend, 0.0 * bend, 0.0 * bend, bend - _USUAL_BEND, np.log(phi / USUAL_PHI)], axis=1)
+        normal = weighted @ np.swapaxes(columns, 1, 2) + np.diag(prior + 1e-9)
+        right = -(weighted @ base[:, :, None])[:, :, 0] - prior * off
+        step = np.clip(np.linalg.solve(normal, right[:, :, None])[:, :, 0], -0.1, 0.1)
+        bend, phi = np.maximum(bend + step[:, 3], _MOST_BENT), phi * np.exp(step[:, 4])
+        rotation = rotation @ np.array([rotation_exp(turn) for turn in step[:, :3]])
+    normals, _ = _normals(bend, phi, ends)
+    found = [_score(n, weights, r[None], 2.0 * _FINE, least)[0] for n, r in zip(normals, rotation, strict=True)]
+    every = zip(bend.tolist(), phi.tolist(), rotation, map(float, found), strict=True)
+    return [Upright(*one) for one in every]
 
 
-def _deviation(one: Upright, ends: Array) -> tuple[Array, Array]:
-    """(N,) sine of the angle between each stroke and the nearer direction, and (5, N) its slopes by turn, bend and log
-    phi.
+def _deviation(bend: Array, phi: Array, rotation: Array, ends: Array) -> tuple[Array, Array]:
+    """(B, N) sine of the angle between each stroke and the nearer direction of each of B answers, and (B, 5, N) its
+    slopes by turn, bend and log phi.
     """
-    off = _normals(one, ends) @ one.rotation
-    x, y, z = off.T
-    is_x, none = np.abs(x) <= np.abs(y), np.zeros(len(off))
+    normals, by_bend = _normals(bend, phi, ends)
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = normals / length
+    x, y, z = np.moveaxis(normals @ rotation, 2, 0)
+    is_x, none = np.abs(x) <= np.abs(y), np.zeros_like(x)
     base = np.where(is_x, x, y)
     turns = np.where(is_x, [none, -z, y], [z, none, -x])  # of the axis, w x e
-    others = []
-    for step in _STEP * np.eye(5)[3:]:
-        there = _normals(_moved(one, step), ends) @ one.rotation[:, :2]
-        others.append((np.where(is_x, *there.T) - base) / _STEP)
-    return base, np.vstack([turns, others])
+    axis = np.where(is_x[..., None], rotation[:, None, :, 0], rotation[:, None, :, 1])
+    by_phi = np.where([False, False, True], -normals, 0.0)
+    others = [
+        np.sum(change * axis, axis=2) - base * np.sum(change * normals, axis=2) for change in (by_bend / length, by_phi)
+    ]
+    return base, np.stack([*turns, *others], axis=1)
 
 
 def _apart(one: Upright, other: Upright) -> bool:
