@@ -211,7 +211,7 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
 
 def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
     """(K,) of each hypothesis, from 0 to 1."""
-    block = 2000
+    block = 40_000 // len(places.first)  # as many as stay in the cache
     blocks = range(0, len(hypotheses), block)
     parts = [_scored(stroke_map, upright, hypotheses[b : b + block].astype(np.float32), places) for b in blocks]
     return np.concatenate([np.empty(0), *parts])

@@ -111,13 +111,10 @@ def best_score(ends: Array, weights: Array, own_share: float) -> float:
 
 def _rotations() -> Array:
     """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
-    rolls = np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))
-    rotations = []
-    for tilt, count in _RINGS_DEG:
-        for direction in 2.0 * np.pi * np.arange(count) / count:
-            lean = rotation_exp(np.deg2rad(tilt) * np.array([np.cos(direction), np.sin(direction), 0.0]))
-            rotations += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
-    return np.array(rotations, dtype=np.float32)
+    rolls = np.array([rotation_exp([0.0, 0.0, roll]) for roll in np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))])
+    ways = [(tilt, 2.0 * np.pi * number / count) for tilt, count in _RINGS_DEG for number in range(count)]
+    leans = [rotation_exp(np.deg2rad(tilt) * np.array([np.cos(way), np.sin(way), 0.0])) for tilt, way in ways]
+    return (np.array(leans)[:, None] @ _DOWN @ rolls).reshape(-1, 3, 3).astype(np.float32)
 
 
 def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Array, Array]:
@@ -134,13 +131,16 @@ def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Arra
 
 def _score(normals: Array, weights: Array, rotations: Array, tolerance: float, least: float) -> Array:
     """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
-    single = np.float32  # twice as fast, and good enough for a share
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    axes = np.moveaxis(rotations[:, :, :2].astype(single), 2, 0).reshape(-1, 3)
-    off = (axes @ normals.T.astype(single) / single(tolerance)).reshape(2, len(rotations), -1)
-    along, weight = np.exp(-(off**2)), (weights / weights.sum()).astype(single)  # (2, B, N), (N,)
-    least_share = np.minimum(*(along @ weight))
-    return np.asarray(np.where(least_share > least, np.maximum(*along) @ weight, 0.0))
+    single, block = np.float32, 128  # twice as fast, and good enough for a share; and as many as stay in the cache
+    planes = (normals / (tolerance * np.linalg.norm(normals, axis=1, keepdims=True))).astype(single)
+    axes, weight = rotations[:, :, :2].astype(single), (weights / weights.sum()).astype(single)
+    shares = []
+    for start in range(0, len(axes), block):
+        off = np.moveaxis(axes[start : start + block], 2, 0) @ planes.T  # (2, b, N)
+        along = np.exp(np.negative(np.square(off, out=off), out=off), out=off)
+        least_share = np.minimum(*(along @ weight))
+        shares.append(np.where(least_share > least, np.maximum(*along) @ weight, 0.0))
+    return np.concatenate(shares)
 
 
 def _penalty(optics: Upright) -> float:
