@@ -25,7 +25,7 @@ from ceres_cal.detect.photographs.candidates import candidates, off_centre, prep
 from ceres_cal.detect.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
 from ceres_cal.detect.photographs.follow import refine
 from ceres_cal.detect.photographs.grid import grid_of
-from ceres_cal.detect.photographs.painted import likelihood_of_place
+from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import search
 from ceres_cal.detect.photographs.upright import find_upright
@@ -290,9 +290,9 @@ def test_what_disturbs_does_not_hide_the_field(kind: str, seed: int) -> None:
 def test_lines_that_motion_makes_faint_are_seen() -> None:
     """Those across the way of the camera are a sixth as bright as those along it."""
     shot = disturbed.taken("motion", 105, FIELD)
-    seen = likelihood_of_place(light(shot.image), FIELD, shot.camera, NAMES)
     aside = shot.camera.at(shot.camera.cam_from_world @ Pose(np.eye(3), np.array([0.9, 0.3, 0.0])))
-    assert seen > 400.0 > 200.0 > likelihood_of_place(light(shot.image), FIELD, aside, NAMES)  # 559 and less than 100
+    seen, beside = likelihoods_of_places(light(shot.image), [(FIELD, shot.camera), (FIELD, aside)], NAMES)
+    assert seen > 400.0 > 200.0 > beside  # 559 and less than 100
     course = predict(FIELD, shot.camera, NAMES, SPACING_PX, SPACING_PX)
     clear = clear_px(FIELD, shot.camera, course, NAMES)
     assert measure(light(shot.image), course, 5.0, clear).share > 0.95  # 0.99

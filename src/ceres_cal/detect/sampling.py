@@ -97,10 +97,8 @@ def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
     x, y = np.where(level[:, None], (u, v), (v, u))
     wave = _ACROSS[nearest]
     crossed, share = wave[:, :1] * x + wave[:, 1:] * y, np.sum(wave * normals, axis=1)
-    return np.column_stack(
-        [
-            np.where(np.isin(nearest, own), share * np.mean(np.exp(2j * np.pi * cycles * crossed), axis=1), 0.0)
-            for own, every in _CYCLES
-            for cycles in every
-        ]
-    )
+    turns = [np.zeros(len(course), dtype=complex) for _, every in _CYCLES for _ in every]
+    waves = ((np.isin(nearest, own), cycles) for own, every in _CYCLES for cycles in every)
+    for turn, (rows, cycles) in zip(turns, waves, strict=True):
+        turn[rows] = share[rows] * np.mean(np.exp(2j * np.pi * cycles * crossed[rows]), axis=1)
+    return np.column_stack(turns)

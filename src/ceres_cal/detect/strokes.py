@@ -58,6 +58,11 @@ class Strokes(Frozen):
         """(N,)"""
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
 
+    @property
+    def total_px(self) -> float:
+        """Length of all of them."""
+        return float(np.sum(self.length_px))
+
 
 def alone(strokes: Strokes, reach_px: float) -> Array:
     """(N,) how much a stroke is a line of its own: 1, less where others run beside it, as of striped floors and sun.
@@ -98,14 +103,13 @@ def find_strokes(grey: Array32) -> Strokes:
     return Strokes(*(np.concatenate([getattr(one, name) for one in (fine, coarse)]) for name in ("ends", "strength")))
 
 
-def lengths_of_signs(grey: Array32) -> tuple[float, float]:
-    """How long, px, the strokes of a photograph are in all that are brighter than the floor, and that are darker.
+def strokes_of_signs(grey: Array32) -> tuple[Strokes, Strokes]:
+    """The strokes of a photograph that are brighter than the floor, and those that are darker.
 
-    On fields with light lines dark ones came to 0.92 of them at most, mostly to 0.2, but on one with dark seams to
-    more; on two with dark lines to 6 and 14.
+    On fields with light lines dark ones came to 0.92 of their length at most, mostly to 0.2, but on one with dark seams
+    to more; on two with dark lines to 6 and 14.
     """
-    light, dark = (float(np.sum(find_strokes(plane).length_px)) for plane in (grey, negative(grey)))
-    return light, dark
+    return find_strokes(grey), find_strokes(negative(grey))
 
 
 def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:
@@ -165,10 +169,9 @@ def _ridge_points(grey: Array32) -> _Ridge:
 
 def _bends(soft: Array32) -> tuple[Array32, Array32, Array32, Array32]:
     """Second derivatives by x, by y and by both, and the lower one of their eigenvalues."""
-    xx, yy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in ((2, 0), (0, 2)))
-    xy = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 1, ksize=3)) / 4.0
-    lower = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
-    return _single(xx), _single(yy), _single(xy), _single(lower)
+    orders, quarter = ((2, 0), (0, 2), (1, 1)), 0.25
+    xx, yy, xy = (_single(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3, scale=quarter)) for order in orders)
+    return xx, yy, xy, _single(0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2))
 
 
 def _smoothed(grey: Array32, sigma_px: float) -> Array32:

@@ -14,7 +14,7 @@ from ceres_cal.base.transforms import Pose, chained, inverted
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
-from ceres_cal.detect.photographs.painted import likelihood_of_place
+from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.upright import Upright, best_score, find_upright
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_narrow_strokes, find_strokes
@@ -83,19 +83,23 @@ class FieldSearch(Frozen):
 
 
 def prepare_search(
-    grey: Array32, target: Target, curves: Collection[str], lengths: Sequence[Prior] = ()
+    grey: Array32,
+    target: Target,
+    curves: Collection[str],
+    lengths: Sequence[Prior] = (),
+    strokes: Strokes | None = None,
 ) -> FieldSearch:
     """The strokes of a photograph, beside what they are to be taken for.
 
     Args:
-        lengths: what is known of dimensions of the target that may be others.
+        lengths: what is known of dimensions of the target that may be others. strokes: where they are known already.
 
     Raises:
         InputError: the target has too few straight lines.
     """
     grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
     until_s = thread_time() + BUDGET_S
-    return FieldSearch(grey, _stroke_map(grey, find_strokes(grey)), grid, tuple(others), until_s)
+    return FieldSearch(grey, _stroke_map(grey, strokes or find_strokes(grey)), grid, tuple(others), until_s)
 
 
 def narrowed(search: FieldSearch) -> FieldSearch:
@@ -184,8 +188,9 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
 
 def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> list[tuple[Camera, LineGrid]]:
     """Those by which the target's own lines are seen in the picture about as well as by the best, the best first."""
-    in_time = (one for one in cameras if not search.is_out_of_time)  # who asks says that it ended early
-    likelihood = [likelihood_of_place(search.grey, grid.target, camera, search.curves) for camera, grid in in_time]
+    # who asks says that it ended early
+    in_time = ((grid.target, camera) for camera, grid in cameras if not search.is_out_of_time)
+    likelihood = likelihoods_of_places(search.grey, in_time, search.curves)
     order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST]
     best = likelihood[order[0]] if likelihood else 0.0
     return [cameras[row] for row in order if likelihood[row] >= min(_LIKELY * best, best)]

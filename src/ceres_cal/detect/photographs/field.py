@@ -34,7 +34,7 @@ from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import Auto, SearchResult, SeveralWaysError, search
-from ceres_cal.detect.strokes import lengths_of_signs
+from ceres_cal.detect.strokes import Strokes, strokes_of_signs
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
@@ -212,16 +212,19 @@ def _together(
     return {name: result, **{path: SearchResult(None, reason) for path, reason in one.left_out}}
 
 
-def _signs(grey: Array32, *, is_near: bool) -> Iterator[bool]:
-    """Whether a photograph's lines are darker than its floor: the likelier first, the other where it may be, too."""
+def _signs(grey: Array32, *, is_near: bool) -> Iterator[tuple[bool, Strokes | None]]:
+    """Whether a photograph's lines are darker than its floor, and its strokes that are so, where they were looked for:
+    the likelier first, the other where it may be, too.
+    """
     nearly = 0.5  # of the strokes' length: seams and cables may be longer than the lines
     if is_near:
-        yield False  # a start that is near finds light ones sooner than strokes tell
-    light, dark = lengths_of_signs(grey)
+        yield False, None  # a start that is near finds light ones sooner than strokes tell
+    strokes = strokes_of_signs(grey)
+    light, dark = (one.total_px for one in strokes)
     if not is_near:
-        yield dark > light
+        yield dark > light, strokes[dark > light]
     if (dark > light) if is_near else min(dark, light) > nearly * max(dark, light):
-        yield is_near or dark <= light
+        yield is_near or dark <= light, strokes[is_near or dark <= light]
 
 
 def _found(prior: Prior, followed: Followed) -> Prior:
@@ -285,9 +288,9 @@ def _looked_for(
     tried: list[SearchResult] = []
     for start in starts:
         at = start.followed if isinstance(start, SearchResult) else start
-        signs = [start.darker] if isinstance(start, SearchResult) else _signs(grey, is_near=isinstance(start, Camera))
-        for dark in signs:
-            one = _looked_from(negative(grey) if dark else grey, target, painted, at, where)
+        before = [(start.darker, None)] if isinstance(start, SearchResult) else None
+        for dark, strokes in before or _signs(grey, is_near=isinstance(start, Camera)):
+            one = _looked_from(negative(grey) if dark else grey, target, painted, at, where, strokes)
             tried.append(replace(one, darker=dark))
             if one.followed is not None:
                 return tried[-1]
@@ -300,6 +303,7 @@ def _looked_from(
     painted: tuple[str, ...],
     start: Camera | Clicks | Auto | Followed | None,
     where: tuple[Path, FieldOptions],
+    strokes: Strokes | None,
 ) -> SearchResult:
     """The field from where another image showed it, or from the start that was given, or from none."""
     path, options = where
@@ -307,7 +311,7 @@ def _looked_from(
     if isinstance(start, Auto):
         with naming(path):
             try:
-                return search(grey, target, painted, replace(start, lengths=lengths))
+                return search(grey, target, painted, replace(start, lengths=lengths), strokes)
             except SeveralWaysError as error:
                 if options.refused is not None:
                     options.refused(path, SearchResult(None, str(error), seen=error.seen))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
@@ -27,17 +27,28 @@ _LACKS = 0.5
 
 
 def _seen(
-    grey: Array32, target: Target, camera: Camera, curves: Collection[str], share_of_image: float = _REACH
+    grey: Array32,
+    target: Target,
+    camera: Camera,
+    curves: Collection[str],
+    share_of_image: float = _REACH,
+    known: dict[float, float] | None = None,
 ) -> tuple[Array, Array]:
-    """Of each of the target's C curves: places in view, and those of them that have paint nearby."""
+    """Of each of the target's C curves: places in view, and those of them that have paint nearby.
+
+    Args:
+        known: how bright lines laid anywhere are by chance, by their width.
+    """
     course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
     count = len(target.curves)
     if len(course) < _FEWEST:
         return np.zeros(count), np.zeros(count)
     reach_px = 0.5 * share_of_image * float(np.hypot(*camera.image_size))
-    anywhere = _laid_anywhere(camera.image_size, float(np.median(course.width_px)))
-    by_chance = float(np.quantile(search(grey, anywhere, reach_px)[1], 1.0 - BY_CHANCE))
-    bright = search(grey, course, reach_px)[1] > by_chance
+    width_px, known = float(np.round(np.median(course.width_px))), {} if known is None else known
+    if width_px not in known:
+        anywhere = search(grey, _laid_anywhere(camera.image_size, width_px), reach_px)[1]
+        known[width_px] = float(np.quantile(anywhere, 1.0 - BY_CHANCE))
+    bright = search(grey, course, reach_px)[1] > known[width_px]
     places, painted = (np.bincount(course.curve, one, count) for one in (np.ones(len(course)), bright))
     return places.astype(float), painted.astype(float)
 
@@ -95,14 +106,21 @@ def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     return tuple(name for name in curves if sure[target.curve_index[name]])
 
 
-def likelihood_of_place(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> float:
-    """How much likelier the target is there than elsewhere, by where its own lines are seen in the picture itself.
+def likelihoods_of_places(
+    grey: Array32, places: Iterable[tuple[Target, Camera]], curves: Collection[str]
+) -> list[float]:
+    """How much likelier the target is in each of some places than elsewhere, by where its own lines are seen in the
+    picture itself.
 
     The log-likelihood ratio of so many places with paint, less what tells that the curves do not share one share: of a
     target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere. Optional parts
     that are not seen say nothing.
     """
-    places, bright = _seen(grey, target, camera, curves)
+    known: dict[float, float] = {}
+    return [_likelihood(target, *_seen(grey, target, camera, curves, known=known)) for target, camera in places]
+
+
+def _likelihood(target: Target, places: Array, bright: Array) -> float:
     lacking = _lacking(target, places, bright)
     painted = np.array([name not in lacking for name in target.curves], dtype=bool)
     places, bright = places[painted], bright[painted]

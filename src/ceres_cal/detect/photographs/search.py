@@ -32,6 +32,7 @@ from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.grid import grid_of
 from ceres_cal.detect.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, PointHints
+from ceres_cal.detect.strokes import Strokes
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.targets import Target
@@ -91,7 +92,9 @@ class SearchResult(Frozen):
     darker: bool = False
 
 
-def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -> SearchResult:
+def search(
+    grey: Array32, target: Target, curves: Collection[str], auto: Auto, strokes: Strokes | None = None
+) -> SearchResult:
     """Find a target's painted curves in a photograph and follow them.
 
     The picture must show straight lines at right angles, two one way and one across at least; whatever else the target
@@ -99,12 +102,15 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     camera looks down, at up to 55 degrees from the upright. A mirrored photograph of a field that is its own mirror
     image looks like another one's: it cannot be told, and is not.
 
+    Args:
+        strokes: of the photograph, where they were looked for already.
+
     Raises:
         SeveralWaysError: the photograph can be taken for the field in several ways, and nothing says which.
         InputError: the target has too few straight lines, or nothing that `auto.facing` names.
     """
     require_sides(auto.facing, target, curves)
-    problem = prepare_search(grey, target, curves, auto.lengths)
+    problem = prepare_search(grey, target, curves, auto.lengths, strokes)
     result = _search_about(problem, auto)
     moved = off_centre(problem) if result.followed is None else problem
     if moved is problem:

@@ -114,7 +114,7 @@ def _rotations() -> Array:
     rolls = np.array([rotation_exp([0.0, 0.0, roll]) for roll in np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))])
     ways = [(tilt, 2.0 * np.pi * number / count) for tilt, count in _RINGS_DEG for number in range(count)]
     leans = [rotation_exp(np.deg2rad(tilt) * np.array([np.cos(way), np.sin(way), 0.0])) for tilt, way in ways]
-    return (np.array(leans)[:, None] @ _DOWN @ rolls).reshape(-1, 3, 3).astype(np.float32)
+    return np.asarray((np.array(leans)[:, None] @ _DOWN @ rolls).reshape(-1, 3, 3), dtype=np.float32)
 
 
 def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Array, Array]:
