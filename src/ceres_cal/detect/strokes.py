@@ -169,9 +169,10 @@ def _ridge_points(grey: Array32) -> _Ridge:
 
 def _bends(soft: Array32) -> tuple[Array32, Array32, Array32, Array32]:
     """Second derivatives by x, by y and by both, and the lower one of their eigenvalues."""
-    orders, quarter = ((2, 0), (0, 2), (1, 1)), 0.25
-    xx, yy, xy = (_single(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3, scale=quarter)) for order in orders)
-    return xx, yy, xy, _single(0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2))
+    orders = ((2, 0), (0, 2), (1, 1))
+    xx, yy, xy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in orders)
+    lower = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    return _single(xx), _single(yy), _single(xy), _single(lower)
 
 
 def _smoothed(grey: Array32, sigma_px: float) -> Array32:
