@@ -129,6 +129,8 @@ class Information(Frozen):
 
     def given(self, keys: Sequence[Key]) -> Information:
         """About some of the numbers, with all others held where they are."""
+        if tuple(keys) == self.keys:
+            return self
         at = self.columns(keys)
         return Information(tuple(keys), self.matrix[at[:, None], at])
 

@@ -83,14 +83,14 @@ class Outlook(Frozen):
         slopes[:, :, whole.columns(self.keys)] = self.slopes
         along, sd = np.tensordot(slopes, spread.covariance, axes=1), spread.sd
         variances = np.sum(along * slopes, axis=(1, 2))
-        along = along.reshape(-1, len(whole.keys))
+        along = np.ascontiguousarray(along.reshape(-1, len(whole.keys)).T)
 
         def after(added: Information) -> Errors:
             told = np.flatnonzero(np.diagonal(added.matrix))  # of many nodes of a surface a measurement sees a few
             root = thin_root(added.matrix[np.ix_(told, told)], sd[told])
             covariance = spread.covariance[np.ix_(told, told)]
             half = np.linalg.inv(np.linalg.cholesky(np.eye(len(root)) + root @ covariance @ root.T))
-            taken = np.sum((along[:, told] @ (half @ root).T) ** 2, axis=1)
+            taken = np.sum(((half @ root) @ along[told]) ** 2, axis=0)
             return _errors_of(variances - np.sum(taken.reshape(len(variances), -1), axis=1))
 
         return list(map(after, informations))
