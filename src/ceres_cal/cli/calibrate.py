@@ -202,10 +202,8 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
     from ceres_cal.problem.parameters import Options
     from ceres_cal.problem.structure import dimensions_of
 
-    parsed |= {
-        "lens": args.lens or _AUTO,
-        "terms": tuple(arguments.parse_names(args.terms)),
-    }  # powers alone make radial
+    terms = tuple(arguments.parse_names(args.terms))
+    parsed |= {"lens": args.lens or _AUTO, "terms": terms}  # powers alone make radial
     lengths, drawn = arguments.parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
     owners = {"station": observations.stations, "camera": observations.cameras}
     priors = arguments.parse_priors(args.prior, owners, Options(**parsed))

@@ -216,23 +216,19 @@ def distortion(material: Material, name: str) -> Figure:
     reach = float(seen.max()) if len(seen) else 0.0
     terms = [powered(term) for term in camera.lens.formula.split(" ")]
     model = " ".join(terms) if camera.lens.formula else f"the {camera.lens.kind} lens"
-
     steps = np.linspace(0.0, camera.corner_radius, _TABLE_STEPS + 1)[1:]
-    table_rows = zip(steps.tolist(), ideal_radii(camera, steps).tolist(), strict=True)
+    rows = (_row(*radii) for radii in zip(steps.tolist(), ideal_radii(camera, steps).tolist(), strict=True))
     return Figure(
         f"lens-{number_of(material, name)}",
         f"The distortion curve{owner_suffix(material, name)}",
         f"Radius of a pixel from the principal point, measured (horizontal) and without distortion (vertical), "
         f"{model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px. The dotted part is extrapolated.",
         lambda axes, _: draw_distortion(axes, camera, reach),
-        Table(
-            ("r, px", "r', px", "r' - r, px", "r' / r"),
-            tuple((f"{r:.1f}", *_row(r, ideal_radius)) for r, ideal_radius in table_rows),
-        ),
+        Table(("r, px", "r', px", "r' - r, px", "r' / r"), tuple(rows)),
     )
 
 
 def _row(r: float, ideal: float) -> tuple[str, ...]:
     if not np.isfinite(ideal):
-        return ("none", "", "")
-    return (f"{ideal:.2f}", f"{ideal - r:+.2f}", f"{ideal / r:.4f}")
+        return f"{r:.1f}", "none", "", ""
+    return f"{r:.1f}", f"{ideal:.2f}", f"{ideal - r:+.2f}", f"{ideal / r:.4f}"
