@@ -111,7 +111,9 @@ def refine(
         lacking: parts that this field is known to lack.
     """
     tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
-    return tracker.told(tracker.followed(camera, tracker.measured(camera)))
+    lines = tracker.measured(camera)
+    tracker = replace(tracker, is_even=lines.is_even)  # the picture has coma, or none, wherever its lines are now
+    return tracker.told(tracker.followed(camera, lines))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +128,7 @@ class _Tracker:
     reached: list[Followed] = field(default_factory=list)
     known: list[tuple[Camera, tuple[object, ...], Any]] = field(default_factory=list)
     rest_px: float = _AT_REST_PX
+    is_even: bool = False
 
     def followed(self, camera: Camera, lines: Lines) -> Followed:
         """What was measured from a camera."""
@@ -393,6 +396,7 @@ class _Tracker:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
     def measured(self, camera: Camera, *, is_even: bool = False) -> Lines:
+        is_even = is_even or self.is_even
         return self._once(camera, ("lines", is_even), lambda: self._measured(camera, is_even))
 
     def _measured(self, camera: Camera, is_even: bool) -> Lines:
