@@ -172,8 +172,23 @@ def test_given_and_without() -> None:
     assert prior.given([]).residuals(estimate).shape == (0,)
 
 
+@given(st.integers(0, 2**31))
+def test_given_where_an_estimate_has_the_others(seed: int) -> None:
+    """As the whole prior rises from its least with those held there, in whichever way the rest moves."""
+    estimate, rng = estimated({"field": Tolerance(lines_m=0.01)}), np.random.default_rng(seed)
+    prior = known_prior(estimate, seed)
+    small = {**SIZES, "rad": 1e-5}  # turns one after another are not their sum
+    sizes = np.array([small.get(key.unit, 1e-2) for key in prior.keys])
+    held = moved(estimate, prior.keys, sizes * rng.standard_normal(len(prior.keys)))
+    free = [key for number, key in enumerate(prior.keys) if number % 3]
+    given = prior.given(free, held)
+    steps = sizes[prior.information.columns(free)] * rng.standard_normal((2, len(free)))
+    costs = np.array([[one.cost(moved(held, free, step)) for step in steps] for one in (prior, given)])
+    assert costs[0, 1] - costs[0, 0] == pytest.approx(costs[1, 1] - costs[1, 0], rel=1e-2, abs=1e-2)
+
+
 def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
-    """The other numbers of the prior still count, with those held at their mean; what is known uses up no equation."""
+    """The other numbers of the prior still count, with those held as they are; what is known uses up no equation."""
     estimate, seen = estimated(), observed()
     options = Options(lens="radial", usual_camera=False, fixed={"cx": 651.3})
     prior = known_prior(estimate)

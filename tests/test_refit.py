@@ -21,6 +21,7 @@ from accuracy.moves import (
     sigmas_off,
     thinned,
     truth_of,
+    weakly_known,
 )
 from accuracy.moves import calibrated as calibrated_at_home
 from accuracy.scenes import FIELD
@@ -326,7 +327,7 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
     sd = np.array([posterior.sd_of(*key[:3]) for key in left])
     old = np.array([before.sd_of(*key[:3]) for key in left])
     assert np.all(np.abs(difference(result.estimate, calibration.estimate, left)) < 4.0 * old)
-    assert np.all(sd < 1.12 * old)  # 1.10 of phi: a refit takes one normal distribution in place of a mixture
+    assert np.all(sd < 1.2 * old)  # 1.14 of phi: a refit takes one normal distribution in place of a mixture
     shift_m, turn = movement(result.estimate.stations["right"].cam_from_world, pose)
     assert shift_m < 0.05 and turn < 0.01  # 0.010 m, 0.0017 rad
     held = refit(calibration, observed, moved=["right"], options=RefitOptions(hold_others=True))
@@ -368,3 +369,11 @@ def test_strays_are_neither_another_zoom_nor_mirrored_labels(
     curves_now = replace(few.curves, pixels=curve_pixels)
     result = refit(calibration, replace(few, points=replace(few.points, pixels=pixels), curves=curves_now))
     assert np.max(sigmas_off(result, truth_of(result, MOVED))) < MOST_SIGMA
+
+
+@pytest.mark.parametrize("seed", [0, 2, 9])
+def test_what_a_refit_states_holds_where_phi_is_hardly_known(seed: int) -> None:
+    """Also at robot height, where one normal distribution in place of a bent valley was 7 standard deviations off."""
+    found, errors = weakly_known(seed)
+    assert "overhead" in found.uncertainty.posterior.followed
+    assert max(float(np.max(off / radius)) for off, radius in errors.values()) < 2.0  # at most 1.4 of 40 measured

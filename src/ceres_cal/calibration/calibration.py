@@ -221,7 +221,7 @@ class Calibration(Frozen):
 
     def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
         """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
-        return GaussianPrior.about(self.uncertainty.posterior.information.marginal(keys), self.estimate)
+        return GaussianPrior.about(self.uncertainty.posterior.normal.marginal(keys), self.estimate)
 
     @property
     def rms_px(self) -> float:

@@ -83,8 +83,8 @@ def _tested(a: Calibration, b: Calibration, keys: Sequence[Key], off: Array, oth
         return {}
     first, second = (c.uncertainty.posterior for c in (a, b))
     apart = contrast(
-        NormalDistribution(first.information.marginal(keys), np.zeros(len(keys)), first.degrees_of_freedom),
-        NormalDistribution(second.information.marginal(keys), -off, second.degrees_of_freedom),
+        NormalDistribution(first.normal.marginal(keys), np.zeros(len(keys)), first.degrees_of_freedom),
+        NormalDistribution(second.normal.marginal(keys), -off, second.degrees_of_freedom),
         keys,
     )
     if not apart.degrees:

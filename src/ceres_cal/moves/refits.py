@@ -184,8 +184,8 @@ def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
 
 def _require_known(plan: RefitPlan, result: Calibration) -> None:
     """Raise DegenerateError where the observations leave a pose open."""
-    posterior = result.uncertainty.posterior
-    for key, sd in zip(posterior.keys, posterior.sd.tolist(), strict=True):
+    across = result.uncertainty.posterior.across
+    for key, sd in zip(across.keys, across.spread.sd.tolist(), strict=True):
         if key.kind == "station" and key.owner in plan.moved and not np.isfinite(sd):
             raise DegenerateError(
                 f"station {key.owner!r}: the observations do not determine its {key.quantity.replace('_', ' ')}: "

@@ -143,7 +143,8 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
 
     others, keys = [key for key in posterior.keys if key != along.keys[0]], along.keys[1:]
     held = (i.less(posterior.stated).given(others) for i in (posterior.information, posterior.by_model))
-    factor, excess = _excess(*(one.marginal(keys).spread.covariance for one in held))
+    known, by_model = (one.marginal(keys) for one in held)
+    factor, excess = by_model.beyond(known.spread.covariance)
     there = [moved(estimate, along.keys, step) for step in along.steps]
     shifts = shifts_along(keys, camera, estimate, there, excess)
 
@@ -151,21 +152,6 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
         return posterior.wider(across, lambda seen: Information(keys, seen.matrix / factor).widened(own))
 
     return replace(along, information=tuple(map(wider, along.information, shifts)))
-
-
-def _excess(covariance: Array, of_model: Array) -> tuple[float, Array]:
-    """By which factor at least a covariance (K, K) is that of a model, and (S, K) whose products with themselves are
-    what it is more.
-    """
-    none = 1e-9  # share of the largest variance, in units of each number's own: rounding
-    unit = np.sqrt(np.maximum(np.diagonal(of_model), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(of_model / unit[:, None] / unit)
-    told = values > none * values[-1]
-    root = vectors[:, told] * np.sqrt(values[told])
-    back = vectors[:, told] / np.sqrt(values[told])
-    ratios, turned = np.linalg.eigh(back.T @ (covariance / unit[:, None] / unit) @ back)
-    least = float(max(ratios[0], none))
-    return least, (unit[:, None] * root @ turned * np.sqrt(ratios - least)).T
 
 
 def _is_lens(camera: Camera) -> bool:

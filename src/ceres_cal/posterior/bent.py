@@ -118,15 +118,9 @@ def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> N
         return None
     there = solution.estimate
     known = information(problem, there).shared
-    stated = sum(prior.cost(there) for prior in held.stated_at(there))
-    cost = (2.0 * solution.cost - stated) / inflation + stated + _cost_of_phi(camera, problem, there)
-    return Node(there, cost, known)
-
-
-def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
-    """What priors on phi alone add to twice the cost: a solve that holds phi leaves them out."""
-    own = [prior for prior in problem.priors if [key[:3] for key in prior.keys] == [("camera", camera, "phi")]]
-    return sum(prior.cost(estimate) for prior in own)
+    # A solve that holds phi leaves out what priors say of it.
+    of_held, stated = (sum(prior.cost(there) for prior in one.stated_at(there)) for one in (held, problem))
+    return Node(there, (2.0 * solution.cost - of_held) / inflation + stated, known)
 
 
 def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float, far: float) -> Iterator[Node]:

@@ -116,6 +116,17 @@ class Mixture(Frozen):
         reach = [np.max(np.abs(quantiles(*read, width)), axis=0) / width for width in (NORMAL_95, FARTHER)]
         return np.asarray(np.minimum(moments(*read), np.max(reach, axis=0)))
 
+    @property
+    def covariance(self) -> Array:
+        """(K, K) second moments about the estimate, of open valleys as far as they were followed; what is unknown in
+        components is left out.
+        """
+        every = ((one.keys, one.spread.covariance) for one in self.information)
+        within = np.array([over(over(matrix, keys, self.keys).T, keys, self.keys) for keys, matrix in every])
+        closed = replace(self, open_below=False, open_above=False)
+        weights, steps, known = closed.refined(self.steps, within[self.at])
+        return np.asarray(np.tensordot(weights, known, axes=1) + (weights * steps.T) @ steps)
+
     def bounds(self, half_width: float) -> Array:
         """(K, 2) beyond which, on either side, as much of it lies as of a normal variable beyond so many sigmas."""
         return np.column_stack(quantiles(*self.refined(self.steps, self.variances), half_width))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -27,8 +28,8 @@ class Posterior(Frozen):
     painted amiss, is not in it.
 
     Attributes:
-        information: about the P numbers that are shared: the normal distribution that a refit, a check and advice take,
-            as the normal equations have it, with the second moments of what else may be true.
+        information: about the P numbers that are shared: the normal distribution that advice takes, as the normal
+            equations have it, with the second moments of what else may be true. A refit and a check take `normal`.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         mixtures: camera -> what it and its stations may be, where its phi was followed along its profile; "" -> what
@@ -141,6 +142,24 @@ class Posterior(Frozen):
     def spread(self) -> Spread:
         """Covariance and unknown directions of the shared numbers."""
         return self.information.spread
+
+    @cached_property
+    def normal(self) -> Information:
+        """The normal distribution that stands for all of it where it is a prior: in every direction at least as wide as
+        the mixtures. By the normal equations alone other observations of a valley that bends as this one does would
+        agree with it at the estimate only, and seem to know phi.
+        """
+        whole = self.information
+        for mixture in self._read:
+            shifts = whole.marginal(mixture.keys).beyond(mixture.covariance, 1.0)[1]
+            whole = self.wider(whole, partial(Information.widened, shifts=over(shifts, mixture.keys, self.keys)))
+        return whole
+
+    @property
+    def across(self) -> Information:
+        """The information with phi held of cameras where it was followed: what goes with it may be as open."""
+        followed = {self.mixtures[name].keys[0] for name in self.followed}
+        return self.information.given([key for key in self.keys if key not in followed])
 
     @cached_property
     def covariance(self) -> Array:

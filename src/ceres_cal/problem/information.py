@@ -172,6 +172,15 @@ class Information(Frozen):
         left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
         return Information(self.keys, left.T @ left)
 
+    def beyond(self, covariance: Array, least: float | None = None) -> tuple[float, Array]:
+        """By which factor at least a covariance (K, K) is this one's, or the one that is given; and the shifts (S, K)
+        whose products with themselves are what it is more. Directions of which nothing is known count as wide enough.
+        """
+        ratios, turned = np.linalg.eigh(self.root @ covariance @ self.root.T)
+        factor = least if least is not None else float(max(np.min(ratios, initial=1.0), np.finfo(float).eps))
+        more = turned * np.sqrt(np.maximum(ratios - factor, 0.0))
+        return factor, (self.spread.covariance @ self.root.T @ more).T
+
     def beside(self, stated: Information, shifts: Array) -> Array:
         """(S, K) shifts that widen all of it as shifts (S, K) widen what is known beyond what was stated.
 

@@ -43,7 +43,7 @@ class GaussianPrior(Frozen):
     """A normal distribution of some intrinsics, stations and structure numbers.
 
     Attributes:
-        information: about its K numbers. mean: (K,) in the units of the keys; 0 for a turn.
+        information: about its K numbers. mean: (K,) in the units of the keys; of a turn from its rotation.
         rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
         is_usual: whether nobody stated it: it is what is usual of cameras, under a distribution with heavy tails, which
             gives way to observations that say otherwise.
@@ -78,10 +78,21 @@ class GaussianPrior(Frozen):
         """Whether it speaks of one camera's intrinsics alone."""
         return all(key[:2] == ("camera", camera) for key in self.keys)
 
-    def given(self, keys: Collection[Key]) -> GaussianPrior:
-        """What it says of those of its numbers that are among the keys, with all others held at their mean."""
+    def given(self, keys: Collection[Key], estimate: Estimate | None = None) -> GaussianPrior:
+        """What it says of those of its numbers that are among the keys, with all others held: where an estimate has
+        them, or else at their mean.
+        """
         own = self.information.among(keys)
-        return self if own == self.keys else self._with(self.information.given(own))
+        if own == self.keys:
+            return self
+        given = self._with(self.information.given(own))
+        names = () if estimate is None else estimate.structure.names
+        held = [key for key in self.keys if key not in own and (not key.is_structure or key.structure_name in names)]
+        across = self.information.matrix[np.ix_(self.information.columns(own), self.information.columns(held))]
+        if estimate is None or not np.any(across):
+            return given
+        off = self._with(self.information.given(held)).offsets(estimate)
+        return replace(given, mean=given.mean - given.information.inverse @ across @ off)
 
     def without(self, keys: Collection[Key]) -> GaussianPrior:
         """The prior with some numbers integrated out: nothing is known of them any more."""
@@ -97,7 +108,7 @@ class GaussianPrior(Frozen):
             turn = rotation_log(estimate.stations[name].cam_from_world.rotation @ rotation.T)
             for key, angle in zip(pose_keys("station", name)[3:], turn.tolist(), strict=True):
                 if key in self.keys:
-                    off[self.information.columns([key])] = angle
+                    off[self.information.columns([key])] += angle
         return logarithmic(off, self.mean)[0] if self.is_log else off
 
     def residuals(self, estimate: Estimate) -> Array:

@@ -98,11 +98,11 @@ class Problem(Frozen):
         return [prior.weighted_at(estimate) for prior in self.priors_of(estimate)]
 
     def stated_at(self, estimate: Estimate) -> list[GaussianPrior]:
-        """What the priors say of numbers that are free, with those that are held at their mean."""
+        """What the priors say of numbers that are free, with those that are held where the estimate has them."""
         if not self.priors:
             return []
         free = set(free_keys(estimate, self.layout, self.layout.placements))  # of placements nothing is known before
-        restricted = [prior.given(free) for prior in self.priors]
+        restricted = [prior.given(free, estimate) for prior in self.priors]
         return [prior for prior in restricted if prior.keys]
 
     def smooth_at(self, estimate: Estimate, camera: str) -> Iterator[GaussianPrior]:
