@@ -146,7 +146,7 @@ def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: 
     known, by_model = (one.marginal(keys) for one in held)
     factor, excess = by_model.beyond(known.spread.covariance)
     there = [moved(estimate, along.keys, step) for step in along.steps]
-    shifts = shifts_along(keys, camera, estimate, there, excess)
+    shifts = shifts_along(camera, estimate, known, excess, list(zip(there, along.information, strict=True)))
 
     def wider(across: Information, own: Array) -> Information:
         return posterior.wider(across, lambda seen: Information(keys, seen.matrix / factor).widened(own))

@@ -35,7 +35,7 @@ from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
-from ceres_cal.problem.information import Key
+from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.problem.reduced import ReducedInformation
@@ -97,11 +97,29 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[E
     return _following(shown, keys, nodes, [[one.ravel() for one in offsets] for offsets in others])
 
 
-def shifts_along(keys: Sequence[Key], camera: str, here: Estimate, nodes: Sequence[Estimate], shifts: Array) -> Array:
-    """(M, S, K) of numbers of M estimates, which show the same elsewhere as shifts (S, K) of one of them show."""
-    shown = list(_shown(keys, here, {camera: _places_of(here.cameras[camera])}))
-    slopes = [one.slopes(here, keys).reshape(-1, len(keys)) for _, one in shown]
-    return _following(shown, keys, nodes, [[slope @ shift for slope in slopes] for shift in shifts])
+def shifts_along(
+    camera: str, here: Estimate, known: Information, shifts: Array, nodes: Sequence[tuple[Estimate, Information]]
+) -> Array:
+    """(M, S, K) of numbers of M estimates, each with what is known of them there, which show on the floor what shifts
+    (S, K) of one estimate's show, each place as far as it is known; what no place shows stays where it is.
+    """
+    loosely = 0.1  # as in units of what is known at a node: shifts of ten sigmas that no place shows cost as one sigma
+    shown = [one for _, one in _shown(known.keys, here, {camera: _places_of(here.cameras[camera])})]
+
+    def slopes_at(there: Estimate) -> Array:
+        return np.concatenate([one.slopes(there, known.keys).reshape(-1, len(known.keys)) for one in shown])
+
+    slopes, found = slopes_at(here), np.zeros((len(nodes), *shifts.shape))
+    squares = np.sum((slopes @ known.spread.covariance) * slopes, axis=1).reshape(-1, 2).sum(axis=1)
+    sigma = np.sqrt(np.repeat(squares, 2))[:, None]
+    for number, (there, own) in enumerate(nodes):
+        rows = np.hstack([slopes_at(there), slopes @ shifts.T]) / sigma
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        sides = np.vstack([rows, np.hstack([loosely * own.root, np.zeros((len(own.root), len(shifts)))])])
+        sizes = natural_sizes(there, known.keys)
+        step = np.linalg.lstsq(sides[:, : len(sizes)] * sizes, sides[:, len(sizes) :], rcond=None)[0]
+        found[number] = (step * sizes[:, None]).T
+    return found
 
 
 def _following(
