@@ -216,5 +216,6 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
         mine = posterior.mixtures[name]
         nodes = [moved(estimate, mine.keys, step) for step in mine.steps]
         along = shifts_to_lenses(lenses, mine.keys[1:], nodes)
-        mixtures[name] = mine.shifted_also(weights, over(np.swapaxes(along, 0, 1), mine.keys[1:], mine.keys))
+        shifts = over(np.swapaxes(along, 0, 1), mine.keys[1:], mine.keys)
+        mixtures[name] = mine.shifted_also(weights, shifts, range(1, len(every)))
     return replace(wider, mixtures=mixtures)

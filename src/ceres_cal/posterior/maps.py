@@ -104,6 +104,7 @@ def located_by(station: str, pixels: Array, height_m: float) -> Functional:
     return Functional(
         lambda there: there.camera_at(station).locate(pixels, height_m),
         lambda there, keys: locate_slopes(there, keys, station, pixels, height_m),
+        tells_phi=height_m != 0.0,
     )
 
 
@@ -332,10 +333,12 @@ class Functional(Frozen):
 
     Attributes:
         values: by an estimate, (N, 2); NaN where nothing is shown. slopes: by it and some keys (K), (N, 2, K).
+        tells_phi: whether it changes with phi along a valley; places on the floor do not.
     """
 
     values: Callable[[Estimate], Array]
     slopes: Callable[[Estimate, Sequence[Key]], Array]
+    tells_phi: bool = True
 
 
 class Reading(Frozen):
@@ -407,9 +410,10 @@ def _of_components(mixture: Mixture, estimate: Estimate, shown: Functional, widt
 
 def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], shown: Functional) -> None:
     """Values (C, N, 2) of components that are another lens: by how much it shows them elsewhere than the component that
-    is alike but for it, wherever it shows anything.
+    is alike but for it, wherever it shows anything. What changes along a valley changes with a lens's phi, too, which
+    the valley has already: there the numbers follow it.
     """
-    if mixture.lenses:
+    if mixture.lenses and not (mixture.is_followed and shown.tells_phi):
         near = shown.values(lenses[0])
         off = [shown.values(lens) - near for lens in lenses]
         for component, (lens, alike) in mixture.lenses.items():
