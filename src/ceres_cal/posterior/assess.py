@@ -113,7 +113,7 @@ def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> P
     if ends is None:
         return posterior
     mixtures = {
-        name: mixture.with_information(lambda across: posterior.wider(across, ends.widened))
+        name: _scattered(mixture, name, estimate, posterior, over(ends.excesses, ends.keys, mixture.keys[1:]))
         for name, mixture in posterior.mixtures.items()
     }
     own = ends.beside(posterior.stated.over(posterior.keys).marginal(held)).mixture(posterior.information)
@@ -130,28 +130,39 @@ def _inflation(posterior: Posterior, camera: str) -> float:
 
 
 def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> Mixture:
-    """The valley as seen from the estimate, across it as wide as the data scatter with phi held.
-
-    By as much as all directions scatter more, those at a node do; beyond that its numbers scatter so that the same
-    places do. Numbers one by one tell nothing of places: the higher a node, the closer position and tilt go together.
+    """The valley as seen from the estimate, across it as wide as the data scatter with phi held: by as much as all
+    directions scatter more at the estimate, and beyond that so that the same places do.
     """
     stated_sd = dict(zip(posterior.keys, posterior.stated_sd.tolist(), strict=True))
     along = profile(camera, nodes, estimate, posterior.half_width, stated_sd)
     if posterior.by_model is None:
         return along
-    from ceres_cal.posterior.other_lenses import shifts_along
-
     others, keys = [key for key in posterior.keys if key != along.keys[0]], along.keys[1:]
     held = (i.less(posterior.stated).given(others) for i in (posterior.information, posterior.by_model))
     known, by_model = (one.marginal(keys) for one in held)
     factor, excess = by_model.beyond(known.spread.covariance)
+    return _scattered(along, camera, estimate, posterior, excess, factor)
+
+
+def _scattered(
+    along: Mixture, camera: str, estimate: Estimate, posterior: Posterior, shifts: Array, factor: float = 1.0
+) -> Mixture:
+    """A valley across which everything is so many times as wide, and its places scatter as shifts (S, K) of all numbers
+    but phi have them at the estimate.
+
+    Numbers one by one tell nothing of places: the higher a node, the closer position and tilt go together, and the less
+    a coefficient may move.
+    """
+    from ceres_cal.posterior.other_lenses import shifts_along
+
+    known, keys = posterior.across.marginal(along.keys[1:]), along.keys[1:]
     there = [moved(estimate, along.keys, step) for step in along.steps]
-    shifts = shifts_along(camera, estimate, known, excess, list(zip(there, along.information, strict=True)))
+    every = shifts_along(camera, estimate, known, shifts, list(zip(there, along.information, strict=True)))
 
     def wider(across: Information, own: Array) -> Information:
         return posterior.wider(across, lambda seen: Information(keys, seen.matrix / factor).widened(own))
 
-    return replace(along, information=tuple(map(wider, along.information, shifts)))
+    return replace(along, information=tuple(map(wider, along.information, every)))
 
 
 def _is_lens(camera: Camera) -> bool:
