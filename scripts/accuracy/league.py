@@ -3,7 +3,8 @@
 1, 2 and 4 cameras over a division B field; tilts of 0, 1, 3, 8 and 20 degrees; the lens chosen or named; with and
 without boards; with and without the height measured by tape (to 10 mm). Right is an answer, or one line that refuses;
 no warning of NumPy, at most five seconds of processor time, no number that is called "known" over 5 standard
-deviations off, no place over 2.5 of its stated 95 % radii off, and no standard deviation above that of its own prior.
+deviations off, no place over 2.5 of its stated 95 % radii off, no floor of which half is not known to 20 mm, and no
+standard deviation above that of its own prior.
 Exits with 1 where anything else comes out.
 """
 
@@ -41,7 +42,7 @@ from ceres_cal.simulate import (
     simulate,
 )
 
-MOST_SECONDS = 5.0
+MOST_SECONDS, MOST_FLOOR_MM = 5.0, 20.0
 NOISE_PX, TAPE_M = 0.3, 0.01
 _BOARD, _BOARDS = checkerboard(9, 6, 0.1), 5
 # Cameras -> where they hang (x, y), and how high, m: each sees its part of the field of 9 x 6 m and some of the next.
@@ -158,6 +159,10 @@ def _fault(calibration: Calibration, scene: Scene, priors: Sequence[Prior]) -> s
         return f"{which} is called known, {sigmas:.1f} sd off"
     if radii > MOST_RADII:
         return f"a place is {radii:.1f} radii off"
+    for name in scene.stations:
+        sd_mm = calibration.uncertainty.map_sd_mm(name, 0.0).sd_mm
+        if (median := float(np.nanmedian(sd_mm))) > MOST_FLOOR_MM:
+            return f"half of the floor that {name} sees is known to {median:.0f} mm only"
     for prior in priors:
         sd = calibration.uncertainty.verdict("station", prior.name, "height").sd
         said = (one for one in calibration.warnings if f"the stated height of station {prior.name!r}" in one)
