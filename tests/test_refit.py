@@ -377,3 +377,10 @@ def test_what_a_refit_states_holds_where_phi_is_hardly_known(seed: int) -> None:
     found, errors = weakly_known(seed)
     assert "overhead" in found.uncertainty.posterior.followed
     assert max(float(np.max(off / radius)) for off, radius in errors.values()) < 2.0  # at most 1.4 of 40 measured
+
+
+def test_how_far_a_camera_moved_is_not_said_where_its_height_is_not_known() -> None:
+    """Straight down a move of 5 cm came out as 5.3 m."""
+    found, _ = weakly_known(2)
+    assert found.refitted is not None and "mm" not in found.refitted.explanation
+    assert "(how far it moved is not known: its phi is not)" in found.refitted.explanation

@@ -34,7 +34,7 @@ from ceres_cal.moves.agreement import (
     require_posterior,
     require_stations,
 )
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, pose_candidates
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_words, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.problem.bundle import solve
@@ -181,7 +181,7 @@ def _checked(calibration: Calibration, observed: Observations, sight: Sights, le
         probability=apart.probability,
         statistic=apart.statistic,
         degrees=apart.degrees,
-        words=_words(holds, apart.probability, misfit, change),
+        words=_words(case, holds, apart.probability, misfit, change),
         change=change,
         misfit=replace(misfit, noise=(noise, noise)),
     )
@@ -238,7 +238,7 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
     return answer if misfit is None else replace(answer, misfit=misfit)
 
 
-def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -> str:
+def _words(case: _CheckCase, holds: bool, probability: float, misfit: Misfit, change: MapChange) -> str:
     many_outliers = 0.25
     worst_mm = change.maps[0].worst_mm if change.maps else np.nan  # of a station that sees none of a field
     if holds:
@@ -246,7 +246,8 @@ def _words(holds: bool, probability: float, misfit: Misfit, change: MapChange) -
         words = f"holds: no movement beyond what is known ({at_most}probability {probability:.2g})"
     else:
         shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
-        moved = f"moved by about {change.moved_mm:.1f} mm and {change.turned_deg:.3f} deg{shifts}"
+        before, camera = case.calibration.uncertainty.posterior, case.calibration.estimate.stations[case.name].camera
+        moved = moved_words(1e-3 * change.moved_mm, change.turned_deg, before, camera, "about ") + shifts
         words = f"no longer holds: {moved} (probability {probability:.1g})"
     count = misfit.points + misfit.curves + misfit.outliers
     if misfit.outliers > many_outliers * count:

@@ -16,6 +16,7 @@ from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import placement_costs
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Weighting
@@ -198,3 +199,10 @@ def movement(a: Pose, b: Pose) -> tuple[float, float]:
     sine = float(np.linalg.norm(a.rotation - b.rotation)) / np.sqrt(8.0)  # |a - b| = 2 sqrt 2 sin(angle / 2)
     angle = 2.0 * np.arcsin(min(sine, 1.0)) if cosine > -0.9 else np.arccos(np.clip(cosine, -1.0, 1.0))
     return float(np.linalg.norm(a.position - b.position)), float(angle)
+
+
+def moved_words(shift_m: float, turned_deg: float, before: Posterior, camera: str, about: str = "") -> str:
+    """How far a station of a camera moved, by what was known of it before."""
+    if camera in before.followed:  # its height goes with phi, which is known to 5 % at most
+        return f"turned by {about}{turned_deg:.3f} deg (how far it moved is not known: its phi is not)"
+    return f"moved by {about}{1e3 * shift_m:.1f} mm and {turned_deg:.3f} deg"

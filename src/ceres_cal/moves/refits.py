@@ -25,7 +25,7 @@ from ceres_cal.moves.explanations import (
     why_nothing_fits,
     zoomed_search,
 )
-from ceres_cal.moves.poses import PoseSearch, equations, movement, pose_candidates
+from ceres_cal.moves.poses import PoseSearch, equations, moved_words, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, make_plan, refit_problem
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
@@ -197,9 +197,9 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:
-    words, moves = [], movements(plan.calibration, result)
+    words, moves, known = [], movements(plan.calibration, result), plan.calibration.uncertainty.posterior
     for name in sorted(plan.moved):
-        how = "is new" if name not in moves else f"moved by {1e3 * moves[name][0]:.1f} mm and {moves[name][1]:.3f} deg"
+        how = moved_words(*moves[name], known, plan.stations[name]) if name in moves else "is new"
         words.append(f"station {name!r} {how}")
     if plan.what in ("zoom", "everything"):
         for name in sorted(plan.moved_cameras):
