@@ -384,3 +384,16 @@ def test_how_far_a_camera_moved_is_not_said_where_its_height_is_not_known() -> N
     found, _ = weakly_known(2)
     assert found.refitted is not None and "mm" not in found.refitted.explanation
     assert "(how far it moved is not known: its phi is not)" in found.refitted.explanation
+
+
+def test_a_refit_knows_the_lenses_that_predicted_as_well() -> None:
+    """From where each sees the new observations: beyond the outermost ones they show what they show."""
+    found, _ = weakly_known(3)
+    posterior = found.uncertainty.posterior
+    near, *others = posterior.lenses
+    assert others and sum(posterior.lens_weights) < 1.0
+    for other in others:
+        assert other.cameras["overhead"].lens != near.cameras["overhead"].lens
+        middle = np.array([[640.0, 480.0], [900.0, 300.0]])
+        gap = other.camera_at("overhead").locate(middle) - near.camera_at("overhead").locate(middle)
+        assert np.max(np.abs(gap)) < 5e-3  # 1 mm measured; metres were its pose the one before the move

@@ -28,9 +28,13 @@ from ceres_cal.moves.explanations import (
 from ceres_cal.moves.poses import PoseSearch, equations, moved_words, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, make_plan, refit_problem
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.posterior.assess import with_other_lenses
+from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import Estimate, Station
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.robust.other_minima import solved_soon
 from ceres_cal.start.initialise import Start
 
 # Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
@@ -92,7 +96,7 @@ def refit(
             raise
         raise SolutionError(f"{stated[0]}; or else {error}") from None
     _require_known(plan, result)
-    explanation = _explained(plan, result)
+    result, explanation = _with_other_lenses(plan, result), _explained(plan, result)
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
     if calibration.digest == observations.digest:
         seen = calibration.refitted.digests if calibration.refitted else ()
@@ -194,6 +198,32 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
     for name in plan.moved:
         if not np.all(np.isfinite(result.estimate.stations[name].cam_from_world.matrix)):
             raise SolutionError(f"station {name!r}: the solve ended nowhere: check labels and target dimensions")
+
+
+def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
+    """Wider by what the lenses that predicted as well before would say from where they see the new observations: one
+    picture tells a lens's numbers, and not which lens it is.
+    """
+    known = plan.calibration.uncertainty.posterior
+    if result.posterior is None or len(known.lenses) < 2:
+        return result
+    sights = gather_sights(plan.observations.part(*result.inlier_masks(plan.observations)))
+    problem, layout = refit_problem(plan, "pose-only", result.estimate)
+    followed = result.posterior.followed  # where a valley says what phi may be
+    free = {name: own[own == 0] if name not in followed else own[:0] for name, own in layout.free.items()}
+    layout, weighting = replace(layout, stations=plan.moved, free=free), Weighting(*result.fit.scales)
+    problem = replace(problem, sights=sights, layout=layout, priors=(), weighting=weighting)
+    others, weights = [], []
+    for lens, weight in zip(known.lenses[1:], known.lens_weights, strict=True):
+        cameras = {name: lens.cameras[name] for name in plan.moved_cameras}
+        # quiet: a lens that sees the new observations from nowhere is none
+        found = solved_soon(problem, replace(result.estimate, cameras={**result.cameras, **cameras}))
+        if found is not None:
+            others.append(found.estimate)
+            weights.append(weight)
+    reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in plan.moved_cameras}
+    lenses = OtherLenses(result.estimate, tuple(others), tuple(weights), reach_px)
+    return replace(result, posterior=with_other_lenses(result.posterior, result.estimate, lenses))
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:

@@ -156,6 +156,14 @@ class Posterior(Frozen):
         return whole
 
     @property
+    def lens_weights(self) -> tuple[float, ...]:
+        """The probability of each of the lenses beside the chosen one."""
+        mixture = self.mixture()
+        of_lens = np.array([lens for lens, _ in mixture.lenses.values()], dtype=np.int64)
+        weights = mixture.weights[np.array(list(mixture.lenses), dtype=np.int64)]
+        return tuple(np.bincount(of_lens, weights, max(len(self.lenses), 1))[1:].tolist())
+
+    @property
     def across(self) -> Information:
         """The information with phi held of cameras where it was followed: what goes with it may be as open."""
         followed = {self.mixtures[name].keys[0] for name in self.followed}
