@@ -286,6 +286,23 @@ def test_straight_from_above_the_floor_is_known_though_phi_is_not(seed: int) -> 
     assert floor.mean_mm < 4.0  # 1.2 and 2.5 measured; 22 of seed 2 by the scatter of each number alone, 7 was refused
 
 
+def test_a_valley_is_as_wide_across_at_each_node_as_where_it_was_asked() -> None:
+    """On the floor, but for its ends: where errors go together it is half as wide again as by the model."""
+    known = calibrated(0.0, 7).uncertainty
+    posterior, estimate = known.posterior, known.estimate
+    mixture, places = posterior.mixtures["overhead"], located_by("overhead", np.array([[300.0, 300.0]]), 0.0)
+    wide = posterior.across.spread.through(places.slopes(estimate, posterior.across.keys))
+    assert posterior.by_model is not None
+    narrow = posterior.by_model.given(posterior.across.keys).spread.through(
+        places.slopes(estimate, posterior.across.keys)
+    )
+    assert np.trace(wide[0]) > 1.3**2 * np.trace(narrow[0])
+    for step, own in zip(mixture.steps[3:-5], mixture.information[3:-5], strict=True):
+        there = moved(estimate, mixture.keys, step)
+        across = own.spread.through(places.slopes(there, own.keys))
+        assert np.sqrt(np.trace(across[0]) / np.trace(wide[0])) == pytest.approx(1.0, abs=0.2)
+
+
 def test_other_lenses_bend_as_the_chosen_one_does() -> None:
     """Half a field by one camera, 3 degrees off straight down: phi is known to 6 %, and goes with the height along a
     curve. Another lens that lies elsewhere on the curve moves nothing on the floor.

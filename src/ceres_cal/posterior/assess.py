@@ -155,7 +155,8 @@ def _scattered(
     """
     from ceres_cal.posterior.other_lenses import shifts_along
 
-    known, keys = posterior.across.marginal(along.keys[1:]), along.keys[1:]
+    keys, others = along.keys[1:], [key for key in posterior.keys if key != along.keys[0]]
+    known = posterior.information.given(others).marginal(keys)
     there = [moved(estimate, along.keys, step) for step in along.steps]
     every = shifts_along(camera, estimate, known, shifts, list(zip(there, along.information, strict=True)))
 
