@@ -225,6 +225,11 @@ class Evidence(Frozen):
     noise_ratio: float
 
     @property
+    def in_mm(self) -> tuple[Array, Array]:
+        """Its amounts (Q,) and their standard deviations (Q,), of lengths in mm."""
+        return 1e3 * self.score.amount, 1e3 * self.score.sd
+
+    @property
     def size(self) -> str:
         """Its effect in words."""
         px, mm, _ = self.effect

@@ -202,10 +202,10 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     """Wider by what the lenses that predicted as well before would say from where they see the new observations: one
-    picture tells a lens's numbers, and not which lens it is.
+    picture tells a lens's numbers, and not which lens it is. Of another zoom or iris nobody knows what they would say.
     """
     known = plan.calibration.uncertainty.posterior
-    if result.posterior is None or len(known.lenses) < 2:
+    if result.posterior is None or len(known.lenses) < 2 or plan.loosened(plan.what):
         return result
     sights = gather_sights(plan.observations.part(*result.inlier_masks(plan.observations)))
     problem, layout = refit_problem(plan, "pose-only", result.estimate)

@@ -100,7 +100,7 @@ def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> P
 
     How targets lie off their drawings bends nothing, and a board may have a thousand such numbers: they are held.
     """
-    followed = {posterior.mixtures[name].keys[0] for name in posterior.followed}
+    followed = posterior.followed_phi
     if not estimate.structure.dimensions:
         followed |= {key for key in posterior.keys if key.kind == "structure"}
         problem, estimate = problem.built_as(estimate)
@@ -216,7 +216,7 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
         return posterior
     from ceres_cal.posterior.other_lenses import counted, shifts_to_lenses
 
-    followed = {posterior.mixtures[name].keys[0] for name in posterior.followed}
+    followed = posterior.followed_phi
     # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
     keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
     weights = counted(lenses.weights)

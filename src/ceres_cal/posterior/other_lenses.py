@@ -20,7 +20,6 @@ lens is. By what the free numbers take up of them they are off.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -86,15 +85,26 @@ def counted(weights: Sequence[float]) -> Array:
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], nodes: Sequence[Estimate]) -> Array:
-    """(M, L, K) of numbers of M estimates, which follow each of the others.
+    """(M, L, K) of numbers of M estimates, which follow each of the others by least squares.
 
     Args:
         nodes: with the chosen lens, at its best or elsewhere in a valley along phi.
     """
-    shown = list(_shown(keys, lenses.near, lenses.pixels))
-    near = [one.values(lenses.near) for _, one in shown]
-    others = [[one.values(other) - at for (_, one), at in zip(shown, near, strict=True)] for other in lenses.others]
-    return _following(shown, keys, nodes, [[one.ravel() for one in offsets] for offsets in others])
+    followed = 1e-4  # of the largest singular value: directions that show less are not moved along
+    shown, found = list(_shown(keys, lenses.near, lenses.pixels)), np.zeros((len(nodes), len(lenses.others), len(keys)))
+    if not shown:
+        return found
+    near, *others = (
+        np.concatenate([weight * one.values(lens).ravel() for weight, one in shown])
+        for lens in (lenses.near, *lenses.others)
+    )
+    for number, there in enumerate(nodes):
+        slopes, sizes = _slopes_of(shown, keys, there), natural_sizes(there, keys)
+        for column, other in enumerate(others):
+            off = other - near
+            known = np.isfinite(slopes).all(axis=1) & np.isfinite(off)
+            found[number, column] = np.linalg.lstsq(slopes[known] * sizes, off[known], rcond=followed)[0] * sizes
+    return found
 
 
 def shifts_along(
@@ -104,16 +114,12 @@ def shifts_along(
     (S, K) of one estimate's show, each place as far as it is known; what no place shows stays where it is.
     """
     loosely = 0.1  # as in units of what is known at a node: shifts of ten sigmas that no place shows cost as one sigma
-    shown = [one for _, one in _shown(known.keys, here, {camera: _places_of(here.cameras[camera])})]
-
-    def slopes_at(there: Estimate) -> Array:
-        return np.concatenate([one.slopes(there, known.keys).reshape(-1, len(known.keys)) for one in shown])
-
-    slopes, found = slopes_at(here), np.zeros((len(nodes), *shifts.shape))
+    shown = list(_shown(known.keys, here, {camera: _places_of(here.cameras[camera])}))
+    slopes, found = _slopes_of(shown, known.keys, here), np.zeros((len(nodes), *shifts.shape))
     squares = np.sum((slopes @ known.spread.covariance) * slopes, axis=1).reshape(-1, 2).sum(axis=1)
     sigma = np.sqrt(np.repeat(squares, 2))[:, None]
     for number, (there, own) in enumerate(nodes):
-        rows = np.hstack([slopes_at(there), slopes @ shifts.T]) / sigma
+        rows = np.hstack([_slopes_of(shown, known.keys, there), slopes @ shifts.T]) / sigma
         rows = rows[np.isfinite(rows).all(axis=1)]
         sides = np.vstack([rows, np.hstack([loosely * own.root, np.zeros((len(own.root), len(shifts)))])])
         sizes = natural_sizes(there, known.keys)
@@ -122,23 +128,9 @@ def shifts_along(
     return found
 
 
-def _following(
-    shown: Sequence[tuple[float, Functional]], keys: Sequence[Key], nodes: Sequence[Estimate], offsets: Any
-) -> Array:
-    """(M, S, K) of numbers of M estimates, by which they show everything elsewhere by S offsets, by least squares."""
-    followed = 1e-4  # of the largest singular value: directions that show less are not moved along
-    shifts = np.zeros((len(nodes), len(offsets), len(keys)))
-    weight = np.repeat([one for one, _ in shown], [len(offset) for offset in offsets[0]] if len(offsets) else 0)
-    for number, there in enumerate(nodes if shown else ()):
-        sizes = natural_sizes(there, keys)
-        slopes = np.concatenate([one.slopes(there, keys).reshape(-1, len(keys)) for _, one in shown]) * sizes
-        for column, offset in enumerate(offsets):
-            off = np.concatenate(offset)
-            known = np.isfinite(slopes).all(axis=1) & np.isfinite(off)
-            weighed = weight[known]
-            step = np.linalg.lstsq(weighed[:, None] * slopes[known], weighed * off[known], rcond=followed)[0]
-            shifts[number, column] = step * sizes
-    return shifts
+def _slopes_of(shown: Sequence[tuple[float, Functional]], keys: Sequence[Key], there: Estimate) -> Array:
+    """(2 N, K) px of all that is shown, by each of the keys."""
+    return np.concatenate([weight * one.slopes(there, keys).reshape(-1, len(keys)) for weight, one in shown])
 
 
 def _shown(keys: Sequence[Key], near: Estimate, pixels: Mapping[str, Array]) -> Iterator[tuple[float, Functional]]:

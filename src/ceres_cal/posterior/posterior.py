@@ -63,6 +63,11 @@ class Posterior(Frozen):
         """Cameras whose phi was followed along its profile."""
         return tuple(name for name, mixture in self.mixtures.items() if mixture.is_followed)
 
+    @property
+    def followed_phi(self) -> frozenset[Key]:
+        """Their phi."""
+        return frozenset(self.mixtures[name].keys[0] for name in self.followed)
+
     def mixture(self, camera: str = "") -> Mixture:
         """What a camera and its stations may be, or everything together, but for cameras whose phi was followed."""
         found = self.mixtures.get(camera) or self.mixtures.get("")
@@ -166,8 +171,7 @@ class Posterior(Frozen):
     @property
     def across(self) -> Information:
         """The information with phi held of cameras where it was followed: what goes with it may be as open."""
-        followed = {self.mixtures[name].keys[0] for name in self.followed}
-        return self.information.given([key for key in self.keys if key not in followed])
+        return self.information.given([key for key in self.keys if key not in self.followed_phi])
 
     @cached_property
     def covariance(self) -> Array:

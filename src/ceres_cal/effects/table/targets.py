@@ -79,7 +79,7 @@ def _of_curve(evidence: Evidence) -> Words:
     name = evidence.score.subject
     target, _, feature = name.partition("/")
     curve = evidence.case.observations.targets[target].curves[feature]
-    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    mm, sd = evidence.in_mm
     advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
     if isinstance(curve, Arc):
         how = f"its centre x {mm[0]:+.1f}, y {mm[1]:+.1f} mm and its radius {mm[2]:+.1f} mm off"
@@ -97,7 +97,7 @@ def _of_curve(evidence: Evidence) -> Words:
 
 def _of_point(evidence: Evidence) -> Words:
     name = evidence.score.subject
-    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    mm, sd = evidence.in_mm
     return Words(
         f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn "
         f"({evidence.size})",
@@ -131,7 +131,7 @@ def _of_board(evidence: Evidence) -> Words:
     # Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
     clear = 2.0
     name = evidence.score.subject
-    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    mm, sd = evidence.in_mm
     further = [
         f"{words} {a:+.2f} ± {s:.2f} mm"
         for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
@@ -153,7 +153,7 @@ def _bowed(case: Case) -> Iterator[EffectColumns]:
 
 
 def _of_bow(evidence: Evidence) -> Words:
-    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    mm, sd = evidence.in_mm
     return Words(
         f"{evidence.score.subject}: its floor appears {_lower(mm[0])} ± {sd[0]:.1f} mm at its edges along x than "
         f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
@@ -170,7 +170,7 @@ def _sheared(case: Case) -> Iterator[EffectColumns]:
 
 
 def _of_shear(evidence: Evidence) -> Words:
-    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    mm, sd = evidence.in_mm
     return Words(
         f"{evidence.score.subject} is out of square: its edges lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves "
         f"({evidence.size})",
@@ -206,7 +206,7 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
 
 
 def _of_place(evidence: Evidence) -> Words:
-    mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+    mm, sd = evidence.in_mm
     return Words(
         f"{evidence.score.subject} the floor is {abs(mm[0]):.0f} ± {sd[0]:.0f} mm "
         f"{'higher' if mm[0] > 0.0 else 'lower'} than around it ({evidence.size})",
