@@ -219,9 +219,12 @@ class Calibration(Frozen):
         taking_part = every if new_data else self.inlier_masks(observations)
         return without_unsteadiness(problem, observations, self.estimate, taking_part, self.effects)
 
-    def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
-        """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
-        return GaussianPrior.about(self.uncertainty.posterior.normal.marginal(keys), self.estimate)
+    def prior_of(self, keys: Sequence[Key], *, of_lens: bool = False) -> GaussianPrior:
+        """What the posterior says of some numbers, all others integrated out, as the prior of the next solve; on demand
+        where the chosen lens is the right one.
+        """
+        known = self.uncertainty.posterior
+        return GaussianPrior.about((known.normal_of_lens if of_lens else known.normal).marginal(keys), self.estimate)
 
     @property
     def rms_px(self) -> float:

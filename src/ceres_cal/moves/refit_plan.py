@@ -165,7 +165,7 @@ def make_plan(
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
-    prior = carried_prior(calibration, observations, stays)
+    prior = carried_prior(calibration, observations, stays, of_lens=what in ("pose", "pose-only"))
     placed = {name: old[name] for name in old if name in stays}
     placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
     return RefitPlan(
@@ -196,17 +196,24 @@ def _turned(observations: Observations) -> Observations:
     return turned
 
 
-def carried_prior(calibration: Calibration, observations: Observations, stays: frozenset[str]) -> GaussianPrior:
+def carried_prior(
+    calibration: Calibration, observations: Observations, stays: frozenset[str], *, of_lens: bool = False
+) -> GaussianPrior:
     """What is known of intrinsics, structure and stations that stay, without these observations.
 
     The posterior of the calibration, all else integrated out. Where it has these same observations in it already, it is
-    what had been known before them: nothing counts twice.
+    what had been known before them: nothing counts twice. Nor do other lenses that predicted as well, where they are
+    asked one by one.
+
+    Args:
+        of_lens: what is known where the chosen lens is the right one.
     """
     if calibration.digest == observations.digest:
         before = calibration.refitted.prior if calibration.refitted is not None else None
         before = before or GaussianPrior(Information.nothing(), np.empty(0))
         return before.without([key for key in before.keys if not _is_kept(key, stays)])
-    return calibration.prior_of([key for key in calibration.uncertainty.posterior.keys if _is_kept(key, stays)])
+    kept = [key for key in calibration.uncertainty.posterior.keys if _is_kept(key, stays)]
+    return calibration.prior_of(kept, of_lens=of_lens)
 
 
 def _is_kept(key: Key, stays: frozenset[str]) -> bool:

@@ -213,16 +213,17 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     free = {name: own[own == 0] if name not in followed else own[:0] for name, own in layout.free.items()}
     layout, weighting = replace(layout, stations=plan.moved, free=free), Weighting(*result.fit.scales)
     problem = replace(problem, sights=sights, layout=layout, priors=(), weighting=weighting)
-    others, weights = [], []
-    for lens, weight in zip(known.lenses[1:], known.lens_weights, strict=True):
+    # Each with the numbers it had, the chosen one as well: what the new observations add is not what they differ by.
+    seen, weights = [], []
+    for lens, weight in zip(known.lenses, (1.0, *known.lens_weights), strict=True):
         cameras = {name: lens.cameras[name] for name in plan.moved_cameras}
         # quiet: a lens that sees the new observations from nowhere is none
         found = solved_soon(problem, replace(result.estimate, cameras={**result.cameras, **cameras}))
         if found is not None:
-            others.append(found.estimate)
+            seen.append(found.estimate)
             weights.append(weight)
     reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in plan.moved_cameras}
-    lenses = OtherLenses(result.estimate, tuple(others), tuple(weights), reach_px)
+    lenses = OtherLenses(seen[0], tuple(seen[1:]), tuple(weights[1:]), reach_px)
     return replace(result, posterior=with_other_lenses(result.posterior, result.estimate, lenses))
 
 

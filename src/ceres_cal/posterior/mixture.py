@@ -100,6 +100,17 @@ class Mixture(Frozen):
         """Whether phi was followed along its profile."""
         return bool(self.chains)
 
+    @property
+    def chosen(self) -> Mixture:
+        """What it is where the chosen lens is the right one."""
+        if not self.lenses:
+            return self
+        own = ~np.isin(np.arange(len(self.weights)), list(self.lenses))
+        place, weights = np.cumsum(own) - 1, self.weights[own] / self.weights[own].sum()
+        chains = tuple(Chain(place[chain.at], chain.roots) for chain in self.chains if own[chain.at].all())
+        numbers = {"weights": weights, "steps": self.steps[own], "at": self.at[own]}
+        return replace(self, **numbers, chains=chains, lenses={})
+
     @cached_property
     def variances(self) -> Array:
         """(C, K) within each component; 0 of what is held there, infinite where unknown."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -154,8 +154,18 @@ class Posterior(Frozen):
         the mixtures. By the normal equations alone other observations of a valley that bends as this one does would
         agree with it at the estimate only, and seem to know phi.
         """
-        whole = self.information
-        for mixture in self._read:
+        return self._as_wide_as(self.information, self._read)
+
+    @cached_property
+    def normal_of_lens(self) -> Information:
+        """The same where the chosen lens is the right one: for those who ask the other lenses themselves."""
+        if len(self.lenses) < 2:
+            return self.normal
+        alone = self.mixture().chosen
+        return self._as_wide_as(alone.information[alone.at[0]], (mixture.chosen for mixture in self._read))
+
+    def _as_wide_as(self, whole: Information, mixtures: Iterable[Mixture]) -> Information:
+        for mixture in mixtures:
             shifts = whole.marginal(mixture.keys).beyond(mixture.covariance, 1.0)[1]
             whole = self.wider(whole, partial(Information.widened, shifts=over(shifts, mixture.keys, self.keys)))
         return whole
