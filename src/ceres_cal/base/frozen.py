@@ -10,7 +10,7 @@ from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, fields
 from dataclasses import field as field
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast, dataclass_transform
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import did_you_mean
@@ -115,6 +115,23 @@ def replace(of: _T, /, **changes: Any) -> _T:
     if hasattr(made, "__post_init__"):
         made.__post_init__()
     return made
+
+
+class Rows(Frozen):
+    """N rows in columns side by side: arrays, or other rows. A number that stands alone is the same for all of them."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
+
+    def take(self, rows: Any) -> Self:
+        """Some rows only, by their numbers or by a mask."""
+        columns = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+        parts = {
+            name: column.take(rows) if isinstance(column, Rows) else column[rows]
+            for name, column in columns
+            if hasattr(column, "__len__")
+        }
+        return replace(self, **parts)
 
 
 _Row = TypeVar("_Row")

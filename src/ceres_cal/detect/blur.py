@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.frozen import Rows, replace
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import (
     LEAST_BLUR_PX,
@@ -29,7 +29,7 @@ _SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
 _OF_COMA = 0.4
 
 
-class Blur(Frozen):
+class Blur(Rows):
     """What makes the lines wider at N places.
 
     Attributes:
@@ -47,10 +47,6 @@ class Blur(Frozen):
     def usual_px(self) -> float:
         """Standard deviation of all that."""
         return float(np.sqrt(np.mean(self.blur_px**2 + self.smear_px**2 / 12.0)))
-
-    def take(self, rows: Mask | Indices) -> Blur:
-        """At these places only."""
-        return Blur(self.blur_px[rows], self.smear_px[rows], self.stretch, self.lean[rows])
 
     def fitted(self, windows: Windows, course: Course) -> Profiles:
         """What fits the windows of these places best."""

@@ -6,14 +6,14 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.arrays import Array, Indices32
+from ceres_cal.base.frozen import Rows
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, along_curve, along_track, curve_points, nearest_on_curve
 from ceres_cal.scene.targets import Target
 
 
-class Course(Frozen):
+class Course(Rows):
     """N places on painted curves as the camera should see them, curve after curve and in order along each.
 
     Attributes:
@@ -28,13 +28,6 @@ class Course(Frozen):
     normals: Array
     curvature: Array
     width_px: Array
-
-    def __len__(self) -> int:
-        return len(self.curve)
-
-    def take(self, rows: Mask | Indices) -> Course:
-        """These places only."""
-        return Course(**{name: column[rows] for name, column in vars(self).items()})
 
     @property
     def edges(self) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import Rows
 from ceres_cal.detect.blur import blur_of, no_blur, with_coma
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
@@ -51,7 +51,7 @@ _APART = 3
 _SCATTER_PX = np.concatenate([[0.0], np.geomspace(0.002, 1.0, 60)])
 
 
-class Lines(Frozen):
+class Lines(Rows):
     """What was measured of a course.
 
     Attributes:
@@ -77,11 +77,6 @@ class Lines(Frozen):
     def pixels(self) -> Array:
         """(N, 2) the paint's middle, NaN where it was not found."""
         return np.asarray(self.course.pixels + self.offset_px[:, None] * self.course.normals)
-
-    def take(self, rows: Mask) -> Lines:
-        """These places only."""
-        columns = {name: getattr(self, name)[rows] for name in ("found", "offset_px", "sigma_px", "contrast")}
-        return replace(self, course=self.course.take(rows), **columns)
 
     def edge(self, side: int) -> Array:
         """(N, 2) the paint's left (side 1) or right (-1) edge, NaN where it was not found.

@@ -20,8 +20,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices, Mask
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.arrays import Array, Array32, Mask
+from ceres_cal.base.frozen import Frozen, Rows
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
@@ -36,7 +36,7 @@ _STEPS = 6
 _TINY = 1e-9
 
 
-class Windows(Frozen):
+class Windows(Rows):
     """Pixels around N places.
 
     Attributes:
@@ -49,12 +49,8 @@ class Windows(Frozen):
     distance: Array
     inside: Mask
 
-    def take(self, rows: Indices) -> Windows:
-        """These places only."""
-        return Windows(self.values[rows], self.distance[rows], self.inside[rows])
 
-
-class Profiles(Frozen):
+class Profiles(Rows):
     """What fits the windows of N places best.
 
     Attributes:
@@ -68,10 +64,6 @@ class Profiles(Frozen):
     sigma_px: Array
     heights: Array
     noise: Array
-
-    def take(self, rows: Indices) -> Profiles:
-        """These places only."""
-        return Profiles(self.offset_px[rows], self.sigma_px[rows], self.heights[rows], self.noise[rows])
 
 
 class EdgeShape(Frozen, eq=True):

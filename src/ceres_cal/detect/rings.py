@@ -15,10 +15,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.frozen import Frozen, Rows
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
 from ceres_cal.detect.ring_centre import ring_centre
 from ceres_cal.observations import NO_POINTS, Curves, Observations, View
 from ceres_cal.scene.targets import Target, rings
@@ -213,7 +213,7 @@ def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], ex
 # ---- measuring ------------------------------------------------------------------------------------------------------
 
 
-class _Edges(Frozen):
+class _Edges(Rows):
     """Measured edges: number of the ring (from 0), pixels (N, 2), sigma_px (N,), radius from the centre (N,) px."""
 
     ring: Indices32
@@ -236,8 +236,8 @@ def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[_
         parts.append((np.full(len(angle[::every]), number, np.int32), *measured[:2]))
     ring, pixels, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
     radius = np.linalg.norm(pixels - centre, axis=1)
-    kept = _usual(ring, radius, sigma, np.arctan2(*(pixels - centre).T[::-1]))
-    return _Edges(ring[kept[0]], pixels[kept[0]], sigma[kept[0]] * kept[1], radius[kept[0]]), float(np.median(blurs))
+    kept, factor = _usual(ring, radius, sigma, np.arctan2(*(pixels - centre).T[::-1]))
+    return _Edges(ring, pixels, factor * sigma, radius).take(kept), float(np.median(blurs))
 
 
 def _measured_ring(
@@ -250,10 +250,9 @@ def _measured_ring(
     windows = cut_windows(grey, places, outward, -1.0 / radius, half_length_px, _HALF_WIDTH_PX)
     edge = np.zeros((len(angle), 1))
     inside = np.flatnonzero(windows.inside)
-    some = Windows(windows.values[inside], windows.distance[inside], windows.inside[inside])
     if not len(inside):
         return np.full((len(angle), 2), np.nan), np.full(len(angle), np.inf), np.nan
-    blur = fit_shape(some, edge[inside], EdgeShape(1.0)).blur_px
+    blur = fit_shape(windows.take(inside), edge[inside], EdgeShape(1.0)).blur_px
     fits = fit_profiles(windows, edge, blur, 0.5 * half_length_px)
     height = fits.heights[:, 0] * (1.0 if track.rises else -1.0)
     clear = height > np.maximum(_LEAST_CONTRAST * fits.noise, 0.3 * np.median(height[inside]))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.frozen import Frozen, Rows
 from ceres_cal.detect.images import negative
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
@@ -40,18 +40,11 @@ _BORDER_PX = 3
 _GAP_PX, _DENSE = 3, 0.5
 
 
-class Strokes(Frozen):
+class Strokes(Rows):
     """N strokes: their ends (N, 2, 2) px and how bright a ridge each is (N,), in grey levels per px squared."""
 
     ends: Array
     strength: Array
-
-    def __len__(self) -> int:
-        return len(self.ends)
-
-    def take(self, rows: Mask) -> Strokes:
-        """These only."""
-        return Strokes(self.ends[rows], self.strength[rows])
 
     @property
     def length_px(self) -> Array:

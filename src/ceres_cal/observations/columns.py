@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.frozen import Frozen, Rows
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.typed import take_types
 
@@ -98,7 +98,7 @@ TYPES: dict[str, type[np.generic]] = {
 }
 
 
-class Columns(Frozen):
+class Columns(Rows):
     """Columns of observations, read-only: index of the view, index into the target's names, pixel, its sigma."""
 
     view: Indices32
@@ -113,9 +113,6 @@ class Columns(Frozen):
             column = np.array(values, dtype=TYPES[name], order="C")  # the compiled kernels take no other order
             column.setflags(write=False)
             object.__setattr__(self, name, column)
-
-    def __len__(self) -> int:
-        return len(self.view)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self)})"

@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
-from ceres_cal.base.frozen import Frozen, cached_property, replace
+from ceres_cal.base.frozen import Frozen, Rows, cached_property, replace
 from ceres_cal.base.transforms import skews
 
 _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
 
 
-class Candidates(Frozen):
+class Candidates(Rows):
     """K cameras that may be: frame_from_cam (K, 3, 3), position (K, 3) m, logarithm of phi in px (K,), and one more
     coefficient of w, of r squared (K,).
     """
@@ -32,13 +32,6 @@ class Candidates(Frozen):
     def none(cls) -> Candidates:
         """Of which there are none."""
         return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
-
-    def __len__(self) -> int:
-        return len(self.rotations)
-
-    def take(self, numbers: Indices | Mask) -> Candidates:
-        """Some of them."""
-        return Candidates(*(values[numbers] for values in vars(self).values()))
 
     def moved(self, step: Array) -> Candidates:
         """By (K, 8): a turn, a shift, and what is added to the rest."""
