@@ -73,7 +73,7 @@ def solve_ours(corners: Corners) -> Answer:
     seconds = time.perf_counter() - start
     observations = corner_observations(corners)
     start = time.perf_counter()
-    initialise(observations, gather_sights(observations), options)
+    initialise(gather_sights(observations), options)
     initialise_seconds = time.perf_counter() - start
     camera, station = calibration.cameras["camera"], calibration.station("camera").cam_from_world
     poses = [station @ calibration.placements[str(view.placement)] for view in observations.views]
@@ -255,11 +255,11 @@ def uncertainty_share(frames: int, repeat: int) -> float:
         start = time.perf_counter()
         calibration = calibrate(observations, options)
         calibrated = time.perf_counter() - start
-        estimate, there = calibration.estimate, residuals(observations, sights, calibration.estimate)
+        estimate, there = calibration.estimate, residuals(sights, calibration.estimate)
         assert len(there.lengths[0])  # calibrate() has them at hand
         start = time.perf_counter()
         whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
-        reduced, scatter_at = information(whole, estimate), partial(measure_scatter, observations, whole, there)
+        reduced, scatter_at = information(whole, estimate), partial(measure_scatter, whole, there)
         _, posterior = assess(whole, estimate, reduced, np.inf, scatter_at)
         assessed = time.perf_counter() - start
         known = len(posterior.placements)  # works them all out

@@ -85,7 +85,7 @@ def test_bound_by_differences() -> None:
 
     def misfit(step: Array) -> Array:
         there = moved(trial.truth, keys, step)
-        off = residuals(trial.clean, sights, there)
+        off = residuals(sights, there)
         position = there.stations["overhead"].cam_from_world.position
         return np.concatenate([off.points.ravel() / 0.3, off.curves / 0.3, [position[2] / height]])
 

@@ -56,7 +56,7 @@ def start_of(name: str) -> Estimate:
     """The true estimate with phi 0.1 % off, moved by 0.2 mm and 0.2 mrad: even a redescending loss finds the end."""
     scene = SCENES[name]()
     observations, options = case(name)
-    start = initialise(observations, gather_sights(observations), options).estimate
+    start = initialise(gather_sights(observations), options).estimate
     moved = Pose.exp([2e-4, -1e-4, 2e-4, 2e-4, 1e-4, -2e-4])
     cameras = {key: replace(camera, phi=1.001 * camera.phi) for key, camera in scene.cameras.items()}
     stations = {key: Station(place.camera, moved @ place.cam_from_world) for key, place in scene.stations.items()}
@@ -124,7 +124,7 @@ class Dense:
         return replace(self.start, cameras=cameras, stations=stations, placements=placements)
 
     def rows(self, unknowns: Array) -> Array:
-        found = residuals(self.observations, self.sights, self.estimate(unknowns))
+        found = residuals(self.sights, self.estimate(unknowns))
         points = found.points / (self.weighting.point_scale * self.observations.points.sigma_px[:, None])
         curves = found.curves / (self.weighting.curve_scale * self.observations.curves.sigma_px)
         points *= self._bend(np.sum(points**2, axis=1))[:, None]
@@ -335,7 +335,7 @@ def test_phi_against_height_does_not_creep(seed: int) -> None:
     scene = field_scene(ssl_field("B"), {"c": scenes.camera("brown")}, {"c": Station("c", leaning)}, spacing_m=0.1)
     seen = simulate(scene, Disturbance(points_sigma_px=0.1, curves_sigma_px=0.1), seed).observations
     options = Options(lens="brown", coefficients=("k1", "k2"), usual_camera=False)
-    start = initialise(seen, gather_sights(seen), options).estimate
+    start = initialise(gather_sights(seen), options).estimate
     found = solve(problem_of(seen, options, Weighting(), start), start, is_near=False)
     assert found.converged and len(found.history) < 45
 

@@ -140,7 +140,7 @@ def test_of_very_many_observations_a_part_is_asked_and_all_of_a_whole_is_taken_o
 
     monkeypatch.setattr(competing, "compared_part", spied)
     of_some = calibrate(observations, RADIAL)
-    assert len(parts[0].observations.curves) < 0.9 * len(observations.curves)
+    assert len(parts[0].problem.observations.curves) < 0.9 * len(observations.curves)
     where = "all 24 frames" if frame is None else f"frame {frame!r}"
     assert wholes(of_some) == wholes(of_all) == {f"the whole of line 'HalfwayLine' in {where}"}
     assert [entry.row for entry in of_some.rejected] == [entry.row for entry in of_all.rejected]
@@ -288,7 +288,7 @@ def test_solving_without_a_line_needs_the_placements_that_are_left() -> None:
     kept = observations.points.view != 0
     others = problem.used(kept, np.zeros(0, dtype=bool))
     others = replace(others, layout=others.layout.of(others.sights.keys))
-    end = solve_robustly(others, observations, calibration.estimate)
+    end = solve_robustly(others, calibration.estimate)
     assert observations.views[0].placement not in end.problem.layout.placements
 
 
@@ -323,7 +323,7 @@ def test_features_of_different_targets_are_different_wholes() -> None:
     observations = simulate(every, NOISE, seed=0).observations
     target = np.array([view.target for view in observations.views])
     owner = target[np.concatenate([observations.points.view, observations.curves.view])]
-    kinds = [one for one in groups_of(observations, gather_sights(observations)) if isinstance(one, FeatureGroups)]
+    kinds = [one for one in groups_of(gather_sights(observations)) if isinstance(one, FeatureGroups)]
     assert len(kinds) == 2
     for wholes in kinds:
         assert all(len(set(owner[wholes.of == number])) == 1 for number in set(wholes.of.tolist()) - {-1})

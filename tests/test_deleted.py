@@ -33,11 +33,11 @@ class Scene:
     def fitted(self, used: Mask) -> Fitted:
         split = [len(self.observations.points)]
         some = self.problem.used(*np.split(used, split))
-        end = solve_robustly(some, self.observations, self.start.estimate, is_near=True)
+        end = solve_robustly(some, self.start.estimate, is_near=True)
         estimate = end.solution.estimate
-        there = residuals(self.observations, self.problem.sights, estimate)
+        there = residuals(self.problem.sights, estimate)
         reduced = information(some, estimate)
-        return Fitted(self.problem, self.observations, estimate, there, used, reduced)
+        return Fitted(self.problem, estimate, there, used, reduced)
 
     def lengths(self, fitted: Fitted) -> Array:
         every = np.full(self.count, np.nan)

@@ -347,7 +347,7 @@ def test_rows_without_a_residual_take_no_part() -> None:
     """A lens in the middle of its valley may not show them all: their scores would be no numbers."""
     observations = Observations.load(Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json")
     sights = gather_sights(observations)
-    there = residuals(observations, sights, initialise(observations, sights, Options(lens="radial")).estimate)
+    there = residuals(sights, initialise(sights, Options(lens="radial")).estimate)
     assert _shown(sights, there) is sights
     points = there.points.copy()
     points[5] = np.nan

@@ -57,8 +57,8 @@ def diagnosis(calibration: Calibration, observations: Observations) -> Diagnosis
 
 def linearised(observations: Observations, calibration: Calibration) -> Equations:
     sights = gather_sights(observations)
-    found = residuals(observations, sights, calibration.estimate)
-    return write_equations(observations, sights, calibration.estimate, found)
+    found = residuals(sights, calibration.estimate)
+    return write_equations(sights, calibration.estimate, found)
 
 
 @pytest.mark.parametrize("lens", usual.LENSES)
@@ -79,7 +79,7 @@ def test_rows_are_the_derivatives_of_the_residuals(lens: str) -> None:
         turned = Pose.exp(np.concatenate([change[-6:-3], np.zeros(3)]))
         pose = Pose(turned.rotation @ old.cam_from_world.rotation, old.cam_from_world.translation + change[-3:])
         at = replace(estimate, cameras={name: camera}, stations={station: replace(old, cam_from_world=pose)})
-        found = residuals(seen, sights, at)
+        found = residuals(sights, at)
         flat = np.concatenate(
             [np.column_stack([found.points, np.full(len(found.points), np.nan)])[:, :2].ravel(), found.curves]
         )
@@ -112,7 +112,7 @@ def test_columns_of_the_target_as_built_are_derivatives_too(
     points = len(observations.points)
 
     def residual(values: Array) -> Array:
-        there = residuals(observations, sights, replace(estimate, structure=structure.with_values(values)))
+        there = residuals(sights, replace(estimate, structure=structure.with_values(values)))
         x, y = np.pad(there.points, ((0, len(there.curves)), (0, 0))).T
         distance = np.pad(there.curves, (points, 0))
         at = equations.observation
@@ -165,7 +165,7 @@ def test_leverage_foretells_the_residual_without_the_observation() -> None:
     rest = {name: np.delete(column, row, axis=0) for name, column in vars(seen.curves).items()}
     without = calibrate(replace(seen, curves=replace(seen.curves, **rest)), options)
     sights = gather_sights(seen)
-    left_out = residuals(seen, sights, without.estimate).curves[row]
+    left_out = residuals(sights, without.estimate).curves[row]
     foretold = table.distance_px[chosen] / (1.0 - table.leverage[chosen])
     assert table.leverage[chosen] > 0.1  # 0.37
     assert left_out == pytest.approx(foretold, abs=2e-3)  # 3e-4: the model is not quite linear

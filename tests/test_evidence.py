@@ -155,15 +155,15 @@ def linearised(observations: Observations) -> Seen:
     options = Options(lens="radial", usual_camera=False, loss="trivial", noise_scale="stated")
     calibration = calibrate(observations, options)
     problem, estimate = calibration.problem(observations), calibration.estimate
-    there = residuals(observations, problem.sights, estimate)
-    equations = write_equations(observations, problem.sights, estimate, there)
+    there = residuals(problem.sights, estimate)
+    equations = write_equations(problem.sights, estimate, there)
     model = make_linear_model(
-        problem, estimate, equations, equation_weights(observations, Weighting(loss="trivial"), equations, there)
+        problem, estimate, equations, equation_weights(Weighting(loss="trivial"), equations, there)
     )
     taken = [model.private * (equations.sight == sight)[:, None] for sight in range(len(equations.bounds) - 1)]
     values, basis = np.linalg.eigh(sum(part @ part.T for part in (*taken, model.shared)))
     left = np.eye(len(equations)) - basis[:, values > 0.5] @ basis[:, values > 0.5].T
-    return Seen(model, Case(observations, problem, estimate, model), left, model.score, basis_of(left))
+    return Seen(model, Case(problem, estimate, model), left, model.score, basis_of(left))
 
 
 @pytest.fixture(scope="module")

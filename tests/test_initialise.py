@@ -36,7 +36,7 @@ CAMERA = Camera((1280, 960), 868.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 
 
 def start_of(observations: Observations, options: Options | None = None) -> Start:
-    return initialise(observations, gather_sights(observations), options or RADIAL)
+    return initialise(gather_sights(observations), options or RADIAL)
 
 
 def options_for(scene: Scene, **more: Any) -> Options:
@@ -78,7 +78,7 @@ def test_starts_are_near_the_truth(name: str, disturbance: Disturbance) -> None:
     for placement, pose in scene.placements.items():
         if placement != "rings":
             assert angle_deg(start.estimate.placements[placement], pose) < 10.0  # 5 degrees measured
-    found_residuals = residuals(observations, gather_sights(observations, predicted=True), start.estimate)
+    found_residuals = residuals(gather_sights(observations, predicted=True), start.estimate)
     lengths = np.concatenate([np.linalg.norm(found_residuals.points, axis=1), np.abs(found_residuals.curves)])
     assert np.all(np.isfinite(lengths))
     assert np.median(lengths) < 6.0

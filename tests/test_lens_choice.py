@@ -269,7 +269,7 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
         return replace(found, cost=np.inf, failed=True) if is_close and next(failing) else found
 
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
-    start = initialise(observations, gather_sights(observations), options)
+    start = initialise(gather_sights(observations), options)
     every = choose_lens(observations, Options(), start).among
     assert every is not None and every.others.others
     monkeypatch.setattr(seen, "solve", solved)
@@ -280,7 +280,7 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
 def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A solve that ran into another minimum is not the lens that predicts as well; the chosen one is there."""
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
-    start = initialise(observations, gather_sights(observations), options)
+    start = initialise(gather_sights(observations), options)
     chosen = choose_lens(observations, Options(), start)
     monkeypatch.setattr(seen, "_KEPT", 0.0)
     assert chosen.among is not None
@@ -341,9 +341,9 @@ def test_more_observations_are_asked_where_all_leave_the_same_in_all_views(monke
 def _normals(observations: Observations, calibration: Calibration) -> tuple[GroupNormals, Linearised]:
     """Of each sight, with the linear model that they follow from."""
     problem, estimate = calibration.problem(observations), calibration.estimate
-    there = residuals(observations, problem.sights, estimate)
-    equations = write_equations(observations, problem.sights, estimate, there)
-    weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
+    there = residuals(problem.sights, estimate)
+    equations = write_equations(problem.sights, estimate, there)
+    weights = equation_weights(problem.weighting, equations, there).within_sigma
     normals = group_normals(problem, estimate, problem.sights, problem.private)
     return normals, make_linear_model(problem, estimate, equations, weights)
 
@@ -358,8 +358,8 @@ def test_errors_without_a_placement_are_those_of_a_solve_without_it() -> None:
     others = calibrate(observations.part(kept, np.ones(0, bool)), calibration.options)
     placements = {**others.estimate.placements, str(out): estimate.placements[str(out)]}
     moved = replace(others.estimate, placements=placements)
-    fresh = residuals(observations, model.equations.sights, moved)
-    again = write_equations(observations, model.equations.sights, moved, fresh)
+    fresh = residuals(model.equations.sights, moved)
+    again = write_equations(model.equations.sights, moved, fresh)
     rows = np.array([observations.views[v].placement == out for v in model.equations.view])
     posed = replace(model, score=np.where(rows, model.weight * again.residual, 0.0)).placed_score
     number = int(model.equations.sight[rows][0])

@@ -120,8 +120,8 @@ def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:
     observations, options = simulation.observations, Options(lens="division", fixed={"k": -2.4e-7})
     truth = calibrate(observations, options).estimate
     sights = gather_sights(observations)
-    found = residuals(observations, sights, truth)
-    equations = write_equations(observations, sights, truth, found)
+    found = residuals(sights, truth)
+    equations = write_equations(sights, truth, found)
     vector = intrinsics_vector(truth.cameras["overhead"])
     assert not len(camera_optics(truth.cameras["overhead"]).form)  # none of the compiled ones
     for number, step in ((0, 1e-2), (4, 1e-5)):
@@ -130,7 +130,7 @@ def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:
             changed = vector.copy()
             changed[number] += sign * step
             cameras = {"overhead": with_intrinsics(truth.cameras["overhead"], changed)}
-            moved.append(residuals(observations, sights, replace(truth, cameras=cameras), found.feet))
+            moved.append(residuals(sights, replace(truth, cameras=cameras), found.feet))
         slope = (np.concatenate([moved[0].points.ravel(), moved[0].curves]) - np.concatenate(
             [moved[1].points.ravel(), moved[1].curves]
         )) / (2.0 * step)  # fmt: skip

@@ -114,7 +114,7 @@ def judged(points: dict[str, tuple[float, float, float]], pose: Pose) -> None:
     ).observations
     estimate = Estimate({"a": above}, {"a": Placed("a", pose)}, {}, EXACT)
     sights = gather_sights(seen)
-    require_possible(seen, sights, estimate, residuals(seen, sights, estimate))
+    require_possible(sights, estimate, residuals(sights, estimate))
 
 
 def turned_upwards(height_m: float) -> Pose:

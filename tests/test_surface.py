@@ -118,7 +118,7 @@ def test_fewer_observations_than_numbers_leave_a_cost_to_rely_on() -> None:
     """Rounding in what they leave open had made it thousands of times as large, and another one at each look."""
     seen = simulate(scenes.lines("brown"), Disturbance(curves_sigma_px=0.3), 1).observations
     options = Options(lens="spline", terms=("surface",), max_iterations=6)
-    start = initialise(seen, gather_sights(seen), options).estimate
+    start = initialise(gather_sights(seen), options).estimate
     problem = Problem(gather_sights(seen), make_layout(seen, options), options=options)
     assert problem.layout.size > 400 > 216 == problem.equations
     assert solve(problem, start, is_near=False).cost < 76.0  # 74.6 at its end

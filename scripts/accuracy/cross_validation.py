@@ -145,8 +145,8 @@ def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array
     """Lengths in px and mm of the residuals, (N + M, 2); what is not seen counts 10 sigma in px, NaN in mm."""
     unseen_sigma = 10.0  # what an observation counts that the fold's camera cannot show at all
     sights = gather_sights(observations).used(*np.split(rows, [len(observations.points)]))
-    there = residuals(observations, sights, estimate)
-    equations = write_equations(observations, sights, estimate, there)
+    there = residuals(sights, estimate)
+    equations = write_equations(sights, estimate, there)
     px = np.concatenate([np.linalg.norm(there.points, axis=1), np.abs(there.curves)])
     px = np.where(np.isfinite(px), px, unseen_sigma * column_of(observations, "sigma_px"))
     return np.column_stack([px, np.abs(error_mm(equations, equations.residual, len(px)))])

@@ -50,7 +50,7 @@ def field_lines(observations: Observations, camera: Camera) -> Iterator[str]:
 
 
 def marks(observations: Observations, calibration: Calibration) -> Iterator[str]:
-    found = residuals(observations, gather_sights(observations), calibration.estimate)
+    found = residuals(gather_sights(observations), calibration.estimate)
     rejected = {(entry.kind, entry.row) for entry in calibration.rejected}
     for row, (x, y) in enumerate(observations.points.pixels):
         if ("point", row) in rejected:

@@ -69,7 +69,7 @@ def left_px(options: Options, known: Observations, new: Observations) -> tuple[A
     calibration = calibrate(known, options)
     (answer,) = score(calibration, new).values()
     assert answer.solution is not None
-    there = residuals(new, sights_as_built(new, calibration), answer.solution.estimate)
+    there = residuals(sights_as_built(new, calibration), answer.solution.estimate)
     return there.lengths[0], answer.solution.inlier_masks(new)[0]
 
 

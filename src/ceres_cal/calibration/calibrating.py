@@ -148,7 +148,7 @@ def _chosen(task: Task, options: Options) -> Calibration:
     sights = gather_sights(task.observations)
     if options.lens == AUTO:
         return _of_any_lens(replace(task, chosen=True), sights, options)
-    return _of_lens(task, initialise(task.observations, sights, options), sights, options)
+    return _of_lens(task, initialise(sights, options), sights, options)
 
 
 def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
@@ -157,13 +157,13 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
     from ceres_cal.calibration.lens_forms import papers
 
     observations = task.observations
-    start = initialise(observations, sights, papers(options))
+    start = initialise(sights, papers(options))
     if options.closed_form_only:
         return _of_lens(task, start, sights, papers(options))
 
     def seen_with(one: Chosen) -> Explained:
         named = replace(one.options, priors=options.priors).with_first_power(len(sights))  # compared without priors
-        problem = problem_of(observations, sights, named, one.start.estimate)
+        problem = problem_of(sights, named, one.start.estimate)
         return explained(task, one.start, problem, one.built)
 
     chosen = choose_lens(observations, options, start)
@@ -209,18 +209,18 @@ def _part(bulk: Bulk, options: Options) -> Subset:
     from ceres_cal.calibration.lens_forms import papers
 
     part, given = bulk.part(), options if options.lens != AUTO else papers(options)
-    few, sights = part.observations, gather_sights(part.observations)
-    start = initialise(few, sights, given)
-    problem = problem_of(few, sights, given, start.estimate)
-    return bulk.part(bulk.standing_out(solve_robustly(problem, few, start.estimate, is_near=start.is_near)))
+    sights = gather_sights(part.observations)
+    start = initialise(sights, given)
+    problem = problem_of(sights, given, start.estimate)
+    return bulk.part(bulk.standing_out(solve_robustly(problem, start.estimate, is_near=start.is_near)))
 
 
 def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
     """With a lens that is named."""
     options = options.with_first_power(len(sights))
-    problem = problem_of(task.observations, sights, options, start.estimate)
+    problem = problem_of(sights, options, start.estimate)
     if options.closed_form_only:
-        return of_closed_form(start, task.observations, problem)
+        return of_closed_form(start, problem)
     return solved_from(task, start, problem)
 
 

@@ -217,7 +217,7 @@ class Calibration(Frozen):
         points, curves = len(observations.points), len(observations.curves)
         every = np.ones(points, dtype=bool), np.ones(curves, dtype=bool)
         taking_part = every if new_data else self.inlier_masks(observations)
-        return without_unsteadiness(problem, observations, self.estimate, taking_part, self.effects)
+        return without_unsteadiness(problem, self.estimate, taking_part, self.effects)
 
     def prior_of(self, keys: Sequence[Key], *, of_lens: bool = False) -> GaussianPrior:
         """What the posterior says of some numbers, all others integrated out, as the prior of the next solve; on demand

@@ -107,19 +107,19 @@ def compared_kinds(
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     most = most_rows if by_most else max(least_rows, int(share * observations.rows))
     few = thinned(observations, most, fewest_frames)
-    sights = built.held(gather_sights(few), few)
+    sights = built.held(gather_sights(few))
     require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
     tried = every
     while True:
-        end, used = _solved(few, options, sights, start, tried)
+        end, used = _solved(options, sights, start, tried)
         if options.as_built == "estimate" and not built.every:
-            built = estimate_as_built(end.problem, few, end)
+            built = estimate_as_built(end.problem, end)
             if built.every:
-                sights = built.held(sights, few)
-                end, used = _solved(few, options, sights, replace(end.estimate, structure=EXACT), [used])
-        seen = InlierRows(few, end, options, sights, built)
+                sights = built.held(sights)
+                end, used = _solved(options, sights, replace(end.estimate, structure=EXACT), [used])
+        seen = InlierRows(end, options, sights, built)
         compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)
@@ -131,18 +131,16 @@ def compared_kinds(
 _Found = tuple[RobustSolution, tuple[Form, ...]]
 
 
-def _solved(
-    observations: Observations, options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[Form, ...]]
-) -> _Found:
+def _solved(options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[Form, ...]]) -> _Found:
     """The robust solve with the first of these kinds that explains the observations, or with the one that does it best,
     up to where the noise is known well enough.
     """
 
     def solved(own: Options, from_nothing: bool) -> RobustSolution:
-        near = initialise(observations, sights, own).estimate if from_nothing else start
+        near = initialise(sights, own).estimate if from_nothing else start
         near = seen_through(near, own, profiles_of(near, sights))
-        problem = problem_of(observations, sights, own, near)
-        return solve_robustly(problem, observations, near, most_rounds=MOST_ROUNDS if from_nothing else 1)
+        problem = problem_of(sights, own, near)
+        return solve_robustly(problem, near, most_rounds=MOST_ROUNDS if from_nothing else 1)
 
     failure: CalibrationError | None = None
     found: list[_Found] = []
@@ -192,7 +190,7 @@ def _between_cells(seen: InlierRows, kind: Kind) -> float:
     """Mean square of residuals between cells over that within them; the x and y of points and each curve apart."""
     points, curves = seen.in_sigmas(kind.estimate)
     left = np.concatenate([points[:, 0], points[:, 1], curves])
-    cell = cells_of(seen.sights, seen.observations.cameras)
+    cell = cells_of(seen.sights, seen.sights.observations.cameras)
     counts = np.bincount(cell)
     seen_in = counts > 0
     counts = counts[seen_in]

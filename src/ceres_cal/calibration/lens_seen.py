@@ -15,7 +15,6 @@ from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.bundle import solve, with_placements_at_best
 from ceres_cal.problem.information import Key
@@ -209,7 +208,6 @@ class InlierRows(Frozen):
         every: sights of all the observations, of targets as they are `built`.
     """
 
-    observations: Observations
     end: RobustSolution
     options: Options
     every: Sights
@@ -244,8 +242,8 @@ class InlierRows(Frozen):
         start = seen_through(near, options, profiles_of(near, self.sights))
 
         def near_best() -> Kind:
-            problem = problem_of(self.observations, self.every, options, start)
-            end = solve_robustly(problem, self.observations, start, most_rounds=MOST_ROUNDS)
+            problem = problem_of(self.every, options, start)
+            end = solve_robustly(problem, start, most_rounds=MOST_ROUNDS)
             estimate = end.estimate
             problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
             return self._near_best(forms, problem, estimate)
@@ -301,7 +299,7 @@ class InlierRows(Frozen):
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""
-        problem = problem_of(self.observations, self.sights, options, estimate)
+        problem = problem_of(self.sights, options, estimate)
         return replace(
             problem, weighting=replace(self.end.problem.weighting, loss="trivial"), feet=self.end.residuals.feet
         )
@@ -325,7 +323,7 @@ class InlierRows(Frozen):
 
     def _shown(self, estimate: Estimate) -> Residuals:
         """The residuals there; DegenerateError where something is not seen."""
-        there = residuals(self.observations, self.sights, estimate, self.end.residuals.feet)
+        there = residuals(self.sights, estimate, self.end.residuals.feet)
         known = np.isfinite(there.points[self.sights.point_rows]), np.isfinite(there.curves[self.sights.curve_rows])
         if not (known[0].all() and known[1].all()):
             raise DegenerateError("cannot show all that another lens shows")

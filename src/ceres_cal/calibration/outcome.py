@@ -103,12 +103,12 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
                 yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
 
 
-def unusual_pixels(end: RobustSolution, problem: Problem, observations: Observations) -> Iterator[str]:
+def unusual_pixels(end: RobustSolution, problem: Problem) -> Iterator[str]:
     """Words about cameras whose pixels come out far from square, where only targets of the world tell so: a length that
     is not the target's looks the same. A board that is turned from view to view would contradict it.
     """
     unusual = 0.01  # of fy / fx: of the public cameras tried it is up to 0.006 off
-    turned = {view.camera for view in observations.views if view.placement is not None}
+    turned = {view.camera for view in problem.observations.views if view.placement is not None}
     for name, camera in end.estimate.cameras.items():
         free = problem.layout.free.get(name, ())
         if OF_PIXELS.index("aspect") in free and name not in turned and abs(camera.aspect - 1.0) > unusual:
@@ -133,12 +133,12 @@ def _share_text(share: float) -> str:
 
 def came_out(
     phi_from: Mapping[str, str],
-    observations: Observations,
     problem: Problem,
     end: RobustSolution,
     explanations: Sequence[Explanation] = (),
 ) -> Calibration:
     """What came out, not assessed."""
+    observations = problem.observations
     out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
     far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
     return Calibration(
@@ -157,14 +157,14 @@ def came_out(
     )
 
 
-def of_closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:
+def of_closed_form(start: Start, problem: Problem) -> Calibration:
     """The paper's own method alone: nothing is minimised."""
     estimate = four_point_baseline(problem.sights, start.estimate)
-    there = residuals(observations, problem.sights, estimate)
-    require_possible(observations, problem.sights, estimate, there)
+    there = residuals(problem.sights, estimate)
+    require_possible(problem.sights, estimate, there)
     solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
-    end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
-    return came_out(start.phi_from, observations, problem, end)
+    end = RobustSolution(problem, solution, visible_from(problem.observations, there), there, 0)
+    return came_out(start.phi_from, problem, end)
 
 
 def of_all(calibration: Calibration, settled: Settled) -> Calibration:

@@ -114,7 +114,7 @@ class Explained(Frozen):
         """The calibration, not assessed."""
         if self.digest is not None:
             self.digest.result()
-        return came_out(self.start.phi_from, self.task.observations, self.problem, self.end, self.explanations)
+        return came_out(self.start.phi_from, self.problem, self.end, self.explanations)
 
     @property
     def effects(self) -> tuple[EffectEstimate, ...]:
@@ -140,7 +140,7 @@ class Explained(Frozen):
         if conflicts.answer is None:
             return self
         problem = replace(self.problem, priors=conflicts.answer.problem.priors)
-        shown = residuals(self.task.observations, problem.sights, conflicts.answer.estimate)
+        shown = residuals(problem.sights, conflicts.answer.estimate)
         return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
 
 
@@ -175,8 +175,8 @@ def known_of(seen: Explained) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
     task, observations, conflicts = seen.task, seen.task.observations, Conflicts()
     if task.tested:
-        part = None if task.before is not None else taking_part(seen.problem, observations, seen.explanations)
-        conflicts = find_conflicts(seen.problem, observations, seen.end, task.scales, part, seen.shifts_at)
+        part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
+        conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at)
         seen = seen.without(conflicts)
     settled = None
     if task.settle is not None:
@@ -191,7 +191,7 @@ def known_of(seen: Explained) -> Calibration:
         alike = seen_alike(seen.others, seen.end.estimate, posterior.half_width)
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
         strange = (
-            *unusual_pixels(seen.end, seen.problem, observations),
+            *unusual_pixels(seen.end, seen.problem),
             *seen_from_behind(seen.end.estimate, observations),
         )
         warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
@@ -215,17 +215,17 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
     At rest the predictions follow the noise: halves differ by 1.7 of what is stated where they do by 1.4 after twice.
     """
     twice = 2
-    task, observations, seen, unsteady = first.task, first.task.observations, first, None
+    task, seen, unsteady = first.task, first, None
     for _ in range(twice):
-        unsteady = find_unsteady(seen.problem, observations, seen.end, unsteady)
+        unsteady = find_unsteady(seen.problem, seen.end, unsteady)
         if unsteady is None:  # or what seemed to move was what the lens or the target left
             return None
         start = replace(seen.end.estimate, structure=first.start.estimate.structure)
         named = first.problem.options
         options = replace(problem.options, powers=named.powers, terms=named.terms)
-        again = problem_of(observations, problem.sights, options, start)
-        steady = unsteady.taken_off(again, len(observations.points))
-        end = solve_robustly(steady, observations, start, None, task.progress, is_near=True)
+        again = problem_of(problem.sights, options, start)
+        steady = unsteady.taken_off(again)
+        end = solve_robustly(steady, start, None, task.progress, is_near=True)
         solved = Explained(task, steady, replace(first.start, estimate=start, is_near=True), end)
         seen = replace(_explained(solved, steady.sights, AS_DRAWN), unsteady=unsteady)
     return seen
@@ -233,9 +233,8 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
 
 def _solved(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
     """Solve, reject, solve: nothing else is explained yet, and targets are drawn as they seemed to be built."""
-    observations = task.observations
-    problem = replace(problem, sights=built.held(problem.sights, observations))
-    end = solve_robustly(problem, observations, start.estimate, task.scales, task.progress, is_near=start.is_near)
+    problem = replace(problem, sights=built.held(problem.sights))
+    end = solve_robustly(problem, start.estimate, task.scales, task.progress, is_near=start.is_near)
     seen = Explained(task, problem, start, end)
     if task.before is None:
         seen = _as_long_as_asked(seen)
@@ -245,35 +244,35 @@ def _solved(task: Task, start: Start, problem: Problem, built: Built) -> Explain
 
 def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
     """Let explanations compete; solve for targets as built, where they are drawn otherwise, and for effects."""
-    task, observations = first.task, first.task.observations
+    task = first.task
 
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
-        return solve_robustly(others, some.observations, _start_of(others, some, first), task.scales)
+        return solve_robustly(others, _start_of(others, some, first), task.scales)
 
-    end, explanations = compete(first.problem, observations, first.end, solved)
+    end, explanations = compete(first.problem, first.end, solved)
     seen = Explained(task, replace(first.problem, sights=drawn), first.start, end, explanations)
     if task.before is None:
         seen = _of_targets(seen, solved, built)
     require_fits(seen.end, seen.problem)
-    require_possible(observations, seen.problem.sights, seen.end.estimate, seen.end.residuals)
+    require_possible(seen.problem.sights, seen.end.estimate, seen.end.residuals)
     return seen
 
 
 def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
-    observations, is_asked = seen.task.observations, problem.options.as_built == "estimate"
+    is_asked = problem.options.as_built == "estimate"
     if is_asked:
-        end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved, built)
-    if is_asked and estimated(observations):
-        part, is_all = taking_part(problem, observations, explanations), seen.task.settle is None
-        beside = solve_beside_effects(problem, part, observations, end, solves=is_all)
+        end, problem, explanations, as_built = solve_as_built(problem, end, explanations, solved, built)
+    if is_asked and estimated(problem.observations):
+        part, is_all = taking_part(problem, explanations), seen.task.settle is None
+        beside = solve_beside_effects(problem, part, end, solves=is_all)
         problem, end = beside.problem, beside.end
     others: tuple[Solution, ...] = ()
     if end.problem.sights.equations == problem.sights.equations:
         least, others = least_of_few(end.problem, end.estimate, seen.start.others)
         if least is not end.estimate:
-            end = replace(end.moved_to(least, observations, problem), reduced=None)
+            end = replace(end.moved_to(least, problem), reduced=None)
     return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside, others)
 
 
@@ -294,7 +293,7 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
 
     Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
     """
-    end, before, observations = seen.end, seen.task.before, seen.task.observations
+    end, before = seen.end, seen.task.before
     known = end.problem if before is None else replace(end.problem, layout=before)
     estimate = end.estimate
     reduced = end.reduced if before is None else None
@@ -302,12 +301,12 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
 
     def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
         at_end = there is estimate
-        found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
-        return measure_scatter(observations, known, found, there, says)
+        found = end.residuals if at_end else residuals(known.sights, there, end.residuals.feet)
+        return measure_scatter(known, found, there, says)
 
     freedom = end.inliers.degrees_of_freedom
     assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, seen.shifts_at)
-    return (end if assessed is estimate else end.moved_to(assessed, observations, seen.problem)), posterior
+    return (end if assessed is estimate else end.moved_to(assessed, seen.problem)), posterior
 
 
 def _start_of(others: Problem, some: Subproblem, first: Explained) -> Estimate:
@@ -315,7 +314,7 @@ def _start_of(others: Problem, some: Subproblem, first: Explained) -> Estimate:
     alike = set(others.sights.keys) == set(some.problem.sights.keys)
     if first.task.before is not None or not alike or all(key.placement is None for key in others.sights.keys):
         return first.start.estimate  # that of the world was found with what does not belong among the rest
-    return initialise(some.observations, others.sights, others.options).estimate
+    return initialise(others.sights, others.options).estimate
 
 
 def _as_long_as_asked(seen: Explained) -> Explained:
@@ -324,7 +323,7 @@ def _as_long_as_asked(seen: Explained) -> Explained:
     A lens without a formula has all of its terms where residuals of different views agree from place to place. How
     large their numbers are the data say in any case (`effects/smoothness.py`): they cost time.
     """
-    options, observations, progress = seen.problem.options, seen.task.observations, seen.task.progress
+    options, progress = seen.problem.options, seen.task.progress
     if options.powers:
         return seen
     problem, end = _named(seen.problem), replace(seen.end, problem=_named(seen.end.problem))
@@ -332,9 +331,9 @@ def _as_long_as_asked(seen: Explained) -> Explained:
     may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
     if may_grow and LeftOver.of_end(end).in_cells > AGREES:
         near = _seen_longer(end.estimate, longer)
-        try_of = problem_of(observations, problem.sights, longer, near)
+        try_of = problem_of(problem.sights, longer, near)
         # quiet: the lens without these terms stays; what it leaves is diagnosed
-        found = attempt(lambda: solve_robustly(try_of, observations, near, progress=progress))
+        found = attempt(lambda: solve_robustly(try_of, near, progress=progress))
         if isinstance(found, RobustSolution) and _shows_all(found):
             problem, end = _named(try_of), replace(found, problem=_named(found.problem))
     start = replace(seen.start, estimate=_seen_longer(seen.start.estimate, problem.options))

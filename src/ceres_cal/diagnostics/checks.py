@@ -20,7 +20,6 @@ from ceres_cal.effects.columns import Selection
 from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.table.targets import feature_of
-from ceres_cal.observations import Observations
 from ceres_cal.problem.structure import numbers_by_kind
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.curves import nearest_on_track
@@ -61,9 +60,7 @@ class Noise(Frozen, eq=True):
         return self.observations / self.effective if self.observations else 1.0
 
 
-def measure_noise(
-    observations: Observations, model: Linearised, before: Linearised, inliers: Inliers
-) -> tuple[Noise, ...]:
+def measure_noise(model: Linearised, before: Linearised, inliers: Inliers) -> tuple[Noise, ...]:
     """The noise of points and of curves, where there are any.
 
     Args:
@@ -74,13 +71,12 @@ def measure_noise(
         rows = model.used & (model.equations.is_curve == is_curve)
         if np.any(rows):
             own = before.variance(before.used & (before.equations.is_curve == is_curve))
-            answer.append(_noise_of(observations, model, kind, rows, scale, own))
+            answer.append(_noise_of(model, kind, rows, scale, own))
     return tuple(answer)
 
 
-def _noise_of(
-    observations: Observations, model: Linearised, kind: str, rows: Mask, own_scale: float, own_variance: float
-) -> Noise:
+def _noise_of(model: Linearised, kind: str, rows: Mask, own_scale: float, own_variance: float) -> Noise:
+    observations = model.equations.sights.observations
     column = observations.curves if kind == "curves" else observations.points
     variance, spare = model.variance(rows), model.spare_of(rows)
     scale = own_scale * float(np.sqrt(variance / own_variance)) if own_variance > 0.0 else own_scale
@@ -90,13 +86,13 @@ def _noise_of(
     if np.isfinite(stated) and spare >= 1.0:
         log_p = float(log_chi2_tail(variance * spare * own_scale**2 / LARGER**2, spare))
     typical = scale * rms(column.sigma_px)
-    correlation, pairs_log_p = _correlation(model, _neighbours(observations, model, kind), variance)
+    correlation, pairs_log_p = _correlation(model, _neighbours(model, kind), variance)
     agree = max(correlation, 0.0) if np.isfinite(correlation) and pairs_log_p < np.log(0.01) else 0.0
     effective = count * (1.0 - agree) / (1.0 + agree)  # of a first-order autoregression
     return Noise(kind, count, typical, scale, stated, log_p, correlation, pairs_log_p, effective)
 
 
-def _neighbours(observations: Observations, model: Linearised, kind: str) -> tuple[Indices, Indices]:
+def _neighbours(model: Linearised, kind: str) -> tuple[Indices, Indices]:
     """Pairs of used equations: next to one another along a line of one view, or on one row of a board."""
     equations = model.equations
     if kind == "curves":
@@ -106,6 +102,7 @@ def _neighbours(observations: Observations, model: Linearised, kind: str) -> tup
         first, second = _successive(rows, along, track, equations.view[rows])
         near = equations.feature[first] == equations.feature[second]
     else:
+        observations = equations.sights.observations
         grids = [observations.targets[view.target].grid for view in observations.views]
         columns = np.array([0 if grid is None else grid.columns for grid in grids])
         rows = np.flatnonzero(model.used & ~equations.is_curve & (columns[equations.view] > 0))
@@ -172,7 +169,7 @@ def wrong_labels(tested: TestResults) -> Iterator[Finding]:
     groups: dict[tuple[bool, str, int, int], list[Mislabelled]] = defaultdict(list)
     for label in tested.case.labels:
         if label.log_p <= tested.selection.log_level:
-            name = tested.case.observations.views[label.view].target
+            name = tested.case.problem.observations.views[label.view].target
             groups[label.is_curve, name, label.feature, label.instead].append(label)
     for (_, target, _, _), labels in groups.items():
         yield _wrong_label(tested, target, labels)
@@ -180,7 +177,7 @@ def wrong_labels(tested: TestResults) -> Iterator[Finding]:
 
 def _wrong_label(tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
     most_named = 5
-    observations, table, one = tested.case.observations, tested.case.table, labels[0]
+    observations, table, one = tested.case.problem.observations, tested.case.table, labels[0]
     described = observations.targets[target]
     names = described.curve_names if one.is_curve else described.point_names
     kind = "curve" if one.is_curve else "point"
@@ -275,7 +272,7 @@ def does_not_hold(tested: TestResults) -> Iterator[Finding]:
         f"the calibration does not hold on these observations: a refit would move it by {px:.2f} px, {mm:.1f} mm rms"
     )
     yield Finding(
-        "does not hold", "calibration", ", ".join(case.observations.stations), None, sentence,
+        "does not hold", "calibration", ", ".join(case.problem.observations.stations), None, sentence,
         "find out with `ceres-cal check` whether the camera was moved, and refit", px, mm,
         px / case.noise_px(left, used), (), tested.selection.log10_p(log_p), count,
     )  # fmt: skip
@@ -294,7 +291,7 @@ and how many tests are made of a case: they share the rate of false alarms with 
 def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:
     """The finding of an effect that the calibration found by itself, and has in it."""
     case, structure = tested.case, tested.case.estimate.structure
-    numbers = numbers_by_kind(structure, case.observations.targets)[one.target, one.kind]
+    numbers = numbers_by_kind(structure, case.problem.observations.targets)[one.target, one.kind]
     offsets = np.zeros(len(structure.offsets) + 1)
     offsets[numbers] = structure.values[numbers]
     shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)

@@ -179,19 +179,19 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
     problem = calibration.problem(observations, new_data=new_data)
     estimate = calibration.estimate
     if new_data:
-        estimate = _with_newcomers_placed(observations, problem, calibration)
-    there = residuals(observations, problem.sights, estimate)
+        estimate = _with_newcomers_placed(problem, calibration)
+    there = residuals(problem.sights, estimate)
     inliers = _judged(calibration, observations, there, new_data)
-    equations = write_equations(observations, problem.sights, estimate, there)
+    equations = write_equations(problem.sights, estimate, there)
     weighting, taking_part = inliers.weighting(problem.options), (inliers.points, inliers.curves)
-    weights = equation_weights(observations, weighting, equations, there, taking_part)
+    weights = equation_weights(weighting, equations, there, taking_part)
     model = make_linear_model(problem, estimate, equations, weights)
     if calibration.refitted is not None and not new_data:
         model = replace(model, known_noise=USUAL_EQUATIONS)
-    table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
+    table = make_table(inliers, model, weights.robust, estimate.cameras)
     labels, tried = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
     known = (calibration,) if new_data else (None, calibration.as_built, calibration.effects)
-    case = DiagnosisCase(observations, problem, estimate, model, inliers, table, labels, tried, *known)
+    case = DiagnosisCase(problem, estimate, model, inliers, table, labels, tried, *known)
     used = _recalled(case)
     if np.array_equal(used, model.used):
         return case
@@ -218,12 +218,12 @@ def _tested(case: DiagnosisCase, rate: float) -> TestResults:
     alternatives = [EffectSums.of(case.model, columns) for columns in columns_of_all(case)]
     extra = sum(tests(case) for _, tests in CHECKS.values())
     selection = select(case.model, alternatives, rate, extra)
-    noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
+    noise = measure_noise(selection.model, case.model, case.inliers)
     level = selection.log_level
     inflation = max((one.inflation for one in noise if one.correlation_log_p < level), default=1.0)
     if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
         selection = select(case.model, alternatives, rate, extra, inflation)
-        noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
+        noise = measure_noise(selection.model, case.model, case.inliers)
     return TestResults(case, selection, noise, rate)
 
 
@@ -260,7 +260,7 @@ def _recalled(case: DiagnosisCase) -> Mask:
 
 def _mislabelled(case: DiagnosisCase) -> Mask:
     """(N + M,) the observations that a wrong label explains."""
-    points = len(case.observations.points)
+    points = len(case.problem.observations.points)
     explained = np.zeros(len(case.table), dtype=bool)
     for label in case.labels:
         explained[label.rows + (points if label.is_curve else 0)] = True
@@ -278,7 +278,7 @@ def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigm
 # ---- new observations ------------------------------------------------------------------------------------------------
 
 
-def _with_newcomers_placed(observations: Observations, problem: Problem, calibration: Calibration) -> Estimate:
+def _with_newcomers_placed(problem: Problem, calibration: Calibration) -> Estimate:
     """The calibration's estimate with every placement that is new among the observations in its best pose.
 
     Raises:
@@ -290,6 +290,7 @@ def _with_newcomers_placed(observations: Observations, problem: Problem, calibra
         return estimate
     fit, options = calibration.fit, calibration.options
     behind = Pose(np.eye(3), np.array([0.0, 0.0, -1e6]))  # no camera sees it: any pose is better
+    observations = problem.observations
     first = {view.placement: view.station for view in reversed(observations.views)}
     unplaced = {name: estimate.stations[first[name]].cam_from_world.inverse @ behind for name in new}
     start = replace(estimate, placements={**estimate.placements, **unplaced})

@@ -68,7 +68,7 @@ class Summaries(Frozen):
 
 def summarise(case: Case, table: ResidualTable) -> Summaries:
     """All summaries of a table."""
-    observations, cameras = case.observations, case.estimate.cameras
+    observations, cameras = case.problem.observations, case.estimate.cameras
     several = len(observations.stations) > 1
     labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
     frames = list(dict.fromkeys(labels))

@@ -17,6 +17,7 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.shown import brief
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import column_of
 from ceres_cal.problem.residuals import Equations, plane_shift
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera
@@ -142,22 +143,21 @@ def _plain(column: AnyArray) -> list[Any]:
     return values
 
 
-def make_table(
-    observations: Observations, inliers: Inliers, model: Linearised, weight: Array, cameras: Mapping[str, Camera]
-) -> ResidualTable:
+def make_table(inliers: Inliers, model: Linearised, weight: Array, cameras: Mapping[str, Camera]) -> ResidualTable:
     """The table of all observations.
 
     Args:
         weight: (E,) robust weight of each equation's observation.
     """
-    equations, points, curves = model.equations, observations.points, observations.curves
+    equations, observations = model.equations, model.equations.sights.observations
+    points, curves = observations.points, observations.curves
     count = len(points) + len(curves)
     is_curve = np.arange(count) >= len(points)
     features, first = _feature_names(observations)
-    view = np.concatenate([points.view, curves.view]).astype(np.int64)
+    view = column_of(observations, "view").astype(np.int64)
     target_of_view = numbers_of((one.target for one in observations.views), observations.targets)
     feature = np.concatenate([points.feature, curves.feature]) + first[is_curve.astype(int), target_of_view[view]]
-    pixel = np.concatenate([points.pixels, curves.pixels])
+    pixel = column_of(observations, "pixels")
     residual, shown = np.full((count, 2), np.nan), equations.observation
     residual[shown] = equations.displacement(equations.residual, count)[shown]
     distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
@@ -175,7 +175,7 @@ def make_table(
         residual,
         distance,
         error_mm(equations, equations.residual, count),
-        np.concatenate([points.sigma_px, curves.sigma_px]),
+        column_of(observations, "sigma_px"),
         np.where(is_curve, inliers.curve_scale, inliers.point_scale),
         np.where(inlier, _spread_out(equations, weight, count), 0.0),
         _mean_leverage(model, count),

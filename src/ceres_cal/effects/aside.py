@@ -167,10 +167,11 @@ def _view_modes(equations: Equations) -> Array:
     return np.hstack([equations.pose, stretch, bows])
 
 
-def groups_of(observations: Observations, sights: Sights) -> Iterator[ObservationGroups]:
+def groups_of(sights: Sights) -> Iterator[ObservationGroups]:
     """Curves in single frames; where a static camera has several, curves and points over all of them; then frames and
     placements, where there are enough.
     """
+    observations = sights.observations
     views = np.arange(len(observations.views))
     together, frames = np.full(len(views), -1), np.zeros_like(views)
     for number, (key, own) in enumerate(zip(sights.keys, sights.views, strict=True)):

@@ -39,7 +39,6 @@ from ceres_cal.effects.strands import (
     sampled,
     views_or_placements,
 )
-from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -275,7 +274,7 @@ def scattered(reduced: ReducedInformation, scatter: Scatter | None) -> Informati
 
 
 def measure_scatter(
-    observations: Observations, problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
+    problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
 ) -> Scatter | None:
     """How the shared numbers scatter by the residuals; None where there is no such number, or nothing left over.
 
@@ -283,7 +282,7 @@ def measure_scatter(
         problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
             problem says there.
     """
-    model = sampled(observations, problem, there, estimate, reduced)
+    model = sampled(problem, there, estimate, reduced)
     if model is None or not model.root.shape[1]:
         return None
     group = views_or_placements(model.equations)

@@ -154,7 +154,6 @@ class Case(Frozen):
         problem: of all the observations. model: its equations there, before any effect is put in.
     """
 
-    observations: Observations
     problem: Problem
     estimate: Estimate
     model: Linearised
@@ -176,7 +175,7 @@ class Case(Frozen):
     @cached_property
     def whole_structure(self) -> Structure:
         """Everything that could be built otherwise than it is drawn."""
-        return whole_structure(self.observations.targets)
+        return whole_structure(self.problem.observations.targets)
 
     @cached_property
     def slots(self) -> tuple[Indices, Indices]:

@@ -15,7 +15,6 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import ranges
 from ceres_cal.problem.costs import robust_weights
 from ceres_cal.problem.information import Information, Key, columns_by_owner
@@ -294,7 +293,6 @@ def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, In
 
 
 def equation_weights(
-    observations: Observations,
     weighting: Weighting,
     equations: Equations,
     there: Residuals,
@@ -307,6 +305,7 @@ def equation_weights(
             default all do.
     """
     at, scale = equations.observation, np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
+    observations = equations.sights.observations
     sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
     squared = (of_observations(at, *there.lengths) / sigma) ** 2
     used = np.ones(len(at), dtype=bool) if taking_part is None else of_observations(at, *taking_part)

@@ -14,7 +14,6 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, median
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, bounds_of
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -217,9 +216,7 @@ def _near_and_far(count: int) -> Indices:
 # ---- the views that are asked ---------------------------------------------------------------------------------------
 
 
-def sampled(
-    observations: Observations, problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
-) -> Linearised | None:
+def sampled(problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation) -> Linearised | None:
     """The equations of some views of every camera; None where there are no shared numbers.
 
     Args:
@@ -229,8 +226,8 @@ def sampled(
     sights = _shown(problem.sights, there)
     if not len(reduced.shared.matrix) or not len(sights):
         return None
-    equations = equations_of(observations, _some(observations, sights), estimate, there)
-    weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
+    equations = equations_of(_some(sights), estimate, there)
+    weights = equation_weights(problem.weighting, equations, there).within_sigma
     return linearise_within(problem, estimate, equations, weights, reduced.shared)
 
 
@@ -242,9 +239,10 @@ def _shown(sights: Sights, there: Residuals) -> Sights:
     return sights.used(points, curves)
 
 
-def _some(observations: Observations, sights: Sights) -> Sights:
+def _some(sights: Sights) -> Sights:
     """Of each camera some views, evenly, and of each of them some rows."""
     most_views = 16  # of a camera
+    observations = sights.observations
     chosen, shown = np.zeros((2, len(observations.views)), dtype=bool)
     shown[observations.points.view[sights.point_rows]] = True
     shown[observations.curves.view[sights.curve_rows]] = True

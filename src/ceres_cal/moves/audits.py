@@ -70,7 +70,6 @@ def audit(foreign: Calibration, observations: Observations) -> Agreements:
 class _AuditCase(Frozen):
     """One station's observations, those of them that count, and ours."""
 
-    observations: Observations
     ours: Calibration
     problem: Problem
 
@@ -101,10 +100,10 @@ class _AuditCase(Frozen):
 
     def _cost(self, estimate: Estimate) -> float:
         far = 1e3  # sigmas, of what a camera does not show at all
-        there = residuals(self.observations, self.problem.sights, estimate)
+        there, observations = residuals(self.problem.sights, estimate), self.problem.observations
         total = 0.0
-        columns: tuple[Columns, ...] = (self.observations.points, self.observations.curves)
-        masks, scales = self.ours.inlier_masks(self.observations), self.ours.fit.scales
+        columns: tuple[Columns, ...] = (observations.points, observations.curves)
+        masks, scales = self.ours.inlier_masks(observations), self.ours.fit.scales
         for lengths, column, mask, scale in zip(there.lengths, columns, masks, scales, strict=True):
             sigmas = (lengths / (scale * column.sigma_px))[mask] if len(column) else np.empty(0)
             total += float(np.sum(np.minimum(np.nan_to_num(sigmas, nan=far), far) ** 2))
@@ -180,7 +179,7 @@ def _case(observations: Observations, given: Camera) -> _AuditCase:
     problem = ours.problem(observations)
     used = replace(problem, sights=sights, weighting=weighting, priors=())
     points, curves = ours.inlier_masks(observations)
-    return _AuditCase(observations, ours, used.used(points, curves))
+    return _AuditCase(ours, used.used(points, curves))
 
 
 def _probability(rise: float, degrees: int) -> float:

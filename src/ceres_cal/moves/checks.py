@@ -90,7 +90,7 @@ def check(
         if name not in world:
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
     level = false_alarms / (len(world) * checks)
-    stations = {name: _checked(calibration, observed, sight, level) for name, sight in world.items()}
+    stations = {name: _checked(calibration, sight, level) for name, sight in world.items()}
     return Agreements(stations, false_alarms, checks)
 
 
@@ -101,7 +101,6 @@ class _CheckCase(Frozen):
     """One station's new observations and what was known of its numbers."""
 
     calibration: Calibration
-    observed: Observations
     sight: Sights
     estimate: Estimate
     prior: GaussianPrior
@@ -145,21 +144,21 @@ class _CheckCase(Frozen):
         return whole, offsets
 
 
-def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _CheckCase:
+def _case(calibration: Calibration, sight: Sights) -> _CheckCase:
     key, old, posterior = sight.key, calibration.estimate, calibration.uncertainty.posterior
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
-    structure = calibration.options.structure_of(observed.targets).carrying(old.structure)
+    structure = calibration.options.structure_of(sight.observations.targets).carrying(old.structure)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.is_structure]
-    return _CheckCase(calibration, observed, sight, estimate, calibration.prior_of(kept), tested)
+    return _CheckCase(calibration, sight, estimate, calibration.prior_of(kept), tested)
 
 
-def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> Agreement:
-    case = _case(calibration, observed, sight)
-    search = PoseSearch(observed, sight, case.estimate, calibration.fit.scales)
+def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement:
+    case = _case(calibration, sight)
+    search = PoseSearch(sight, case.estimate, calibration.fit.scales)
     near = pose_candidates(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
     used = sight.used(*_inliers(search, near[0])) if near else sight[:0]
     inside, count = (len(s.point_rows) + len(s.curve_rows) for s in (used, sight))
@@ -201,7 +200,7 @@ def _apart(case: _CheckCase, used: Sights, least: float, estimate: Estimate) -> 
     # At its end the solve's priors pull as much as the observations do, at the noise that they had there.
     earlier, offsets = case.known(used, case.station_keys, estimate, keys)
     best = seen.inverse @ (earlier.matrix @ offsets) / noise**2
-    scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, reduced)
+    scatter = measure_scatter(problem, residuals(used, estimate), estimate, reduced)
     if scatter is not None:
         seen = scatter.widened(seen)
         freedom = 1.0 / (1.0 / freedom + scatter.dependence.inverse_freedom)
@@ -212,7 +211,7 @@ def _apart(case: _CheckCase, used: Sights, least: float, estimate: Estimate) -> 
 
 def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
     """Which rows of the observations a pose near by explains."""
-    observations, sight = search.observations, search.sight
+    sight, observations = search.sight, search.sight.observations
     points, curves = (np.zeros(len(c), dtype=bool) for c in (observations.points, observations.curves))
     limit = _INLIER_SIGMA * max(1.0, min(near.scale, 2.0))
     in_points, in_curves = search.residuals(near.pose).in_sigmas(sight, search.scales)

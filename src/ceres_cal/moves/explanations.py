@@ -115,10 +115,10 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     """Explanations that fit, and better than what was known, in words, with what to do."""
     old = old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
-    mirrored = relabelled(search.observations, MIRRORED)
+    mirrored = relabelled(search.sight.observations, MIRRORED)
     if mirrored is not None and _fits(_seen_as(search, mirrored), old, known):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
-    for name, observations in mistaken_targets(search.observations).items():
+    for name, observations in mistaken_targets(search.sight.observations).items():
         if _fits(_seen_as(search, observations), old, known):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
     zoomed = zoomed_search(search, old)
@@ -126,7 +126,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
         phi = zoomed[0].camera.phi
         before = search.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
-    own = search.observations.of_station(search.sight.key.station)
+    own = search.sight.observations.of_station(search.sight.key.station)
     fresh = attempt(lambda: calibrate(own, replace(plan.options, priors=())))  # quiet: one hint less in a refusal
     if isinstance(fresh, CalibrationError):
         return
@@ -152,7 +152,7 @@ def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
     sights = gather_sights(observations)
     number = sights.keys.index(search.sight.key)
     estimate = replace(search.estimate, structure=make_structure(observations.targets, {}))
-    return replace(search, observations=observations, sight=sights[number], estimate=estimate)
+    return replace(search, sight=sights[number], estimate=estimate)
 
 
 def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, PoseCandidate] | None:
@@ -248,7 +248,7 @@ def _explains(plan: RefitPlan, result: Calibration) -> bool:
     The noise of its few points alone does not tell: three of five may be strays.
     """
     moved = (sight for name, sight in plan.sights.of_world.items() if name in plan.moved)
-    searches = [PoseSearch(plan.observations, sight, result.estimate, plan.scales) for sight in moved]
+    searches = [PoseSearch(sight, result.estimate, plan.scales) for sight in moved]
     stations = result.estimate.stations
     return all(candidate_at(one, stations[one.sight.key.station].cam_from_world).fits for one in searches)
 
@@ -272,7 +272,7 @@ def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, fl
     count = len(sights.point_rows) + len(sights.curve_rows)
     scores = {}
     for what, result in results.items():
-        there = residuals(plan.observations, sights, result.estimate)
+        there = residuals(sights, result.estimate)
         total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
         for name in sights.cameras:
             total += there.misfit(sights.of_camera(name), result.cameras[name], scales)

@@ -14,7 +14,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array, distinct, median
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import placement_costs
@@ -65,7 +64,6 @@ class PoseSearch(Frozen):
         sight: its one sight. scales: noise scales of points and curves to be expected.
     """
 
-    observations: Observations
     sight: Sights
     estimate: Estimate
     scales: tuple[float, float]
@@ -85,7 +83,7 @@ class PoseSearch(Frozen):
     @property
     def drawn(self) -> Sights:
         """The sight of points as drawn: on a plane, also where a board was built bent."""
-        every = np.concatenate([target.point_array for target in self.observations.targets.values()])
+        every = np.concatenate([target.point_array for target in self.sight.observations.targets.values()])
         return replace(self.sight, points=every[self.sight.point_index])
 
     def with_camera(self, camera: Camera) -> PoseSearch:
@@ -100,7 +98,7 @@ class PoseSearch(Frozen):
         stations = {**self.estimate.stations, key.station: station}
         placements = {} if key.placement is None else {key.placement: Pose.identity()}
         there = replace(self.estimate, stations=stations, placements=placements)
-        return residuals(self.observations, self.sight, there)
+        return residuals(self.sight, there)
 
 
 def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[PoseCandidate]:

@@ -133,7 +133,7 @@ def _moved_sights(plan: RefitPlan) -> list[Sights]:
 
 
 def _search_of(plan: RefitPlan, sight: Sights, estimate: Estimate) -> PoseSearch:
-    return PoseSearch(plan.observations, sight, estimate, plan.scales)
+    return PoseSearch(sight, estimate, plan.scales)
 
 
 def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:

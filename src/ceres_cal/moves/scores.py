@@ -61,11 +61,11 @@ def score(
     )
     if not layout.size:
         raise InputError("with its stations held nothing is left to be posed: `ceres-cal check` is for that")
-    start = Start(_start(calibration, observed, sights, known), calibration.phi_from)
+    start = Start(_start(calibration, sights, known), calibration.phi_from)
     priors = gather_priors(observed, given, EXACT)
     task = Task(observed, tested=False, before=layout)
     posed = solved_from(task, start, Problem(sights, layout, priors, options=given))
-    left = residuals(observed, sights, posed.estimate)
+    left = residuals(sights, posed.estimate)
     noise = _noise_ratios(posed, calibration)
     views = [(view.camera, _view(number, observed, left, posed, noise)) for number, view in enumerate(observed.views)]
     views.sort(key=lambda one: -one[1].misfit.all_rms_px)
@@ -85,18 +85,16 @@ def sights_as_built(observations: Observations, calibration: Calibration) -> Sig
     return built.built_into(sights)
 
 
-def _start(
-    calibration: Calibration, observations: Observations, sights: Sights, known: Mapping[str, Station]
-) -> Estimate:
+def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station]) -> Estimate:
     """Every sight's pose under the calibrated lens, chained into stations and placements."""
-    stations = {name: Station(camera, Pose.identity()) for name, camera in observations.stations.items()}
-    cameras = {name: calibration.cameras[name] for name in observations.cameras}  # some of a rig's
+    stations = {name: Station(camera, Pose.identity()) for name, camera in sights.observations.stations.items()}
+    cameras = {name: calibration.cameras[name] for name in sights.observations.cameras}  # some of a rig's
     blank = Estimate(cameras, stations, {}, EXACT)
     numbers, poses = [], []
     for number, key in enumerate(sights.keys):
         old = calibration.estimate.stations.get(key.station)
         before = [old.cam_from_world] if old is not None and key.placement is None else []
-        candidates = pose_candidates(PoseSearch(observations, sights[number], blank, (1.0, 1.0)), before)
+        candidates = pose_candidates(PoseSearch(sights[number], blank, (1.0, 1.0)), before)
         if candidates:
             numbers.append(number)
             poses.append(candidates[0].pose.matrix)
@@ -104,7 +102,7 @@ def _start(
         raise DegenerateError(
             f"{sights.keys[0]}: its pose is not determined: show four points or more, not on one line"
         )
-    stations, placements = chained_poses(observations, sights, np.array(numbers), np.array(poses), known)
+    stations, placements = chained_poses(sights, np.array(numbers), np.array(poses), known)
     return Estimate(cameras, stations, placements, EXACT)
 
 

@@ -24,7 +24,6 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.observations.files import Content
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import nearest_to_rays
 
@@ -47,7 +46,7 @@ class Sights(Frozen, Sequence["Sights"]):
     """Some sights, their observations one after the other; one sight is a `Sights` of length one.
 
     Attributes:
-        keys: of each of the S sights. views: numbers of the views that each sight gathers.
+        observations: all of them. keys: of each of the S sights. views: numbers of the views that each sight gathers.
         point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
         point_index: (N,) number among the points of all targets. points: (N, 3) m in the sight's frame.
         pixels: (N, 2). sigma_px: (N,).
@@ -56,6 +55,7 @@ class Sights(Frozen, Sequence["Sights"]):
             `curves.along_track`).
     """
 
+    observations: Observations
     keys: tuple[SightKey, ...]
     views: tuple[tuple[int, ...], ...]
     point_bounds: Indices
@@ -212,7 +212,8 @@ class Sights(Frozen, Sequence["Sights"]):
         p, c = (np.full(int(rows.max(initial=-1)) + 1, -1) for rows in (self.point_rows, self.curve_rows))
         p[points], c[curves] = np.arange(len(points)), np.arange(len(curves))
         own = self.used(p >= 0, c >= 0)
-        return replace(own, point_rows=p[own.point_rows], curve_rows=c[own.curve_rows])
+        few = self.observations.part(points, curves)
+        return replace(own, observations=few, point_rows=p[own.point_rows], curve_rows=c[own.curve_rows])
 
     @property
     def by_kind(self) -> tuple[Sights, Sights]:
@@ -227,6 +228,7 @@ class Sights(Frozen, Sequence["Sights"]):
         every = len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self)))
         chosen = () if every else numbers.tolist()
         return Sights(
+            self.observations,
             self.keys if every else tuple(map(self.keys.__getitem__, chosen)),
             self.views if every else tuple(map(self.views.__getitem__, chosen)),
             bounds_of(point_sizes),
@@ -285,7 +287,7 @@ def gather_sights(observations: Observations, *, predicted: bool = False) -> Sig
     return every if predicted else every.used(*observations.copies.originals)
 
 
-def sights_of(observations: Content) -> Sights:
+def sights_of(observations: Observations) -> Sights:
     """The sights of all observations; a sight without any is left out."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
@@ -308,6 +310,7 @@ def sights_of(observations: Content) -> Sights:
     side = curves.side[c] % 3  # -1 is the last of a target's three sets of tracks
     track_index = first_track[curves.view[c]] + side * curve_count[curves.view[c]] + curves.feature[c]
     every = Sights(
+        observations,
         tuple(order),
         tuple(tuple(views) for views in views_of),
         point_bounds,
@@ -373,10 +376,10 @@ def column_of(observations: Observations, name: str) -> AnyArray:
     return np.concatenate([getattr(observations.points, name), getattr(observations.curves, name)])
 
 
-def shown_rows(content: Content, sights: Sights) -> Mask:
+def shown_rows(sights: Sights) -> Mask:
     """(N + M,) the observations that sights show, points by row and then curves by row."""
-    rows = np.zeros(content.rows, dtype=bool)
-    rows[sights.point_rows] = rows[len(content.points) + sights.curve_rows] = True
+    rows = np.zeros(sights.observations.rows, dtype=bool)
+    rows[sights.point_rows] = rows[len(sights.observations.points) + sights.curve_rows] = True
     return rows
 
 

@@ -281,8 +281,8 @@ def _linearised(end: RobustSolution, observations: Observations, reduced: Reduce
     problem, estimate = end.problem, end.estimate
     every = max(1, -(-problem.sights.equations // most_equations))
     sights = problem.sights[::every]
-    equations = equations_of(observations, sights, estimate, end.residuals)
-    weights = equation_weights(observations, problem.weighting, equations, end.residuals).within_sigma
+    equations = equations_of(sights, estimate, end.residuals)
+    weights = equation_weights(problem.weighting, equations, end.residuals).within_sigma
     model = linearise_within(problem, estimate, equations, weights, reduced.shared)
     share = sights.equations / problem.sights.equations
     return model.beside_prior(share * model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root)

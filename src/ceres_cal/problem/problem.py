@@ -83,6 +83,11 @@ class Problem(Frozen):
     elsewhere: Elsewhere | None = None
     taken_up: float = 0.0
 
+    @property
+    def observations(self) -> Observations:
+        """All of them, also those that take no part."""
+        return self.sights.observations
+
     @cached_property
     def private(self) -> frozenset[str | None]:
         """Free placements that a single sight shows: each can be eliminated by itself."""
@@ -181,7 +186,7 @@ class Problem(Frozen):
         return replace(self, sights=sights), replace(estimate, structure=EXACT)
 
 
-def problem_of(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
+def problem_of(sights: Sights, options: Options, estimate: Estimate) -> Problem:
     """What is minimised, before anything was weighed."""
-    priors = gather_priors(observations, options, estimate.structure)
-    return Problem(sights, make_layout(observations, options), priors, options=options)
+    priors = gather_priors(sights.observations, options, estimate.structure)
+    return Problem(sights, make_layout(sights.observations, options), priors, options=options)

@@ -18,7 +18,6 @@ from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.observations import Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.problem.parameters import Estimate, intrinsics_vector, unit_px
@@ -122,14 +121,14 @@ def _weights(sigma_px: Array, noise_scale: float | None) -> Array:
     return np.reciprocal(weights, out=weights)
 
 
-def residuals(observations: Content, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
+def residuals(sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
     """Residuals of every observation in the sights; NaN for rows in none of them.
 
     Args:
         feet: (M,) where on its track the search for each curve observation's foot starts, such as those of earlier
             residuals; without them it starts where the ray passes nearest.
     """
-    return _residuals(len(observations.points), len(observations.curves), sights, estimate, feet)
+    return _residuals(len(sights.observations.points), len(sights.observations.curves), sights, estimate, feet)
 
 
 def residuals_alone(sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
@@ -291,7 +290,7 @@ def whole_structure(targets: Mapping[str, Target], in_waves: Collection[str] | N
     return make_structure(targets, every)
 
 
-def write_equations(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
+def write_equations(sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
     """The equations of every observation whose residual is finite.
 
     Raises:
@@ -301,19 +300,19 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     sights = sights.used(np.isfinite(x + y), np.isfinite(there.curves))
     if not len(sights):
         raise SolutionError("the calibration can show none of the observations: give those it was made from")
-    return equations_of(observations, sights, estimate, there)
+    return equations_of(sights, estimate, there)
 
 
-def equations_of(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
+def equations_of(sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
     """The equations of some sights, all of whose residuals are finite."""
     poses = estimate.pose_stack(sights.keys)
     parts = []
     for numbers in map(sights.numbers, sights.cameras):
         own = sights.take(numbers)
         if len(own.point_rows):
-            parts.append(_of_points(observations, own, numbers, poses[numbers], estimate, there))
+            parts.append(_of_points(own, numbers, poses[numbers], estimate, there))
         if len(own.curve_rows):
-            parts.append(_of_curves(observations, own, numbers, poses[numbers], estimate, there))
+            parts.append(_of_curves(own, numbers, poses[numbers], estimate, there))
     size = max(part["intrinsics"].shape[1] for part in parts)
     for part in parts:
         if missing := size - part["intrinsics"].shape[1]:
@@ -323,8 +322,9 @@ def equations_of(observations: Observations, sights: Sights, estimate: Estimate,
         order = np.argsort(columns["sight"], kind="stable")
         columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
-    columns["is_curve"] = columns["observation"] >= len(observations.points)
-    view = of_observations(columns["observation"], observations.points.view, observations.curves.view)
+    points, curves = sights.observations.points, sights.observations.curves
+    columns["is_curve"] = columns["observation"] >= len(points)
+    view = of_observations(columns["observation"], points.view, curves.view)
     return Equations(sights=sights, poses=poses, bounds=bounds, view=view.astype(np.int64), **columns)
 
 
@@ -339,14 +339,14 @@ def of_observations(numbers: Indices, points: AnyArray, curves: AnyArray) -> Any
 
 
 def _of_points(
-    observations: Observations, own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
+    own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
 ) -> dict[str, AnyArray]:
     """The columns of the points of one camera's sights, of these numbers and poses."""
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 6 + kernels.BUILT))
     points = point_columns(own, estimate.structure)
-    bends = np.concatenate([bends_of(target) for target in observations.targets.values()])
+    bends = np.concatenate([bends_of(target) for target in own.observations.targets.values()])
     points = points._replace(bends=bends[own.point_index])
     kernels.point_rows(optics, poses, points, rows)
     return {
@@ -364,7 +364,7 @@ def _of_points(
 
 
 def _of_curves(
-    observations: Observations, own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
+    own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
 ) -> dict[str, AnyArray]:
     """The columns of their curve observations."""
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
@@ -375,7 +375,7 @@ def _of_curves(
     distance = there.curves[own.curve_rows]
     return {
         "sight": numbers[_sight_of(own.curve_bounds)],
-        "observation": len(observations.points) + own.curve_rows,
+        "observation": len(own.observations.points) + own.curve_rows,
         "feature": own.track_index.astype(np.int64),
         "residual": distance,
         "direction": normals,

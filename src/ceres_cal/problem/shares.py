@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
-from ceres_cal.observations.sights import SightKey, Sights, shown_rows, sights_of
+from ceres_cal.observations.sights import SightKey, Sights, column_of, shown_rows, sights_of
 from ceres_cal.problem.costs import Run, SightCost
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
@@ -192,9 +192,9 @@ class _RowBounds(Frozen):
             now >= _FAR * then for now, then in zip(asked.bounds, self.bounds, strict=True)
         )
 
-    def taking_part(self, content: Content, asked: ShareRequest) -> tuple[Mask, Mask]:
+    def taking_part(self, every: Content, asked: ShareRequest) -> tuple[Mask, Mask]:
         """(n,) of points and (m,) of curve observations."""
-        points, curves = np.ones(len(content.points), dtype=bool), np.ones(len(content.curves), dtype=bool)
+        points, curves = np.ones(len(every.points), dtype=bool), np.ones(len(every.curves), dtype=bool)
         for mask, bound, (rows, lengths) in zip((points, curves), asked.bounds, self.far, strict=True):
             mask[rows[~(lengths <= bound)]] = False
         return points, curves
@@ -233,40 +233,40 @@ class Share:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_feet": None, "_judged": None}
 
-    def _content(self) -> Content:
+    def _world(self) -> Sights:
+        """The sights of the world in it."""
         points, curves = (
             {name: read_rows(column) for name, column in columns.items()} for columns in (self.points, self.curves)
         )
         for columns in (points, curves):
             columns["view"] = columns["view"] - np.int32(self.first_view)
-        return Content(self.targets, {}, self.views, Points(**points), Curves(**curves))
+        content = Content(self.targets, {}, self.views, Points(**points), Curves(**curves))
+        sights = sights_of(cast("Observations", content))  # which were checked when they were read
+        return sights.take(sights.numbers(placements=(None,)))
 
-    def _loaded(self) -> tuple[Content, Sights]:
-        """What it holds, and the sights of the world in it."""
-        content = self._content()
-        sights = sights_of(content)
-        sights = sights.take(sights.numbers(placements=(None,)))
-        return content, sights if self.left_out is None else sights.used(*(~mask for mask in self.left_out))
+    def _counted(self, world: Sights) -> Sights:
+        """The same without what does not count."""
+        return world if self.left_out is None else world.used(*(~mask for mask in self.left_out))
 
-    def _feet_of(self, content: Content, sights: Sights, asked: ShareRequest) -> Array:
+    def _feet_of(self, sights: Sights, asked: ShareRequest) -> Array:
         """(m,) where the search for feet starts, known from before or found again: no answer depends on which."""
         names = [name for name, _ in asked.feet_along]
         known = self._feet if self._feet is not None and self._feet[0] in names else None
         feet = None if known is None else known[1].astype(float)
         for name, estimate in asked.feet_along[names.index(known[0]) + 1 if known else 0 :]:
-            kept = residuals(content, sights, estimate, feet).feet.astype(np.float32)
+            kept = residuals(sights, estimate, feet).feet.astype(np.float32)
             self._feet, feet = (name, kept), kept.astype(float)
         assert feet is not None
         return feet
 
-    def _lengths(self, content: Content, sights: Sights, asked: ShareRequest) -> tuple[Array, Array]:
+    def _lengths(self, sights: Sights, asked: ShareRequest) -> tuple[Array, Array]:
         """(n,) and (m,) lengths of the residuals where the rows are judged, in stated sigmas; what decides which take
         part is remembered.
         """
         name, estimate = asked.judged_at
-        there = residuals(content, sights, estimate, self._feet_of(content, sights, asked))
-        lengths, sums, far = relative_lengths(content, there), [], []
-        columns = content.points, content.curves
+        there = residuals(sights, estimate, self._feet_of(sights, asked))
+        lengths, sums, far = relative_lengths(sights.observations, there), [], []
+        columns = sights.observations.points, sights.observations.curves
         for column, px, own, bound in zip(columns, there.lengths, lengths, asked.bounds, strict=True):
             rows = np.flatnonzero(~(own <= _FAR * bound))
             far.append((rows, own[rows]))
@@ -274,11 +274,11 @@ class Share:
         self._judged = _RowBounds(name, asked.bounds, far, np.array(sums))
         return lengths
 
-    def _judged_by(self, content: Content, sights: Sights, asked: ShareRequest) -> _RowBounds:
+    def _judged_by(self, sights: Sights, asked: ShareRequest) -> _RowBounds:
         """What decides which rows take part, from before where that will do."""
         known = self._judged
         if known is None or not known.will_do(asked):
-            self._lengths(content, sights, asked)
+            self._lengths(sights, asked)
         assert self._judged is not None
         return self._judged
 
@@ -286,10 +286,10 @@ class Share:
 
     def looked(self, asked: ShareRequest) -> Looked:
         """What the residuals are like where the rows are judged."""
-        content, sights = self._loaded()
-        points, curves = self._lengths(content, sights, asked)
-        there, (p, c) = _rows_in(content, sights), asked.bounds
-        view = np.concatenate([content.points.view, content.curves.view])
+        sights = self._counted(self._world())
+        points, curves = self._lengths(sights, asked)
+        there, (p, c) = shown_rows(sights), asked.bounds
+        view = column_of(sights.observations, "view")
         inside = np.concatenate([points <= p, curves <= c])
         relative = np.concatenate([points / asked.weighting.point_scale, curves / asked.weighting.curve_scale])[inside]
         count, size = np.where(np.arange(len(view)) < len(points), 2, 1), len(self.views)
@@ -321,31 +321,26 @@ class Share:
 
     def used(self, asked: ShareRequest) -> Used:
         """Which rows take part, and how far off the others are."""
-        content, sights = self._loaded()
-        judged = self._judged_by(content, sights, asked)
-        world = np.split(_rows_in(content, sights_of(content)), [len(content.points)])
+        world = self._world()
+        content, judged = world.observations, self._judged_by(self._counted(world), asked)
+        shown = np.split(shown_rows(world), [len(content.points)])
         sums, rows, sigmas = judged.sums.copy(), [], []
         for kind, column in enumerate((content.points, content.curves)):
             far, lengths = judged.far[kind]
             inside, sigma_px = lengths <= asked.bounds[kind], column.sigma_px[far]
             sums[kind] += _sums((lengths * sigma_px)[inside], sigma_px[inside])
-            out = ~inside & world[kind][far]
+            out = ~inside & shown[kind][far]
             rows.append(self.first_rows[kind] + far[out])
             sigmas.append(lengths[out])
         return Used(sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
 
     def _problems(self, asked: ShareRequest) -> Iterator[tuple[Sights, Problem]]:
         """Each sight with the rows that take part, and its problem."""
-        content, sights = self._loaded()
-        part = sights.used(*self._judged_by(content, sights, asked).taking_part(content, asked))
-        feet = self._feet_of(content, sights, asked)
+        sights = self._counted(self._world())
+        part = sights.used(*self._judged_by(sights, asked).taking_part(sights.observations, asked))
+        feet = self._feet_of(sights, asked)
         problem = Problem(part, asked.layout, (), asked.weighting, feet=feet)
         return ((sight, problem) for sight in part)
-
-
-def _rows_in(content: Content, sights: Sights) -> Mask:
-    """(n + m,) the rows that the sights of the world show."""
-    return shown_rows(content, sights.take(sights.numbers(placements=(None,))))
 
 
 def owners_of(key: SightKey, slots: Sequence[int]) -> list[tuple[str, str]]:

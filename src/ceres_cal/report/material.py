@@ -97,7 +97,7 @@ class Material(Quality):
         )  # reads: "..." in place of the paper's method
         if isinstance(calibration, CalibrationError):
             return str(calibration)
-        remaining = residuals(self.observations, gather_sights(self.observations), calibration.estimate)
+        remaining = residuals(gather_sights(self.observations), calibration.estimate)
         lengths = np.concatenate([np.linalg.norm(remaining.points, axis=1), np.abs(remaining.curves)])
         return ClosedForm(calibration, lengths)
 

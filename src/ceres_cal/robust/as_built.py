@@ -55,11 +55,11 @@ class Built(Frozen):
     whole: Structure = EXACT
     sd: Array = field(default_factory=lambda: np.empty(0))
 
-    def held(self, sights: Sights, observations: Observations) -> Sights:
+    def held(self, sights: Sights) -> Sights:
         """The sights of targets that are drawn as they are built."""
         if not self.every:
             return sights
-        own = make_structure(observations.targets, tolerances_of(self.every))
+        own = make_structure(sights.observations.targets, tolerances_of(self.every))
         return own.carrying(self.whole).built_into(sights)
 
 
@@ -68,7 +68,6 @@ AS_DRAWN = Built()
 
 def solve_as_built(
     problem: Problem,
-    observations: Observations,
     end: RobustSolution,
     explanations: tuple[Explanation, ...],
     solver: Solver,
@@ -80,44 +79,44 @@ def solve_as_built(
         problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
             drawn as `built`. solver: of some of the observations, see `compete`.
     """
-    options, stated = problem.options, end.estimate.structure
+    observations, options, stated = problem.observations, problem.options, end.estimate.structure
 
     def solved(there: Built) -> RobustSolution:
-        held = taking_part(_held(problem, there, observations), observations, explanations)
-        return solve_robustly(held, observations, replace(end.estimate, structure=stated), is_near=True)
+        held = taking_part(_held(problem, there), explanations)
+        return solve_robustly(held, replace(end.estimate, structure=stated), is_near=True)
 
     def freed(there: Built) -> Structure:
         tolerances = {**options.tolerances, **tolerances_of(there.every)}
         structure = make_structure(observations.targets, tolerances, options.dimensions)
         return structure.carrying(there.whole, end.estimate.structure)
 
-    now = estimate_as_built(problem, observations, _freed(end, problem, freed(built)) if built.every else end)
+    now = estimate_as_built(problem, _freed(end, problem, freed(built)) if built.every else end)
     if not now.every:
         if built.every:
-            end, explanations = compete(problem, observations, solved(now), solver)
+            end, explanations = compete(problem, solved(now), solver)
         return end, problem, explanations, ()
     before, rounds, change = now, 1, _change(now, built)
     end = solved(before)
     while change > 2.0 and rounds < _MOST_ROUNDS:  # the next one is less than half of it
-        now = estimate_as_built(problem, observations, _freed(end, problem, freed(before)))
+        now = estimate_as_built(problem, _freed(end, problem, freed(before)))
         change = _change(now, before) if now.every else 0.0
         if change > 1.0:
             before, rounds = now, rounds + 1
             end = solved(before)
     every, structure = before.every, freed(before)
     if _change(before, built) > 1.0:
-        end, explanations = compete(_held(problem, before, observations), observations, end, solver)
+        end, explanations = compete(_held(problem, before), end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
     estimate = replace(end.estimate, structure=structure)
-    part = taking_part(problem, observations, explanations)
+    part = taking_part(problem, explanations)
     if {view.target for view in observations.views if view.placement is None} & {one.target for one in every}:
-        end = solve_robustly(part, observations, estimate, is_near=True)
+        end = solve_robustly(part, estimate, is_near=True)
     else:
         settled = replace(end.solution, estimate=estimate)
-        end = replace(judge_at(part, observations, estimate), solution=settled, rounds=end.rounds)
-    end, structure = end.moved_to(end.estimate, observations, problem), end.estimate.structure
-    return end, problem, explanations, tuple(_measured(every, structure, observations))
+        end = replace(judge_at(part, estimate), solution=settled, rounds=end.rounds)
+    end, structure = end.moved_to(end.estimate, problem), end.estimate.structure
+    return end, problem, explanations, tuple(_measured(every, structure, observations.targets))
 
 
 def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:
@@ -135,9 +134,9 @@ def words_of(every: Sequence[AsBuilt]) -> tuple[str, ...]:
     return tuple(f"{target!r} is not as drawn: {words}; solved for" for target, words in said.items())
 
 
-def _held(problem: Problem, built: Built, observations: Observations) -> Problem:
+def _held(problem: Problem, built: Built) -> Problem:
     """The problem of targets that are drawn as they are built."""
-    return replace(problem, sights=built.held(problem.sights, observations))
+    return replace(problem, sights=built.held(problem.sights))
 
 
 def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> RobustSolution:
@@ -148,12 +147,12 @@ def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> Robus
     return replace(end, problem=replace(end.problem, sights=sights), solution=solution)
 
 
-def taking_part(problem: Problem, observations: Observations, explanations: Sequence[Explanation]) -> Problem:
+def taking_part(problem: Problem, explanations: Sequence[Explanation]) -> Problem:
     """The problem without what they took out."""
     rows = [one.rows for one in explanations if one.is_taken]
     if not rows:
         return problem
-    kept, points = ~np.any(rows, axis=0), len(observations.points)
+    kept, points = ~np.any(rows, axis=0), len(problem.observations.points)
     part = problem.used(kept[:points], kept[points:])
     return replace(part, layout=part.layout.of(part.sights.keys))
 
@@ -171,9 +170,9 @@ def _change(now: Built, before: Built) -> float:
     return float(max(max(logs, default=0.0) / _AT_REST, moved / _STILL))
 
 
-def _measured(every: Sequence[AsBuilt], structure: Structure, observations: Observations) -> Iterator[AsBuilt]:
+def _measured(every: Sequence[AsBuilt], structure: Structure, targets: Mapping[str, Target]) -> Iterator[AsBuilt]:
     """The same with the offsets that came out."""
-    numbers = numbers_by_kind(structure, observations.targets)
+    numbers = numbers_by_kind(structure, targets)
     for one in every:
         yield replace(one, rms_m=rms(structure.values[numbers[one.target, one.kind]]))
 
@@ -244,7 +243,7 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
 _REPEATS = 2.0
 
 
-def estimate_as_built(problem: Problem, observations: Observations, end: RobustSolution) -> Built:
+def estimate_as_built(problem: Problem, end: RobustSolution) -> Built:
     """The kinds of features that are likely not where they are drawn, of targets without a stated tolerance; and the
     whole structure with their likeliest offsets, and those of stated tolerances as they are.
 
@@ -252,14 +251,14 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
         problem: of all the observations. end: of its rounds.
     """
     most_screened, most_sights = 12, 200  # of a camera: that are asked first, and that tell the sigma
-    structure, tolerances = whole_structure(observations.targets), problem.options.tolerances
-    dimensions = problem.options.dimensions
-    stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.estimate.structure)
-    kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
+    targets, tolerances = problem.observations.targets, problem.options.tolerances
+    structure, dimensions = whole_structure(targets), problem.options.dimensions
+    stated = make_structure(targets, tolerances, dimensions).carrying(end.estimate.structure)
+    kinds = {of: n for of, n in numbers_by_kind(structure, targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
         return Built((), structure.carrying(stated))
     sights = some_sights(end.problem.sights, most_screened)
-    equations, weights = _equations(stated, observations, end, sights)
+    equations, weights = _equations(stated, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
     repeat = {of for of, numbers in kinds.items() if agreement(scores[:, numbers]) > _REPEATS}
@@ -267,13 +266,13 @@ def estimate_as_built(problem: Problem, observations: Observations, end: RobustS
         return Built((), structure.carrying(stated))
     # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved. But
     # heights, as many as points, took up what a wrong floor left of eight views of a board: they repeat by themselves.
-    structure = whole_structure(observations.targets, {target for target, kind in repeat if kind == "heights"})
-    numbered = numbers_by_kind(structure, observations.targets)
+    structure = whole_structure(targets, {target for target, kind in repeat if kind == "heights"})
+    numbered = numbers_by_kind(structure, targets)
     kinds, as_stated = {of: numbered[of] for of in kinds if of in numbered}, structure.carrying(stated)
-    equations, weights = _equations(stated, observations, end, some_sights(end.problem.sights, most_sights))
+    equations, weights = _equations(stated, end, some_sights(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
-    every = tuple(_likely(repeats, kinds, observations))
+    every = tuple(_likely(repeats, kinds, targets))
     numbers = [kinds[one.target, one.kind] for one in every]
     moved = np.concatenate([np.empty(0, dtype=np.int64), *numbers])
     sigmas = np.repeat([one.sigma_m for one in every], [len(own) for own in numbers])
@@ -296,16 +295,14 @@ def some_sights(sights: Sights, most: int) -> Sights:
 # ---- columns of the structure ---------------------------------------------------------------------------------------
 
 
-def _equations(
-    stated: Structure, observations: Observations, end: RobustSolution, sights: Sights
-) -> tuple[Equations, Weights]:
+def _equations(stated: Structure, end: RobustSolution, sights: Sights) -> tuple[Equations, Weights]:
     """Of some sights, with the residuals to the drawing, offsets that were found before taken off."""
     estimate = end.estimate
-    equations = equations_of(observations, sights, estimate, end.residuals)
+    equations = equations_of(sights, estimate, end.residuals)
     stated_alone = stated.carrying(estimate.structure)
     before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
     solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
-    weights = end.weights_of(observations, equations)
+    weights = end.weights_of(equations)
     return replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1)), weights
 
 
@@ -347,10 +344,10 @@ def smooth_image(equations: Equations, estimate: Estimate) -> Array:
 
 
 def _likely(
-    repeats: RepeatedAmounts, kinds: Mapping[tuple[str, Kind], Indices], observations: Observations
+    repeats: RepeatedAmounts, kinds: Mapping[tuple[str, Kind], Indices], targets: Mapping[str, Target]
 ) -> Iterator[AsBuilt]:
     """The kinds that more likely scatter than not, each beside those of the others that do."""
-    extents = {target: float(np.max(np.ptp(observations.targets[target].box, axis=0))) for target, _ in kinds}
+    extents = {target: float(np.max(np.ptp(targets[target].box, axis=0))) for target, _ in kinds}
     priors = {of: (HEIGHTS if of[1] == "heights" else AS_BUILT).times(extents[of[0]]) for of in kinds}
     sizes = repeats.sizes(kinds, priors)
     for target, kind in kinds:

@@ -233,7 +233,7 @@ class _SumRounds(Rounds[_SumRound]):
         self._problem, self._progress = problem, progress
         placed = np.flatnonzero([key.placement is not None for key in problem.sights.keys])
         self._core = problem.sights.take(placed)
-        points, curves = np.split(shown_rows(self._few, self._core), [len(self._few.points)])
+        points, curves = np.split(shown_rows(self._core), [len(self._few.points)])
         self._placed, self._before = (points, curves), end
         self._along: tuple[tuple[str, Estimate], ...] = ()
         self._unknowns = problem.unknowns(end.estimate)
@@ -241,7 +241,7 @@ class _SumRounds(Rounds[_SumRound]):
     def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _BulkResiduals:
         name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
         self._along = (*self._along, (name, of_world(estimate)))
-        here = residuals(self._few, self._problem.sights, estimate)
+        here = residuals(self._problem.sights, estimate)
         points, curves = relative_lengths(self._few, here)
         if self._part.gone is not None:
             gone = np.split(self._part.gone, [len(points)])

@@ -31,7 +31,6 @@ from ceres_cal.effects.aside import (
 )
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.linearised import make_linear_model
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import column_of, shown_rows, some_views, thinned_by_key
 from ceres_cal.problem.bundle import with_placements_at_best
 from ceres_cal.problem.problem import Problem
@@ -62,13 +61,12 @@ class Subproblem(Frozen):
     """
 
     problem: Problem
-    observations: Observations
     end: RobustSolution
     kinds: Sequence[ObservationGroups]
 
     def of_rows(self, rows: Mask) -> Problem:
         """The problem of these (n + m,)."""
-        points = len(self.observations.points)
+        points = len(self.problem.observations.points)
         return self.problem.used(rows[:points], rows[points:])
 
     def without(self, rows: Mask) -> Problem:
@@ -81,21 +79,19 @@ Solver = Callable[[Problem, Subproblem], RobustSolution]
 """Solves a problem of some of the observations that are compared_part, from a start that the others had no part in."""
 
 
-def compete(
-    problem: Problem, observations: Observations, end: RobustSolution, solver: Solver
-) -> tuple[RobustSolution, tuple[Explanation, ...]]:
+def compete(problem: Problem, end: RobustSolution, solver: Solver) -> tuple[RobustSolution, tuple[Explanation, ...]]:
     """The end of all rounds without the groups that do not belong, and these; also those that are in doubt.
 
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    every = Subproblem(problem, observations, end, list(groups_of(observations, problem.sights)))
+    every = Subproblem(problem, end, list(groups_of(problem.sights)))
     if not every.kinds:
         return end, ()
     part = compared_part(every)
     some = _freed(part, solver)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
-    taking_part = np.ones(observations.rows, dtype=bool)
+    taking_part = np.ones(problem.observations.rows, dtype=bool)
     for trial in trials:
         groups = every.kinds[some.kinds.index(trial.suspects[0])]
         own = [groups.among([number]) & taking_part for number in trial.suspects[1]]
@@ -106,13 +102,13 @@ def compete(
             end = trial.end
     if not taking_part.all():
         end = end if some is every else solver(every.without(~taking_part), every)
-        end = replace(end, residuals=residuals(observations, problem.sights, end.estimate))
+        end = replace(end, residuals=residuals(problem.sights, end.estimate))
     return end, tuple(explanations)
 
 
 def _freed(every: Subproblem, solver: Solver) -> Subproblem:
     """Without the statements that look wrong: a line is not blamed for what they bend."""
-    freed = without_suspicious(every.problem, every.observations, every.end)
+    freed = without_suspicious(every.problem, every.end)
     # Where that fails they are competed with as stated; what contradicts them is tested afterwards.
     end = None if freed is every.problem else _solved(freed, every, solver)
     return every if end is None else replace(every, problem=freed, end=end)
@@ -168,7 +164,7 @@ class _Competition:
     def __init__(self, some: Subproblem, solver: Solver) -> None:
         self._some, self._solver = some, solver
         self._tried: set[tuple[int, ...]] = set()
-        self._taking_part = np.ones(some.observations.rows, dtype=bool)
+        self._taking_part = np.ones(some.problem.observations.rows, dtype=bool)
 
     def decided(self) -> list[_Trial]:
         """The trials of groups that do not belong, one after the other; the last one may be in doubt."""
@@ -237,7 +233,7 @@ class _Competition:
         without = self._without(groups, numbers)
         if without is None:
             return None
-        there = residuals(self._some.observations, self._some.problem.sights, without.estimate)
+        there = residuals(self._some.problem.sights, without.estimate)
         chosen, offsets = self._offsets(replace(without, residuals=there), groups, numbers)
         if offsets is None:
             return None
@@ -265,7 +261,7 @@ class _Competition:
         gone = groups.among(numbers)
         end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
         every = self._some.problem
-        there = residuals(self._some.observations, every.sights, end.estimate)
+        there = residuals(every.sights, end.estimate)
         require_fits(replace(end, residuals=there), every)
         if isinstance(groups, FeatureGroups):
             return end
@@ -281,13 +277,12 @@ class _Competition:
         None where some of these lie here and there: they are no group.
         """
         recalled = groups.among(back) & self._taking_part
-        observations, problem = self._some.observations, self._some.problem
         rows = rows_compared(groups, end, self._taking_part, recalled)
         sights = self._some.of_rows(rows).sights
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
-        equations = write_equations(observations, sights, end.estimate, end.residuals)
-        weights = end.weights_of(observations, equations)
+        equations = write_equations(sights, end.estimate, end.residuals)
+        weights = end.weights_of(equations)
         here = recalled[equations.observation]
         used = weights.used | here
         chosen, share = groups_compared(groups, end, rows & (end.inliers.rows | recalled), back)
@@ -296,14 +291,14 @@ class _Competition:
             own = np.flatnonzero(effect.group == np.searchsorted(chosen, number))
             left = (equations.residual * weights.inverse_sigma)[own]
             left = left + effect.columns[own] @ least_absolute(effect.columns[own], left)
-            agree = np.abs(left) <= problem.options.reject_sigma
+            agree = np.abs(left) <= self._some.problem.options.reject_sigma
             if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
                 return chosen, None
             used[own] = agree
         if len(chosen) < 2:
             return chosen, None
         weights = replace(weights, used=used, robust=np.where(here, 1.0, weights.robust))
-        model = make_linear_model(problem, end.estimate, equations, weights)
+        model = make_linear_model(self._some.problem, end.estimate, equations, weights)
         prior = groups.prior  # that it is one of those that are compared
         return chosen, measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
 
@@ -314,10 +309,10 @@ class _Competition:
 def compared_part(every: Subproblem) -> Subproblem:
     """All observations, or of very many some: of views that stand out, and of others evenly."""
     most_rejected = 4  # such groups of a kind, whose views are asked
-    observations, sights = every.observations, every.problem.sights
+    sights, observations = every.problem.sights, every.problem.observations
     if len(sights.point_rows) + len(sights.curve_rows) <= _MOST_ASKED:
         return every
-    there, view = shown_rows(observations, sights), column_of(observations, "view")
+    there, view = shown_rows(sights), column_of(observations, "view")
     chosen = np.zeros(len(observations.views), dtype=bool)
     chosen[some_views(np.bincount(view[there], minlength=len(chosen)), _MOST_ASKED, _FEWEST_ASKED)] = True
     for groups in every.kinds:
@@ -330,14 +325,13 @@ def compared_part(every: Subproblem) -> Subproblem:
 
 def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
     """Some rows (n + m,) of all, the first of them points, as if there were no others."""
-    p, c = rows[:split], rows[split:] - len(every.observations.points)
-    observations, problem = every.observations.part(p, c), every.problem.of_rows(p, c)
-    there, inliers = every.end.residuals.of_rows(p, c), every.end.inliers.of_rows(p, c)
-    weighting = every.end.problem.weighting
+    p, c = rows[:split], rows[split:] - len(every.problem.observations.points)
+    problem, there = every.problem.of_rows(p, c), every.end.residuals.of_rows(p, c)
+    inliers, weighting = every.end.inliers.of_rows(p, c), every.end.problem.weighting
     used = replace(problem.used(inliers.points, inliers.curves), weighting=weighting, feet=there.feet)
     end = replace(every.end, problem=used, inliers=inliers, residuals=there)
-    kinds = [replace(groups, observations=observations, of=groups.of[rows]) for groups in every.kinds]
-    return Subproblem(problem, observations, end, kinds)
+    kinds = [replace(groups, observations=problem.observations, of=groups.of[rows]) for groups in every.kinds]
+    return Subproblem(problem, end, kinds)
 
 
 # ---- what is compared ----------------------------------------------------------------------------------------------

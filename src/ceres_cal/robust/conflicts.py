@@ -26,7 +26,6 @@ from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.effects.evidence import FEATURE_ASIDE
-from ceres_cal.observations import Observations
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Information, Key, over
 from ceres_cal.problem.parameters import Estimate
@@ -212,7 +211,6 @@ class Doubt(NamedTuple):
 @numerical("the test of what was stated")
 def find_conflicts(
     problem: Problem,
-    observations: Observations,
     end: RobustSolution,
     usual: tuple[float, float] | None = None,
     part: Problem | None = None,
@@ -226,18 +224,18 @@ def find_conflicts(
             without an outlier; None where the answer stays. shifts_at: by which numbers scatter besides.
     """
     most = 4  # solves
-    every = tuple(statements(problem, observations, end.estimate))
+    every = tuple(statements(problem, end.estimate))
     if not every:
         return Conflicts()
     reduced = end.told
-    search = _ForwardSelection(problem, end, observations, usual, every, shifts_at)
+    search = _ForwardSelection(problem, end, usual, every, shifts_at)
     while search.solves < most and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
     named = (*(one for _, one in pairs), *search.conflicts())
     priors, answer = agreed(problem.priors, named), None
     if part is not None and priors != problem.priors:
-        answer = _solved(replace(part, priors=priors), observations, search.end, usual)
+        answer = _solved(replace(part, priors=priors), search.end, usual)
     if answer is None:
         shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.places[1:]]
     else:
@@ -246,12 +244,12 @@ def find_conflicts(
     return Conflicts(named, reduced.shared.keys, tuple(shifts), answer, tuple(search.doubts))
 
 
-def without_suspicious(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
+def without_suspicious(problem: Problem, end: RobustSolution) -> Problem:
     """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
     others. Tolerances stay: a line that its own one does not hold is a line aside.
     """
     estimate = end.estimate
-    for one in statements(problem, observations, estimate):
+    for one in statements(problem, estimate):
         if one.kind in ("earlier", "tolerance"):
             continue
         if worst_test(one, linear_rest(one, end)).log_p < np.log(_SUSPICIOUS):
@@ -291,11 +289,9 @@ def _wrong(squared: float) -> float:
 
 
 @or_none  # quiet: the linear test decides, and the answer stays
-def _solved(
-    problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None
-) -> RobustSolution | None:
+def _solved(problem: Problem, end: RobustSolution, usual: tuple[float, float] | None) -> RobustSolution | None:
     """The problem solved from where another one ended; None where it cannot be."""
-    after = solve_robustly(replace(problem, feet=end.residuals.feet), observations, end.estimate, usual)
+    after = solve_robustly(replace(problem, feet=end.residuals.feet), end.estimate, usual)
     return None if after.solution.failed else after
 
 
@@ -312,7 +308,6 @@ class _ForwardSelection:
 
     problem: Problem
     end: RobustSolution
-    observations: Observations
     usual: tuple[float, float] | None
     every: tuple[Statement, ...]
     shifts_at: ShiftsAt | None
@@ -341,7 +336,7 @@ class _ForwardSelection:
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.estimate)
-        after = None if suspect.kind == "earlier" else _solved(freed, self.observations, self.end, self.usual)
+        after = None if suspect.kind == "earlier" else _solved(freed, self.end, self.usual)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
@@ -374,7 +369,7 @@ class _ForwardSelection:
         """About the shared numbers at an end, as the observations scatter."""
         estimate = end.estimate
         reduced = end.told
-        known = scattered(reduced, measure_scatter(self.observations, end.problem, end.residuals, estimate, reduced))
+        known = scattered(reduced, measure_scatter(end.problem, end.residuals, estimate, reduced))
         if self.shifts_at is None:
             return known
         keys, shifts = self.shifts_at(estimate, end.problem.priors)

@@ -21,7 +21,6 @@ from ceres_cal.effects.evidence import FLOOR_OFF, LIKELY, RepeatedAmounts, shift
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.strands import strand_names
 from ceres_cal.effects.table import estimated
-from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.priors import GaussianPrior
@@ -48,19 +47,17 @@ class EffectsEnd(Frozen):
     shifts_at: ShiftsAt
 
 
-def solve_beside_effects(
-    problem: Problem, part: Problem, observations: Observations, end: RobustSolution, *, solves: bool = True
-) -> EffectsEnd:
+def solve_beside_effects(problem: Problem, part: Problem, end: RobustSolution, *, solves: bool = True) -> EffectsEnd:
     """The end with everything solved for that likely displaces the observations.
 
     Args:
         problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
         solves: whether likely effects are; where the observations are a part of those that count, they only widen.
     """
-    points, off = len(observations.points), np.zeros((observations.rows, 2))
+    points, off = len(problem.observations.points), np.zeros((problem.observations.rows, 2))
 
     def amounts_at(under: Problem, end: RobustSolution) -> _Amounts:
-        return _Amounts.of(under, observations, end, off, solves)
+        return _Amounts.of(under, end, off, solves)
 
     displaced, amounts = part, amounts_at(part, end)
     for _ in range(_MOST_ROUNDS):
@@ -69,7 +66,7 @@ def solve_beside_effects(
         off = amounts.displacement(len(off))
         shifts = -off[:points], -off[points:]
         displaced = replace(part, sights=part.sights.displaced(*shifts))
-        end = solve_robustly(displaced, observations, end.estimate, is_near=True)
+        end = solve_robustly(displaced, end.estimate, is_near=True)
         before, amounts = amounts, amounts_at(displaced, end)
         if amounts.stay(before):
             break
@@ -80,12 +77,12 @@ def solve_beside_effects(
         own = amounts
         if there is not solved or priors is not None:
             under = displaced if priors is None else replace(displaced, priors=tuple(priors))
-            own = amounts_at(under, last.moved_to(there, observations, under))
+            own = amounts_at(under, last.moved_to(there, under))
         return free_keys(there, part.layout, part.private), list(own.shifts())
 
     if np.any(off):
         problem = replace(problem, sights=problem.sights.displaced(-off[:points], -off[points:]))
-        end = end.moved_to(solved, observations, problem)
+        end = end.moved_to(solved, problem)
     return EffectsEnd(problem, end, tuple(amounts.estimates()), shifts_at)
 
 
@@ -114,17 +111,15 @@ class _Amounts(Frozen):
     solves: bool
 
     @classmethod
-    def of(
-        cls, problem: Problem, observations: Observations, end: RobustSolution, off: Array, solves: bool
-    ) -> _Amounts:
+    def of(cls, problem: Problem, end: RobustSolution, off: Array, solves: bool) -> _Amounts:
         """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
         estimate = end.estimate
-        equations = write_equations(observations, problem.sights, estimate, end.residuals)
+        equations = write_equations(problem.sights, estimate, end.residuals)
         equations = replace(equations, residual=equations.residual - equations.along(off))
-        model = make_linear_model(problem, estimate, equations, end.weights_of(observations, equations))
-        case = Case(observations, problem, estimate, model)
+        model = make_linear_model(problem, estimate, equations, end.weights_of(equations))
+        case = Case(problem, estimate, model)
         groups, parts, size = list[_EffectGroup](), list[SparseColumns](), 0
-        for effect in estimated(observations):
+        for effect in estimated(problem.observations):
             for columns in effect.columns(case):
                 width, count = columns.columns.shape[1], len(columns.subjects)
                 scaled = columns.columns * model.weight[:, None]

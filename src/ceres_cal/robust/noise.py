@@ -307,7 +307,6 @@ class Fitted(Frozen):
     """
 
     problem: Problem
-    observations: Observations
     estimate: Estimate
     residuals: Residuals
     used: Mask
@@ -332,10 +331,10 @@ def deleted_lengths(rows: Mask, weighting: Weighting, fitted: Fitted) -> tuple[I
     """Of some of the observations (N + M,), whose residuals are finite: which one each is, and the length of its
     deleted residual in that one's standard deviations.
     """
-    observations, estimate = fitted.observations, fitted.estimate
-    sights = fitted.problem.sights.used(*np.split(rows, [len(observations.points)]))
-    equations = equations_of(observations, sights, estimate, fitted.residuals)
-    weights = equation_weights(observations, weighting, equations, fitted.residuals)
+    estimate = fitted.estimate
+    sights = fitted.problem.sights.used(*np.split(rows, [len(fitted.problem.observations.points)]))
+    equations = equations_of(sights, estimate, fitted.residuals)
+    weights = equation_weights(weighting, equations, fitted.residuals)
     share = np.where(fitted.used[equations.observation], weights.robust, 0.0)
     leverage, overlap = _leverages(equations, weights.inverse_sigma, estimate, fitted.reduced)
     residual = weights.inverse_sigma * equations.residual

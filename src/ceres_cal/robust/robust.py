@@ -15,7 +15,6 @@ from ceres_cal.base.arrays import Indices, numerical
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.linearised import Weights, equation_weights
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
 from ceres_cal.problem.parameters import Estimate
@@ -72,14 +71,14 @@ class RobustSolution(Frozen):
         """Whether nothing worth another solve changed since another round."""
         return self.inliers.same_as(before.inliers, no_change)
 
-    def weights_of(self, observations: Observations, equations: Equations) -> Weights:
+    def weights_of(self, equations: Equations) -> Weights:
         """How the equations counted."""
         taking_part = self.inliers.points, self.inliers.curves
-        return equation_weights(observations, self.problem.weighting, equations, self.residuals, taking_part)
+        return equation_weights(self.problem.weighting, equations, self.residuals, taking_part)
 
-    def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
+    def moved_to(self, estimate: Estimate, problem: Problem) -> RobustSolution:
         """The same with another estimate. `problem`: of all the observations."""
-        there = residuals(observations, problem.sights, estimate, self.residuals.feet)
+        there = residuals(problem.sights, estimate, self.residuals.feet)
         return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
 
 
@@ -141,7 +140,6 @@ _MUCH_LESS = 0.3
 @numerical("the solve")
 def solve_robustly(
     problem: Problem,
-    observations: Observations,
     estimate: Estimate,
     usual: tuple[float, float] | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -163,14 +161,14 @@ def solve_robustly(
     Raises:
         CalibrationError: see `solve`.
     """
-    rounds = _RowRounds(problem, observations, usual, progress)
+    rounds = _RowRounds(problem, usual, progress)
     state = rounds.posed(estimate) if is_near else rounds.first(estimate)
     return rounds.to_rest(state, most_rounds, is_near=is_near)
 
 
-def judge_at(problem: Problem, observations: Observations, estimate: Estimate) -> RobustSolution:
+def judge_at(problem: Problem, estimate: Estimate) -> RobustSolution:
     """Noise and outliers by the leverages at an estimate, where nothing is solved."""
-    rounds = _RowRounds(problem, observations, None, None)
+    rounds = _RowRounds(problem, None, None)
     return rounds.by_leverages(rounds.at(estimate))
 
 
@@ -178,13 +176,9 @@ class _RowRounds(Rounds[RobustSolution]):
     """The rounds over rows that are at hand."""
 
     def __init__(
-        self,
-        problem: Problem,
-        observations: Observations,
-        usual: tuple[float, float] | None,
-        progress: Callable[[Progress], None] | None,
+        self, problem: Problem, usual: tuple[float, float] | None, progress: Callable[[Progress], None] | None
     ) -> None:
-        self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
+        self._problem, self._usual, self._progress = problem, usual, progress
         self._redundancy: Redundancy | None = None
         self._moving = 0.0
         self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
@@ -201,30 +195,30 @@ class _RowRounds(Rounds[RobustSolution]):
 
     def first(self, estimate: Estimate) -> RobustSolution:
         """The rough solve from a start."""
-        there = residuals(self._observations, self._problem.sights, estimate, self._problem.feet)
-        return self._rough(estimate, there, visible_from(self._observations, there), 1)
+        there = residuals(self._problem.sights, estimate, self._problem.feet)
+        return self._rough(estimate, there, visible_from(self._problem.observations, there), 1)
 
     def at(self, estimate: Estimate) -> RobustSolution:
         """An estimate as it is, judged."""
-        there = residuals(self._observations, self._problem.sights, estimate, self._problem.feet)
+        there = residuals(self._problem.sights, estimate, self._problem.feet)
         solution = Solution(estimate, np.nan, False, "", ())
         return self._with(self._judge(solution, there), solution, there, 0)
 
     def posed(self, estimate: Estimate) -> RobustSolution:
         """A start near the minimum, its private placements at their best."""
-        there = residuals(self._observations, self._problem.sights, estimate, self._problem.feet)
-        visible = visible_from(self._observations, there)
+        there = residuals(self._problem.sights, estimate, self._problem.feet)
+        visible = visible_from(self._problem.observations, there)
         weighting = Weighting(visible.point_scale, visible.curve_scale, "cauchy", loss_scale=1.0)
         problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
         estimate = with_placements_at_best(problem, estimate)
         state = self._judged(Solution(estimate, np.nan, False, "", ()), there, 0)
-        self._scales = visible_from(self._observations, state.residuals).scales
+        self._scales = visible_from(self._problem.observations, state.residuals).scales
         return state
 
     def refined(self, state: RobustSolution) -> RobustSolution:
         """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
         for _ in range(_MOST_REFINED):
-            visible = visible_from(self._observations, state.residuals)
+            visible = visible_from(self._problem.observations, state.residuals)
             if not _much_below(visible.scales, self._scales):
                 break
             state = self._rough(state.estimate, state.residuals, visible, state.rounds + 1)
@@ -248,7 +242,7 @@ class _RowRounds(Rounds[RobustSolution]):
             )
         few = problem.of_sights(_evenly(problem))
         if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
-            of_few = _RowRounds(few, self._observations, self._usual, self._progress)
+            of_few = _RowRounds(few, self._usual, self._progress)
             end = of_few.to_rest(of_few.first(estimate), most_rounds=2)
             self._scales = of_few._scales  # at which they were solved, not those of the start
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
@@ -325,14 +319,14 @@ class _RowRounds(Rounds[RobustSolution]):
         self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
         inliers, rows = self._judge(state.solution, state.residuals), state.inliers.rows
         estimate, there = state.estimate, state.residuals
-        fitted = Fitted(self._problem, self._observations, estimate, there, rows, reduced)
+        fitted = Fitted(self._problem, estimate, there, rows, reduced)
         return by_deleted_residuals(inliers, fitted), reduced
 
     def _judged(
         self, solution: Solution, before: Residuals, rounds: int, inliers: Inliers | None = None
     ) -> RobustSolution:
         """Where a solve, of these inliers, ended, and the problem that the inliers there make."""
-        there = residuals(self._observations, self._problem.sights, solution.estimate, before.feet)
+        there = residuals(self._problem.sights, solution.estimate, before.feet)
         anew = self._judge(solution, there)
         if inliers is not None and anew.same_as(inliers, self.no_change):
             anew = anew.with_rows(inliers.rows)
@@ -342,7 +336,7 @@ class _RowRounds(Rounds[RobustSolution]):
         redundancy = self._redundancy or by_count(
             self._problem.sights.equations, self._problem.unknowns(solution.estimate)
         )
-        return judge(self._observations, there, redundancy, self._problem.options, self._usual)
+        return judge(self._problem.observations, there, redundancy, self._problem.options, self._usual)
 
     def _with(self, inliers: Inliers, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
         """The state with the problem that the inliers make; rows are not moved where the last ones were the same."""

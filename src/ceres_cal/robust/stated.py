@@ -12,7 +12,6 @@ from ceres_cal.base.arrays import Array, is_diagonal
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.base.words import two_digits
-from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.priors import GaussianPrior
@@ -109,12 +108,12 @@ def is_plain(prior: GaussianPrior) -> bool:
     return is_diagonal(prior.information.matrix)
 
 
-def statements(problem: Problem, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
+def statements(problem: Problem, estimate: Estimate) -> Iterator[Statement]:
     """Everything stated of a problem's numbers, and what is held by name; a tolerance that was estimated is none."""
     told, every = problem.options.tolerances, problem.stated_at(estimate)
     plain = ([key for key in prior.keys if key.kind != "structure" or key.owner in told] for prior in every)
     yield from grouped([one.given(own) if is_plain(one) else one for one, own in zip(every, plain, strict=True)])
-    yield from _held(problem.options, observations, estimate)
+    yield from _held(problem.options, estimate)
 
 
 def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
@@ -155,10 +154,10 @@ def agreed(priors: Sequence[GaussianPrior], conflicts: Sequence[Conflict]) -> tu
     return tuple(left)
 
 
-def _held(options: Options, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
+def _held(options: Options, estimate: Estimate) -> Iterator[Statement]:
     """What the options hold by name, the principal point as one."""
-    for name in observations.cameras:
-        every = {key.quantity: key for key in intrinsic_keys(name, estimate.cameras[name].lens)}
+    for name, camera in estimate.cameras.items():
+        every = {key.quantity: key for key in intrinsic_keys(name, camera.lens)}
         centre = [q for q in ("cx", "cy") if not options.free_principal_point or q in options.fixed]
         others = [[quantity] for quantity in options.fixed if quantity not in centre]
         for quantities in ([centre] if centre else []) + others:

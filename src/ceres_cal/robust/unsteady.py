@@ -80,8 +80,9 @@ class Unsteady(Frozen):
     keys: Sequence[Key]
     shifts: Array
 
-    def taken_off(self, problem: Problem, points: int) -> Problem:
-        """The problem of observations, of which so many are points, without it."""
+    def taken_off(self, problem: Problem) -> Problem:
+        """The problem without it."""
+        points = len(problem.observations.points)
         sights = problem.sights.displaced(-self.displacement[:points], -self.displacement[points:])
         return replace(problem, sights=sights, taken_up=self.taken_up)
 
@@ -111,20 +112,17 @@ def _centre_moves(sizes: Sizes) -> bool:
     return sizes.get(_CENTRE_OF_VIEW, 0.0) > _LEAST_PX
 
 
-def find_unsteady(
-    problem: Problem, observations: Observations, end: RobustSolution, before: Unsteady | None
-) -> Unsteady | None:
+def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None) -> Unsteady | None:
     """What is found of cameras whose views are likely to be displaced; None where none is.
 
     Args:
         problem: of all the observations, what was found `before` taken off. end: of its rounds.
     """
-    count, estimate = observations.rows, end.estimate
+    count, estimate = problem.observations.rows, end.estimate
     off = np.zeros((count, 2)) if before is None else before.displacement
-    weights_of = partial(end.weights_of, observations)
 
     def model_of(some: Problem, there: Estimate = estimate, *, of_poses: bool = False) -> Linearised:
-        return _model(observations, there, end.residuals, weights_of, off, some, of_poses=of_poses)
+        return _model(there, end.residuals, end.weights_of, off, some, of_poses=of_poses)
 
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
@@ -136,7 +134,7 @@ def find_unsteady(
         some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
         if before is not None or _seem_displaced(model_of(*some.built_as(estimate), of_poses=True)):
             model = model_of(some)
-            if before is None and any(lens_changes(Case(observations, some, estimate, model))):
+            if before is None and any(lens_changes(Case(some, estimate, model))):
                 continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` tells that
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own:
@@ -146,7 +144,6 @@ def find_unsteady(
 
 def without_unsteadiness(
     problem: Problem,
-    observations: Observations,
     estimate: Estimate,
     taking_part: tuple[Mask, Mask],
     effects: Sequence[EffectEstimate],
@@ -155,15 +152,13 @@ def without_unsteadiness(
     sizes = {one.subject: {a.name: a.value for a in one.amounts} for one in effects if one.kind in _KINDS}
     if not sizes:
         return problem
-    there, points = residuals(observations, problem.sights, estimate), len(observations.points)
-    off = np.zeros((points + len(observations.curves), 2))
-    weights_of = partial(equation_weights, observations, problem.weighting, there=there, taking_part=taking_part)
-    model = _model(observations, estimate, there, weights_of, off, problem)
-    return _predicted(model, problem, estimate, sizes, 1.0, len(off)).taken_off(problem, points)
+    there, off = residuals(problem.sights, estimate), np.zeros((problem.observations.rows, 2))
+    weights_of = partial(equation_weights, problem.weighting, there=there, taking_part=taking_part)
+    model = _model(estimate, there, weights_of, off, problem)
+    return _predicted(model, problem, estimate, sizes, 1.0, len(off)).taken_off(problem)
 
 
 def _model(
-    observations: Observations,
     estimate: Estimate,
     there: Residuals,
     weights_of: Callable[[Equations], Weights],
@@ -179,7 +174,7 @@ def _model(
     Args:
         of_poses: whether nothing else is free, which takes half the time.
     """
-    equations = write_equations(observations, problem.sights, estimate, there)
+    equations = write_equations(problem.sights, estimate, there)
     equations = replace(equations, residual=equations.residual - equations.along(off))
     weights = weights_of(equations)
     silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0

@@ -51,7 +51,7 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
             )
 
 
-def require_possible(observations: Observations, sights: Sights, estimate: Estimate, residuals: Residuals) -> None:
+def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -> None:
     """Raise SolutionError where a station cannot stand where it does.
 
     Only a floor is asked that lies in the world: boards are seen from either side, a wall stands upright, a ceiling is
@@ -62,7 +62,7 @@ def require_possible(observations: Observations, sights: Sights, estimate: Estim
     """
     for station, sight in sights.of_world.items():
         camera = estimate.camera_at(station)
-        floor_m = _floor_m(_places_of_world(observations, sight))
+        floor_m = _floor_m(_places_of_world(sight))
         if floor_m is not None and camera.position[2] <= min(floor_m, 0.0):
             raise SolutionError(
                 f"station {station!r}: the camera stands {floor_m - camera.position[2]:.2f} m under the floor that it "
@@ -70,7 +70,7 @@ def require_possible(observations: Observations, sights: Sights, estimate: Estim
             )
         _require_ahead(station, sight, residuals)
         if floor_m is not None:
-            _require_above(floor_m - _BELOW * (camera.position[2] - floor_m), observations, estimate)
+            _require_above(floor_m - _BELOW * (camera.position[2] - floor_m), sights.observations, estimate)
 
 
 def _require_above(least_m: float, observations: Observations, estimate: Estimate) -> None:
@@ -97,10 +97,11 @@ def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
         )
 
 
-def _places_of_world(observations: Observations, sight: Sights) -> Array:
+def _places_of_world(sight: Sights) -> Array:
     """(P, 3) m of what a sight shows of targets that nobody put there: its points, starts and ends of its lines, and
     of its arcs the centre and a quarter.
     """
+    observations = sight.observations
     world = np.array([not observations.targets[view.target].movable for view in observations.views])
     points = sight.points[world[observations.points.view[sight.point_rows]]]
     tracks = sight.tracks[distinct(sight.track_index[world[observations.curves.view[sight.curve_rows]]])]

@@ -16,7 +16,7 @@ from ceres_cal.base.arrays import Array, Indices, numerical
 from ceres_cal.base.errors import attempt
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
-from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
@@ -56,7 +56,7 @@ class Start(Frozen, eq=True):
 
 
 @numerical("the initial estimate")
-def initialise(observations: Observations, sights: Sights, options: Options) -> Start:
+def initialise(sights: Sights, options: Options) -> Start:
     """A start for everything the observations show.
 
     A camera over a field alone, of whose principal point nothing is stated, may show a part of a sensor: where a start
@@ -67,34 +67,35 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     """
     least_sigmas, better = 5.0, 0.75  # that are left; share of them: a wrong quarter leaves 1.3 to 20 times as many
     share = 0.22  # of the picture's size, from its middle
-    start = _initialised(observations, sights, options)
+    observations = sights.observations
+    start = _initialised(sights, options)
     for name, size in observations.cameras.items():
         own = sights.numbers(camera=name)
         stated = [one.quantity for one in (*observations.priors, *options.priors) if one.name == name]
         known = {"principal_point", "cx", "cy"} & {*stated, *options.fixed}
         if known or any(sights.keys[number].placement is not None for number in own):
             continue
-        least, given = better * _left(observations, sights.take(own), start), options
+        least, given = better * _left(sights.take(own), start), options
         for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_sigmas else ():
             there = Prior("camera", name, "principal_point", (x * size[0], y * size[1]), (1.0, 1.0))
             moved = replace(given, priors=(*given.priors, there))
-            other = attempt(partial(_initialised, observations, sights, moved))  # quiet: it is one of five
-            if isinstance(other, Start) and (left := _left(observations, sights.take(own), other)) < least:
+            other = attempt(partial(_initialised, sights, moved))  # quiet: it is one of five
+            if isinstance(other, Start) and (left := _left(sights.take(own), other)) < least:
                 start, least, options = other, left, moved
     return start
 
 
-def _left(observations: Observations, sights: Sights, start: Start) -> float:
+def _left(sights: Sights, start: Start) -> float:
     """The median of what a start leaves of all that these sights hold, in stated sigmas."""
-    points, curves = residuals(observations, sights, start.estimate).lengths
+    points, curves = residuals(sights, start.estimate).lengths
     points, curves = points[sights.point_rows] / sights.sigma_px, curves[sights.curve_rows] / sights.curve_sigma_px
     return float(np.median(np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)))
 
 
-def _initialised(observations: Observations, sights: Sights, options: Options) -> Start:
-    posed = posed_sights(observations, sights, options)
-    stations, placements = chained_poses(observations, sights, posed.numbers, posed.poses, open_numbers=posed.open)
-    structure = options.structure_of(observations.targets)
+def _initialised(sights: Sights, options: Options) -> Start:
+    posed = posed_sights(sights, options)
+    stations, placements = chained_poses(sights, posed.numbers, posed.poses, open_numbers=posed.open)
+    structure = options.structure_of(sights.observations.targets)
     estimate = Estimate(posed.cameras, stations, placements, structure)
     others = tuple(
         replace(
@@ -124,11 +125,11 @@ class PosedSights(Frozen):
     open: dict[int, tuple[str, ...]]
 
 
-def posed_sights(observations: Observations, sights: Sights, options: Options) -> PosedSights:
+def posed_sights(sights: Sights, options: Options) -> PosedSights:
     """Every camera with the sights that pose it, each camera by itself."""
-    priors = (*observations.priors, *options.priors)
+    priors = (*sights.observations.priors, *options.priors)
     parts: list[PosedSights] = []
-    for name, image_size in observations.cameras.items():
+    for name, image_size in sights.observations.cameras.items():
         blank = _blank_camera(name, image_size, options, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)

@@ -86,7 +86,7 @@ def _board_poses(observations: Observations) -> dict[SightKey, Pose]:
     ]
     if not symmetric:
         return {}
-    posed = posed_sights(observations, sights, _START)
+    posed = posed_sights(sights, _START)
     wanted = set(symmetric)
     return {
         sights.keys[number]: Pose(pose[:, :3], pose[:, 3])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
-from ceres_cal.base.frozen import Frozen, Rows, cached_property, replace
+from ceres_cal.base.frozen import Frozen, Rows, cached_property
 from ceres_cal.base.transforms import skews
 
 _LEAST = 1e-12  # of a length, which is divided by
@@ -121,13 +121,6 @@ class Sightlines(Frozen):
         rays[:, :, :2] = self.pixels
         rays[:, :, 2] = np.exp(poses.log_phi)[:, None] * (self.w + poses.bend[:, None] * self._squared)
         return rays
-
-    def take(self, rows: Indices) -> Sightlines:
-        """Some rows, of points both, in their order."""
-        ends = np.cumsum([2 * self.counts[0], self.counts[1], self.counts[2]])
-        points, lines, arcs = (int(n) for n in np.diff(np.searchsorted(rows, [0, *ends])))
-        few = {name: getattr(self, name)[rows] for name in ("pixels", "w", "slope", "places", "along", "curve")}
-        return replace(self, **few, counts=(points // 2, lines, arcs))
 
     def distances(self, poses: Candidates) -> Array:
         """Distances (K, N) px."""

@@ -13,7 +13,7 @@ from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
@@ -192,7 +192,6 @@ _STATED = {"x": "position_m", "y": "position_m", "height": "height_m", "phi": "p
 
 
 def chained_poses(
-    observations: Observations,
     sights: Sights,
     numbers: Indices,
     poses: Array,
@@ -212,7 +211,7 @@ def chained_poses(
     order = np.argsort(-sizes[numbers], kind="stable")
     keys, seen = [sights.keys[i] for i in numbers[order]], poses[order]
     stations = {name: station.cam_from_world.matrix for name, station in (standing or {}).items()}
-    stations = stations or {name: np.eye(3, 4) for name in anchored_stations(observations)}
+    stations = stations or {name: np.eye(3, 4) for name in anchored_stations(sights.observations)}
     placements: dict[str | None, Array] = {None: np.eye(3, 4)}
     known = -1
     while len(stations) + len(placements) > known:
@@ -228,8 +227,8 @@ def chained_poses(
             rows = list(fresh.values())
             world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
             placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
-    _require_all(observations, sights, stations, placements, open_numbers or {})
-    cameras = observations.stations
+    _require_all(sights, stations, placements, open_numbers or {})
+    cameras = sights.observations.stations
     named = [name for name in placements if name is not None]
     return (
         {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
@@ -238,7 +237,6 @@ def chained_poses(
 
 
 def _require_all(
-    observations: Observations,
     sights: Sights,
     stations: Container[str],
     placements: Container[str | None],
@@ -248,7 +246,7 @@ def _require_all(
         if key.station in stations and key.placement in placements:
             continue
         sight = sights[number]
-        frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
+        frames = ", ".join(repr(sights.observations.views[i].frame) for i in sight.views[0][:3])
         said = f"{len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations (on "
         said += f"{len(distinct(sight.track_index))} curves) cannot fix its pose"
         if names := open_numbers.get(number, ()):

@@ -136,9 +136,9 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
     free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
     problem, estimate = problem_of(camera, seen, free, priors)
-    left = residuals(seen, problem.sights, estimate)
+    left = residuals(problem.sights, estimate)
     # reads: "..." of `AsBuilt.words`: this is another field
-    equations = attempt(lambda: write_equations(seen, problem.sights, estimate, left), SolutionError)
+    equations = attempt(lambda: write_equations(problem.sights, estimate, left), SolutionError)
     if isinstance(equations, CalibrationError):
         return replace(AS_DRAWN, misfit=np.inf)
     every = np.ones(len(equations), dtype=bool)

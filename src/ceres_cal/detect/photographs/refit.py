@@ -129,7 +129,7 @@ def refit_camera(
 def misfit(camera: Camera, observations: Observations) -> float:
     """Mean cost of the curve observations of one view, by the loss of `refit_camera`."""
     problem, estimate = problem_of(camera, observations, (), ())
-    left = residuals(observations, problem.sights, estimate).curves / problem.weighting.loss_scale
+    left = residuals(problem.sights, estimate).curves / problem.weighting.loss_scale
     return float(np.mean(np.log1p(np.nan_to_num(left, nan=np.inf) ** 2)))
 
 

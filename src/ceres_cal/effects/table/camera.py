@@ -20,7 +20,7 @@ from ceres_cal.problem.quantities import pixel_slopes
 def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
     """Each station turned about the camera's axes, shifted in the world: from some frame on, or in one frame alone."""
     equations = case.equations
-    frames = [(view.station, view.frame) for view in case.observations.views]
+    frames = [(view.station, view.frame) for view in case.problem.observations.views]
     known = list(dict.fromkeys(frames))
     frame = numbers_of(frames, known)[equations.view]
     bounds = zip(equations.bounds, equations.bounds[1:], strict=False)
@@ -28,7 +28,7 @@ def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
     tied = np.array([key.placement not in case.problem.private for key in equations.sights.keys])
     of_station = np.array([key.station for key in equations.sights.keys])
     columns = motion_columns(case)
-    for station in case.observations.stations:
+    for station in case.problem.observations.stations:
         present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
         names, last = tuple(known[number][1] for number in present), len(present) - 1
         # In the first or last frame alone is the same as from there on.

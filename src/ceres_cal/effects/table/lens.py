@@ -167,7 +167,7 @@ _PLACES = [OF_PIXELS.index(name) for name in _NUMBERS]
 
 def lens_changes(case: Case) -> Iterator[EffectColumns]:
     """phi and the principal point of a camera are others in the frames after one, by boards that are held up."""
-    frames = [(view.camera, view.frame) for view in case.observations.views]
+    frames = [(view.camera, view.frame) for view in case.problem.observations.views]
     known = list(dict.fromkeys(frames))
     frame = numbers_of(frames, known)[case.equations.view]
     # Over a field a knock turns the camera, too, and a turn looks like another principal point.

@@ -78,7 +78,7 @@ def feature_of(name: str) -> str:
 def _of_curve(evidence: Evidence) -> Words:
     name = evidence.score.subject
     target, _, feature = name.partition("/")
-    curve = evidence.case.observations.targets[target].curves[feature]
+    curve = evidence.case.problem.observations.targets[target].curves[feature]
     mm, sd = evidence.in_mm
     advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
     if isinstance(curve, Arc):
@@ -108,7 +108,7 @@ def _of_point(evidence: Evidence) -> Words:
 
 def _lengths(case: Case) -> Iterator[EffectColumns]:
     """A length that a target is drawn by is another one: many of its lines and points lie elsewhere, in proportion."""
-    structure, targets = case.whole_structure, case.observations.targets
+    structure, targets = case.whole_structure, case.problem.observations.targets
     asked = [name for name in dimensions_of(targets) if name not in case.estimate.structure.dimensions]
     slopes = dimension_slopes(structure.names, targets, asked)[1]
     for name, moved in zip(asked, case.equations.built_along(structure, slopes).T, strict=True):
@@ -118,7 +118,7 @@ def _lengths(case: Case) -> Iterator[EffectColumns]:
 def _of_length(evidence: Evidence) -> Words:
     name = evidence.score.subject
     target, _, dimension = name.partition("/")
-    drawn_m = evidence.case.observations.targets[target].dimensions[dimension]
+    drawn_m = evidence.case.problem.observations.targets[target].dimensions[dimension]
     by, sd = evidence.score.amount, evidence.score.sd
     return Words(
         f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says ({evidence.size})",
@@ -217,7 +217,7 @@ def _of_place(evidence: Evidence) -> Words:
 
 def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
     """(E,) which target that is part of the world each equation shows, -1 for a movable one; and their names."""
-    observations = case.observations
+    observations = case.problem.observations
     names = tuple(name for name, target in observations.targets.items() if not target.movable)
     number = {name: place for place, name in enumerate(names)}
     of_view = np.array([number.get(view.target, -1) for view in observations.views], dtype=np.int64)
