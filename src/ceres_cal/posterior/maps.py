@@ -249,7 +249,8 @@ class Picture(Frozen):
 
     def of(self, camera: Camera) -> Picture:
         """What another one shows at the same pixels."""
-        return replace(self, camera=camera.at(Pose.identity()))
+        camera = camera.at(Pose.identity())
+        return self if camera == self.camera else replace(self, camera=camera)
 
     @property
     def shown(self) -> Mask:

@@ -185,41 +185,47 @@ def _model(
     return make_linear_model(problem, estimate, equations, weights)
 
 
-def _modes(equations: Equations) -> Array:
-    """(E, 18) px per px of each coefficient of a view: the principal point's x and y; a turn and a shift of the pose
-    that grow from row to row; polynomials along both axes of the image but for the constant, which is the pose's. x and
-    y are from -1 to 1 over what is seen of the view.
-    """
+def _over_view(equations: Equations) -> Array:
+    """(2, E) x and y from -1 to 1 over what is seen of each view."""
     starts = equations.bounds[:-1]
     low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
     half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
-    x, y = ((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T
+    return np.asarray(((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T)
+
+
+def _displacing(equations: Equations, y: Array) -> Array:
+    """(E, 8) px per px of the principal point's x and y, and of a turn and a shift of the pose that grow from row to
+    row.
+    """
     read_out = equations.pose * y[:, None]
     read_out /= np.sqrt(np.maximum(np.mean(read_out**2, axis=0), 1e-300))
+    return np.hstack([equations.intrinsics[:, _CENTRE], read_out])
+
+
+def _modes(equations: Equations) -> Array:
+    """(E, 18) px per px of each coefficient of a view: what may displace it; and polynomials along both axes of the
+    image but for the constant, which is the pose's.
+    """
+    x, y = _over_view(equations)
     third = 1.0 / 3.0  # the mean of x^2
     smooth = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
     along = [smooth * equations.direction[:, axis, None] for axis in range(2)]
-    return np.hstack([equations.intrinsics[:, _CENTRE], read_out, *along])
+    return np.hstack([_displacing(equations, y), *along])
 
 
 def _seem_displaced(model: Linearised) -> bool:
     """Whether views may be displaced, at a glance: half of all squares go with their read-out, or their principal
-    points seem to move.
+    points seem to move by themselves, by moments: their scores have the variance T + T^2 sigma^2. Beside what else
+    displaces views they move by less.
     """
-    told, score = _of_views(model, _modes(model.equations)[:, _OF_MODE == _READ_OUT])
-    taken = np.sum(score * np.einsum("vij,vj->vi", np.linalg.pinv(told, _TOLD, hermitian=True), score))
-    return bool(2.0 * taken > np.sum(model.placed_score**2)) or _seems_to_move(model)
-
-
-def _seems_to_move(model: Linearised) -> bool:
-    """Whether principal points of views move by themselves, by moments: their scores have the variance T + T^2 sigma^2.
-    Beside what else displaces views they move by less.
-    """
-    whole_told, score = _of_views(model, model.equations.intrinsics[:, _CENTRE])
-    told = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2), 1e-300)
+    whole_told, scores = _of_views(model, _displacing(model.equations, _over_view(model.equations)[1]))
+    read_out = np.linalg.pinv(whole_told[:, 2:, 2:], _TOLD, hermitian=True)
+    taken = np.sum(scores[:, 2:] * np.einsum("vij,vj->vi", read_out, scores[:, 2:]))
+    told, score = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2)[:, :2], 1e-300), scores[:, :2]
     mean = np.sum(score, axis=0) / np.sum(told, axis=0)
     moved = float(np.sum((score - told * mean) ** 2 / told - 1.0))
-    return moved > (0.75 * _LEAST_PX) ** 2 * float(np.sum(told))
+    moves = moved > (0.75 * _LEAST_PX) ** 2 * float(np.sum(told))
+    return bool(2.0 * taken > np.sum(model.placed_score**2)) or moves
 
 
 def _of_views(model: Linearised, columns: Array) -> tuple[Array, Array]:
