@@ -207,17 +207,17 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
 def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
     """Not where it is stated, held back by the options, or known by an earlier calibration."""
     seen, structure, options = observed(), estimated().structure, replace(RADIAL, usual_camera=True)
-    usual, phi = (one for one in gather_priors(seen, options, structure) if one.is_usual)
-    assert [key.quantity for key in phi.keys] == ["phi"] and phi.is_log
-    assert [key.quantity for key in usual.keys] == ["cx", "cy", "aspect"]
+    (usual,) = (one for one in gather_priors(seen, options, structure) if one.is_usual)
+    assert [key.quantity for key in usual.logs] == ["phi"]
+    assert [key.quantity for key in usual.keys] == ["cx", "cy", "aspect", "phi"]
     assert usual.mean[:2] == pytest.approx(0.5 * (np.array(next(iter(seen.cameras.values()))) - 1.0))
     name = next(iter(seen.cameras))
     stated = replace(options, priors=(Prior("camera", name, "cx", (640.0,), (1.0,)),))
     carried = gather_priors(seen, options, structure, GaussianPrior(usual.information, usual.mean))
     for priors in (gather_priors(seen, RADIAL, structure), carried):
         assert not any(one.is_usual for one in priors)
-    beside, _ = (one for one in gather_priors(seen, stated, structure) if one.is_usual)
-    assert [key.quantity for key in beside.keys] == ["cy", "aspect"]
+    (beside,) = (one for one in gather_priors(seen, stated, structure) if one.is_usual)
+    assert [key.quantity for key in beside.keys] == ["cy", "aspect", "phi"]
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -233,7 +233,8 @@ def test_the_usual_phi_pulls_as_its_cost_rises(ratio: float) -> None:
     """The normal distribution in its place has the cost's own derivative, for lenses of any phi."""
     seen, estimate = observed(), estimated()
     every = gather_priors(seen, replace(RADIAL, usual_camera=True), estimate.structure)
-    prior = next(one for one in every if one.is_log)
+    whole = next(one for one in every if one.logs)
+    prior = whole.given(whole.logs)
     (name,), mean = seen.cameras, float(prior.mean[0])
 
     def at(phi: float) -> Estimate:

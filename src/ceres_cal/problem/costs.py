@@ -20,7 +20,7 @@ from ceres_cal.base.transforms import Pose, left_jacobian, rotation_log, skew
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
-from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior, logarithmic
+from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.problem.structure import Structure
@@ -347,8 +347,7 @@ class PriorCost(CachedCost):
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
         super().__init__(run)
-        self._is_usual, self._is_log = prior.is_usual, prior.is_log
-        self._root, self._mean = prior.information.root, prior.mean
+        self._prior, self._root = prior, prior.information.root
         parts = list(_parts(prior, estimate, layout))
         self.owners: list[tuple[str, str]] = [owner for owner, _, _, _ in parts]
         self._coordinates = [(columns, coordinates) for _, _, columns, coordinates in parts]
@@ -356,16 +355,16 @@ class PriorCost(CachedCost):
         self.set_parameter_block_sizes([size for _, size, _, _ in parts])
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
-        off, root, slopes = -self._mean, self._root, []
+        off, root, slopes = -self._prior.mean, self._root, []
         for (columns, coordinates), block in zip(self._coordinates, parameters, strict=True):
             values, by_block = coordinates(block)
             off[columns] += values
             slopes.append((columns, by_block))
-        if self._is_log:
-            off, slope = logarithmic(off, self._mean)
+        if self._prior.logs:
+            off, slope = self._prior.bent(off)
             root = root * slope
         residuals = self._root @ off
-        if self._is_usual:
+        if self._prior.is_usual:
             residuals, slope = _bent(residuals)
             root = slope[:, None] * root
         return CostValue(at, residuals, [(root[:, columns] @ by_block).reshape(-1) for columns, by_block in slopes])

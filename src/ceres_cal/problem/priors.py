@@ -11,9 +11,9 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
@@ -47,14 +47,14 @@ class GaussianPrior(Frozen):
         rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
         is_usual: whether nobody stated it: it is what is usual of cameras, under a distribution with heavy tails, which
             gives way to observations that say otherwise.
-        is_log: whether the logarithms of its numbers are normal: offsets are mean log(x / mean).
+        logs: those of its numbers whose logarithms are normal: their offsets are mean log(x / mean).
     """
 
     information: Information
     mean: Array
     rotations: Mapping[str, Array] = field(default_factory=dict)
     is_usual: bool = False
-    is_log: bool = False
+    logs: frozenset[Key] = frozenset()
 
     @classmethod
     def about(cls, information: Information, estimate: Estimate) -> GaussianPrior:
@@ -86,10 +86,12 @@ class GaussianPrior(Frozen):
         if own == self.keys:
             return self
         given = self._with(self.information.given(own))
-        names = () if estimate is None else estimate.structure.names
-        held = [key for key in self.keys if key not in own and (not key.is_structure or key.structure_name in names)]
+        if estimate is None:
+            return given
+        names, theirs = estimate.structure.names, set(own)
+        held = [key for key in self.keys if key not in theirs and (not key.is_structure or key.structure_name in names)]
         across = self.information.matrix[np.ix_(self.information.columns(own), self.information.columns(held))]
-        if estimate is None or not np.any(across):
+        if not np.any(across):
             return given
         off = self._with(self.information.given(held)).offsets(estimate)
         return replace(given, mean=given.mean - given.information.inverse @ across @ off)
@@ -109,7 +111,24 @@ class GaussianPrior(Frozen):
             for key, angle in zip(pose_keys("station", name)[3:], turn.tolist(), strict=True):
                 if key in self.keys:
                     off[self.information.columns([key])] += angle
-        return logarithmic(off, self.mean)[0] if self.is_log else off
+        return self.bent(off)[0]
+
+    @cached_property
+    def _of_logs(self) -> Indices:
+        return self.information.columns(self.information.among(self.logs))
+
+    def bent(self, off: Array) -> tuple[Array, Array]:
+        """(K,) offsets of numbers that are `off` the mean, and their derivatives by these; of numbers whose logarithms
+        are normal, far below 0 where they are 0 or less.
+        """
+        least_ratio = 1e-6  # of a number to its mean: a step of the solver may pass 0
+        slope = np.ones(len(off))
+        if self.logs:
+            at = self._of_logs
+            ratio = np.maximum(1.0 + off[at] / self.mean[at], least_ratio)
+            off = off.copy()
+            off[at], slope[at] = self.mean[at] * np.log(ratio), 1.0 / ratio
+        return off, slope
 
     def residuals(self, estimate: Estimate) -> Array:
         """(R,) root (x - mean), in standard deviations."""
@@ -126,11 +145,9 @@ class GaussianPrior(Frozen):
             return self
         off = self.offsets(estimate)
         weights = 1.0 / (1.0 + (off / USUAL_BENDS) ** 2 * np.diagonal(self.information.matrix))
-        if not self.is_log:
-            return self._times(weights)
         here = values_of(estimate, self.keys)
-        slope = logarithmic(here - self.mean, self.mean)[1]
-        return replace(self._times(weights * slope**2), mean=here - off / slope, is_log=False)
+        slope = self.bent(here - self.mean)[1]
+        return replace(self._times(weights * slope**2), mean=here - off / slope, logs=frozenset())
 
     def loosened(self, factor: float) -> GaussianPrior:
         """With standard deviations so many times as large, where it is usual: beside observations that are off by as
@@ -141,13 +158,6 @@ class GaussianPrior(Frozen):
     def _times(self, weights: Array) -> GaussianPrior:
         """Of numbers that are stated one by one."""
         return replace(self, information=replace(self.information, matrix=weights[:, None] * self.information.matrix))
-
-
-def logarithmic(off: Array, mean: Array) -> tuple[Array, Array]:
-    """(K,) mean log(x / mean) of numbers x that are `off` the mean, and its derivative by x; far below 0 of x <= 0."""
-    least_ratio = 1e-6  # of a number to its mean: a step of the solver may pass 0
-    ratio = np.maximum(1.0 + off / mean, least_ratio)
-    return mean * np.log(ratio), 1.0 / ratio
 
 
 def gather_priors(
@@ -212,14 +222,13 @@ def usual_cameras(
         if not options.free_aspect:
             usual["aspect"] = 1.0, _USUAL_ASPECT
         usual |= dict.fromkeys(lens.tangential, (0.0, _USUAL_DECENTRING))
+        phi = ANY_PHI[0] * 0.5 * float(np.hypot(*size))
+        usual["phi"] = phi, ANY_PHI[1] * phi
         about = {keys[quantity]: known for quantity, known in usual.items() if quantity in keys}
         if about:
             information = Information.of_sigmas({key: sigma for key, (_, sigma) in about.items()})
-            yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), is_usual=True)
-        if "phi" in keys:
-            phi = ANY_PHI[0] * 0.5 * float(np.hypot(*size))
-            information = Information.of_sigmas({keys["phi"]: ANY_PHI[1] * phi})
-            yield GaussianPrior(information, np.array([phi]), is_usual=True, is_log=True)
+            logs = frozenset(key for key in about if key.quantity == "phi")
+            yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), {}, True, logs)
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:
