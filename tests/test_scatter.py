@@ -20,7 +20,7 @@ def grids(columns: int, rows: int, noise_px: float, bow_m: float = 0.0) -> list[
     points[:, 2] += bow_m * np.linspace(-1.0, 1.0, columns)[np.lexsort((points[:, 0], points[:, 1])) % columns] ** 2
     found = []
     for number in range(6):
-        pose = board_pose(board, WIDE, (300.0 + 130.0 * number, 400.0), 0.7, (0.5, number, 0.0))
+        pose = board_pose(board, WIDE.rays([(300.0 + 130.0 * number, 400.0)])[0], 0.7, (0.5, number, 0.0))
         pixels = WIDE.at(pose).project(points).reshape(rows, columns, 2)
         found.append(pixels + rng.normal(0.0, noise_px, pixels.shape))
     return found

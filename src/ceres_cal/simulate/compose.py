@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
@@ -79,13 +78,12 @@ def _random_board_pose(board: Target, camera: Camera, held: BoardRanges, rng: np
     pixel = rng.uniform((0.0, 0.0), camera.image_size)
     direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
     tilt = np.deg2rad(rng.uniform(*held.tilt_deg))
-    return board_pose(board, camera, pixel, rng.uniform(*held.distance_m), (tilt, direction, spin))
+    line_of_sight = camera.rays(pixel[None])[0]
+    return board_pose(board, line_of_sight, rng.uniform(*held.distance_m), (tilt, direction, spin))
 
 
-def board_pose(
-    board: Target, camera: Camera, pixel: ArrayLike, distance_m: float, turn_rad: tuple[float, float, float]
-) -> Pose:
-    """cam_from_board with the board's middle at a pixel (2,), so far from the camera.
+def board_pose(board: Target, line_of_sight: Array, distance_m: float, turn_rad: tuple[float, float, float]) -> Pose:
+    """cam_from_board with the board's middle along a line of sight (3,) of length 1, so far from the camera.
 
     Its normal points away from the camera, so that columns run right and rows down before it is turned: by spin about
     its own normal, then by the tilt about an axis across the line of sight. That tilt brings its upper edge nearer to
@@ -95,7 +93,6 @@ def board_pose(
         turn_rad: tilt, direction of the tilt, spin.
     """
     tilt, direction, spin = turn_rad
-    line_of_sight = camera.rays(np.reshape(pixel, (1, 2)))[0]
     across = np.array([-line_of_sight[1], line_of_sight[0], 0.0])  # z x line of sight
     sine = np.linalg.norm(across)
     facing = rotation_exp(across / max(sine, 1e-12) * np.arctan2(sine, line_of_sight[2]))

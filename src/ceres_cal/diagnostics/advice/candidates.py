@@ -19,6 +19,7 @@ from ceres_cal.problem.priors import stated_prior, tolerances
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import layout_of
 from ceres_cal.problem.reduced import information
+from ceres_cal.problem.residuals import equations_of, residuals
 from ceres_cal.problem.structure import Tolerance, make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, curve_points
@@ -106,13 +107,19 @@ class Ground(Frozen):
         targets = {**self.targets, **measurement.targets}
         estimate = self._with(measurement, targets)
         observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
-        layout = layout_of(self.keys, estimate, measurement.placements)
+        sights, layout = (
+            gather_sights(observations, predicted=True),
+            layout_of(self.keys, estimate, measurement.placements),
+        )
+        if len(sights):  # of the hundreds of nodes of a surface a measurement sees a few
+            seen = np.any(equations_of(sights, estimate, residuals(sights, estimate)).intrinsics != 0.0, axis=0)
+            layout = replace(layout, free={name: own[seen[own]] for name, own in layout.free.items()})
         lenses = {name: camera.lens for name, camera in estimate.cameras.items()}
         stated = (stated_prior(prior, lenses[estimate.stations[prior.name].camera]) for prior in measurement.priors)
         priors = (*stated, *tolerances(estimate.structure, self.keys))
-        problem = Problem(gather_sights(observations, predicted=True), layout, priors, self.weighting)
-        told = information(problem, estimate)  # without how smooth a lens is, which is known already
-        return told.points.beside_all([told.curves, told.stated, told.built]).marginal(self.keys)
+        told = information(Problem(sights, layout, priors, self.weighting), estimate)
+        whole = told.points.beside_all([told.curves, told.stated, told.built])  # how smooth a lens is, is known already
+        return whole.marginal(whole.among(self.keys)).over(self.keys)
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
         """The estimate with what the measurement brings along; of the placements those that are still free."""
@@ -227,9 +234,9 @@ def poles(search: CandidateSearch) -> Iterator[Measurement]:
     places = [("", float(a), float(b)) for a in x for b in y]
     for _, target in still(search.ground.targets):
         places += [(name, a, b) for name, (a, b, z) in target.points.items() if z == 0.0]
-    for mark, a, b in places:
-        if all(well_inside(one, np.array([[a, b, top]]))[0] for one in cameras):
-            yield _pole(search.station, mark, a, b, top)
+    tops = np.array([(a, b, top) for _, a, b in places])
+    for number in np.flatnonzero(np.all([well_inside(one, tops) for one in cameras], axis=0)).tolist():
+        yield _pole(search.station, *places[number], top)
 
 
 def _pole(station: str, mark: str, x: float, y: float, top: float) -> Measurement:
@@ -274,10 +281,11 @@ def boards(search: CandidateSearch) -> Iterator[Measurement]:
         for column in board_places:
             for row in board_places:
                 pixel = np.round(size * (column, row))
+                line_of_sight = camera.rays(pixel[None])[0]
                 for tilt in board_tilts_deg:
                     for quarter, edge in enumerate(_NEARER):
                         turn = (np.deg2rad(tilt), 0.5 * np.pi * quarter, 0.0)
-                        pose = board_pose(board, camera, pixel, distance, turn)
+                        pose = board_pose(board, line_of_sight, distance, turn)
                         held = camera.cam_from_world.inverse @ pose
                         corners = held.transform(board.point_array)
                         if np.min(corners[:, 2]) < least_height_m or not np.all(well_inside(camera, corners)):
