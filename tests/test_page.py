@@ -31,6 +31,7 @@ from ceres_cal.cli.page.session import KEPT, Session, opened
 from ceres_cal.cli.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
 from ceres_cal.detect.photographs import Clicks, by_hand, load_clicks
 from ceres_cal.detect.photographs.clicks import starts_from_clicks
+from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import targets_by_name
 
@@ -63,7 +64,7 @@ def truth() -> Camera:
 def test_the_model_is_where_it_was_dragged_to(count: int) -> None:
     camera, names = truth(), [*CORNERS, *(name for name in FIELD.points if name not in CORNERS)][:count]
     pixels = camera.project(np.array([FIELD.points[name] for name in names]))
-    shown = by_hand.Shown.of(FIELD, {name: (*pixel, 3.0) for name, pixel in zip(names, pixels, strict=True)}, [])
+    shown = PointHints.of(FIELD, {name: (*pixel, 3.0) for name, pixel in zip(names, pixels, strict=True)}, [])
     base = by_hand.guess(FIELD, (1280, 960))
     found = by_hand.solved(FIELD, shown, base, base)
     off_px, _ = by_hand.off(FIELD, shown, found)
@@ -75,7 +76,7 @@ def test_the_model_is_where_it_was_dragged_to(count: int) -> None:
 
 def test_a_place_of_a_line_draws_the_line() -> None:
     base = by_hand.guess(FIELD, (1280, 960))
-    shown = by_hand.Shown.of(FIELD, {}, [("HalfwayLine", 700.0, 300.0, 3.0), ("HalfwayLine", 720.0, 700.0, 3.0)])
+    shown = PointHints.of(FIELD, {}, [("HalfwayLine", 700.0, 300.0, 3.0), ("HalfwayLine", 720.0, 700.0, 3.0)])
     assert np.max(by_hand.off(FIELD, shown, by_hand.solved(FIELD, shown, base, base))[0]) < 1.0
 
 
@@ -83,7 +84,7 @@ def test_a_click_that_contradicts_the_others_is_named() -> None:
     camera = truth()
     points = {name: (*camera.project(np.array(FIELD.points[name])), 3.0) for name in list(FIELD.points)[:10]}
     points["TopRightCorner"] = (points["TopRightCorner"][0] + 60.0, points["TopRightCorner"][1], 3.0)
-    shown, base = by_hand.Shown.of(FIELD, points, []), by_hand.guess(FIELD, (1280, 960))
+    shown, base = PointHints.of(FIELD, points, []), by_hand.guess(FIELD, (1280, 960))
     _, against = by_hand.judged(FIELD, shown, by_hand.solved(FIELD, shown, base, base), base)
     assert list(against) == ["TopRightCorner"] and against["TopRightCorner"] == pytest.approx(60.0, abs=12.0)
 
@@ -101,7 +102,7 @@ def test_places_of_lines_take_part_in_a_start(tmp_path: Path) -> None:
     def off_px(clicks: Clicks) -> float:
         starts, free = starts_from_clicks(clicks, FIELD, (1280, 960))
         assert free.hints is not None and len(free.hints.places) == len(clicks.curves)
-        shown = by_hand.Shown.of(FIELD, {}, [(name, x, y, 1.0) for name, x, y in curves])
+        shown = PointHints.of(FIELD, {}, [(name, x, y, 1.0) for name, x, y in curves])
         return float(np.median([np.max(by_hand.off(FIELD, shown, start)[0]) for start in starts]))
 
     clicks = load_clicks(file)

@@ -24,6 +24,7 @@ from ceres_cal.detect.photographs import by_hand, check_photographs
 from ceres_cal.detect.photographs.clicks import FEWEST
 from ceres_cal.detect.photographs.facing import distinguishing_feature
 from ceres_cal.detect.photographs.known import is_painted
+from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import EXPORT_FORMATS
 from ceres_cal.moves.comparisons import compare
@@ -342,9 +343,9 @@ def _lines(model: Model) -> list[Any]:
     return [np.round(line.middle[::4], 1).tolist() for line in model.lines]
 
 
-def _shown(state: State, target: Target) -> by_hand.Shown:
+def _shown(state: State, target: Target) -> PointHints:
     points = {name: (one.x, one.y, one.sigma) for name, one in state.points.items()}
-    return by_hand.Shown.of(target, points, [(one.curve, one.x, one.y, one.sigma) for one in state.places])
+    return PointHints.of(target, points, [(one.curve, one.x, one.y, one.sigma) for one in state.places])
 
 
 def _require_names(state: State, target: Target) -> None:

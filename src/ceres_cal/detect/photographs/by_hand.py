@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices32
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import answer_or_reason
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.photographs.clicks import FEWEST, Clicks, starts_from_clicks, unknown_optics
 from ceres_cal.detect.photographs.refit import NOTHING, ROBUST, PointHints, observations_of, refit_camera
@@ -25,49 +25,6 @@ _AS_SHOWN = Weighting(loss="trivial")
 # How many equations free which intrinsics; fewer leave the lens as it was.
 _FREED = ((8, ("phi",)), (12, ("phi", "a3")), (24, ("phi", "a3", "cx", "cy")), (36, ("phi", "a3", "a2", "cx", "cy")))
 _AGAINST = 4.0  # standard deviations of a hand by which a click contradicts the others
-
-
-class Shown(Frozen):
-    """What somebody showed, as rows.
-
-    Attributes:
-        names, index, pixels, sigma_px: of points. curve, places, place_sigma_px: of places of curves.
-    """
-
-    names: tuple[str, ...]
-    index: Indices32
-    pixels: Array
-    sigma_px: Array
-    curve: Indices32
-    places: Array
-    place_sigma_px: Array
-
-    @classmethod
-    def of(
-        cls,
-        target: Target,
-        points: Mapping[str, tuple[float, float, float]],
-        places: Sequence[tuple[str, float, float, float]],
-    ) -> Shown:
-        """Points by name and places with their curve, each x, y and sigma in px; without what the target has not."""
-        points = {name: place for name, place in points.items() if name in target.point_index}
-        places = [place for place in places if place[0] in target.curve_index]
-        at, on = (
-            np.array(rows, dtype=float).reshape(-1, 3) for rows in (list(points.values()), [p[1:] for p in places])
-        )
-        return cls(
-            tuple(points),
-            np.array([target.point_index[name] for name in points], dtype=np.int32),
-            at[:, :2],
-            at[:, 2],
-            np.array([target.curve_index[place[0]] for place in places], dtype=np.int32),
-            on[:, :2],
-            on[:, 2],
-        )
-
-    @property
-    def equations(self) -> int:
-        return 2 * len(self.names) + len(self.curve)
 
 
 def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera:
@@ -92,7 +49,7 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
     return Camera(image_size, phi, middle, Radial((0.0,) * 4, (2, 3, 4, 5)), 1.0, Pose(rotation, -rotation @ position))
 
 
-def solved(target: Target, shown: Shown, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
+def solved(target: Target, shown: PointHints, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
     """The camera by all clicks, each as well as a hand hits it; what nobody showed goes along with them.
 
     Args:
@@ -112,7 +69,7 @@ def solved(target: Target, shown: Shown, before: Camera, base: Camera, *, quickl
     return best or before
 
 
-def _fitted(target: Target, shown: Shown, start: Camera, base: Camera, weighting: Weighting) -> Camera | None:
+def _fitted(target: Target, shown: PointHints, start: Camera, base: Camera, weighting: Weighting) -> Camera | None:
     """The camera that suits best what was shown, with as much of it free as that can tell."""
     wanted: tuple[str, ...] = next((names for least, names in reversed(_FREED) if shown.equations >= least), ())
     free = tuple(name for name in wanted if name in intrinsic_names(base.lens))
@@ -122,26 +79,25 @@ def _fitted(target: Target, shown: Shown, start: Camera, base: Camera, weighting
     return None if fitted is None else fitted[0]
 
 
-def settled(target: Target, shown: Shown, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
+def settled(target: Target, shown: PointHints, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
     """The camera once nothing is dragged any more, the clicks that contradict the others (see `judged`), and what is
     wrong with them all.
     """
     far = 10.0  # of them: no camera near puts it there
     camera, wrong = solved(target, shown, before, base), ""
     off_px, sigma_px = off(target, shown, camera)
-    if len(shown.names) >= FEWEST and np.any(off_px > far * sigma_px):
+    if len(shown.feature) >= FEWEST and np.any(off_px > far * sigma_px):
         other, wrong = answer_or_reason(lambda: anew(target, shown, base.image_size))
         camera = other or camera
     return *judged(target, shown, camera, base), wrong
 
 
-def observed(target: Target, shown: Shown, image_size: tuple[int, int]) -> Observations:
+def observed(target: Target, shown: PointHints, image_size: tuple[int, int]) -> Observations:
     """What was shown, as observations."""
-    every = shown.index, shown.pixels, shown.sigma_px, shown.curve, shown.places, shown.place_sigma_px
-    return observations_of(target, image_size, *NOTHING, PointHints(*every))
+    return observations_of(target, image_size, *NOTHING, shown)
 
 
-def judged(target: Target, shown: Shown, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
+def judged(target: Target, shown: PointHints, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
     """The camera without the clicks that contradict the others, and by how many px those are off, by name or "#2" of a
     place of a curve.
     """
@@ -151,32 +107,36 @@ def judged(target: Target, shown: Shown, camera: Camera, base: Camera) -> tuple[
         return camera, {}
     robust = _fitted(target, shown, camera, _turned(target, shown, base), ROBUST) or camera
     off_px, sigma_px = off(target, shown, robust)
-    names = (*shown.names, *(f"#{number}" for number in range(len(shown.curve))))
+    names = (*_names(target, shown), *(f"#{number}" for number in range(len(shown.curve))))
     rows = zip(names, off_px.tolist(), (off_px > _AGAINST * sigma_px).tolist(), strict=True)
     return robust, {name: distance for name, distance, against in rows if against}
 
 
-def anew(target: Target, shown: Shown, image_size: tuple[int, int]) -> Camera:
+def anew(target: Target, shown: PointHints, image_size: tuple[int, int]) -> Camera:
     """The camera that the named points tell from nothing, as `detect_field` starts from them.
 
     Raises:
         InputError: fewer than four, or none can be right, and why.
     """
-    points = dict(zip(shown.names, map(tuple, shown.pixels.tolist()), strict=True))
+    points = dict(zip(_names(target, shown), map(tuple, shown.pixels.tolist()), strict=True))
     curves = tuple((target.curve_names[n], x, y) for n, (x, y) in zip(shown.curve, shown.places.tolist(), strict=True))
     cameras, _ = starts_from_clicks(Clicks(points, curves), target, image_size)
     return min(cameras, key=lambda camera: _cost(target, shown, camera))
 
 
-def off(target: Target, shown: Shown, camera: Camera) -> tuple[Array, Array]:
+def _names(target: Target, shown: PointHints) -> list[str]:
+    return [target.point_names[number] for number in shown.feature]
+
+
+def off(target: Target, shown: PointHints, camera: Camera) -> tuple[Array, Array]:
     """(N,) how far each click is from its point or curve, px, and how well a hand hits it."""
     ends = np.concatenate([shown.pixels, shown.places]) - feet(target, shown, camera)
     return np.nan_to_num(np.linalg.norm(ends, axis=1), nan=1e6), np.concatenate([shown.sigma_px, shown.place_sigma_px])
 
 
-def feet(target: Target, shown: Shown, camera: Camera) -> Array:
+def feet(target: Target, shown: PointHints, camera: Camera) -> Array:
     """(N, 2) px where the model has what each click shows."""
-    points = camera.project(target.point_array[shown.index]) if len(shown.index) else np.empty((0, 2))
+    points = camera.project(target.point_array[shown.feature]) if len(shown.feature) else np.empty((0, 2))
     lines = curves_in_image(target, camera)
     nearest = []
     for curve, place in zip(shown.curve, shown.places, strict=True):
@@ -204,34 +164,32 @@ def curves_in_image(target: Target, camera: Camera, steps: int = 60) -> Mapping[
     return {name: camera.project(curve_points(curve, 0, steps)) for name, curve in target.curves.items()}
 
 
-def _cost(target: Target, shown: Shown, camera: Camera) -> float:
+def _cost(target: Target, shown: PointHints, camera: Camera) -> float:
     """Of the clicks, the largest square of how far one is off, in standard deviations."""
     off_px, sigma_px = off(target, shown, camera)
     return float(np.max((off_px / sigma_px) ** 2, initial=0.0))
 
 
-def _hints(target: Target, shown: Shown, base: Camera) -> PointHints:
+def _hints(target: Target, shown: PointHints, base: Camera) -> PointHints:
     """What was shown, and loosely the other points where they were."""
     held_px = 300.0  # how loosely points that nobody showed stay where they were
-    rest = np.setdiff1d(np.arange(len(target.points), dtype=np.int32), shown.index)
+    rest = np.setdiff1d(np.arange(len(target.points), dtype=np.int32), shown.feature)
     there = base.project(target.point_array[rest])
     rest, there = rest[np.isfinite(there[:, 0])], there[np.isfinite(there[:, 0])]
-    return PointHints(
-        np.concatenate([shown.index, rest]),
-        np.concatenate([shown.pixels, there]),
-        np.concatenate([shown.sigma_px, np.full(len(rest), held_px)]),
-        shown.curve,
-        shown.places,
-        shown.place_sigma_px,
+    return replace(
+        shown,
+        feature=np.concatenate([shown.feature, rest]),
+        pixels=np.concatenate([shown.pixels, there]),
+        sigma_px=np.concatenate([shown.sigma_px, np.full(len(rest), held_px)]),
     )
 
 
-def _turned(target: Target, shown: Shown, base: Camera) -> Camera:
+def _turned(target: Target, shown: PointHints, base: Camera) -> Camera:
     """The base shifted, and from two points on turned about its axis and lifted, so that they come near their place."""
-    if not len(shown.index):
+    if not len(shown.feature):
         return base
     axis = np.array(base.principal_point)
-    seen, wanted = base.project(target.point_array[shown.index]) - axis, shown.pixels - axis
+    seen, wanted = base.project(target.point_array[shown.feature]) - axis, shown.pixels - axis
     if not np.all(np.isfinite(seen)):
         return base
     a, b = seen @ (1.0, 1.0j), wanted @ (1.0, 1.0j)

@@ -103,8 +103,9 @@ def starts_from_clicks(
     """
     stretches = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
     clicks.require_names(target)
-    index = np.array([target.point_index[name] for name in clicks.points], dtype=np.int32)
-    pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
+    points = {name: (*pixel, SIGMA_PX) for name, pixel in clicks.points.items()}
+    hints = PointHints.of(target, points, [(*place, SIGMA_PX) for place in clicks.curves])
+    pixels, plane = hints.pixels, target.point_array[hints.feature]
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 1e-6:
         raise InputError(f"all {len(plane)} points to start from lie on one line: show more corners")
     every = [_with_stretch(stretch, pixels, plane, image_size) for stretch in stretches]
@@ -112,11 +113,7 @@ def starts_from_clicks(
     if not fitting:
         raise InputError(_odd_one(list(clicks.points), min((off for _, off in every), key=np.median)))
     phi = float(np.median([camera.phi for camera in fitting]))
-    curves = np.array([target.curve_index[name] for name, *_ in clicks.curves], dtype=np.int32)
-    places = np.array([place for _, *place in clicks.curves]).reshape(-1, 2)
-    sigmas = np.full(len(index), SIGMA_PX), np.full(len(curves), SIGMA_PX)
-    hints = PointHints(index, pixels, sigmas[0], curves, places, sigmas[1])
-    if len(curves):
+    if clicks.curves:
         shown = observations_of(target, image_size, *NOTHING, hints)
         refitted = (refit_camera(camera, shown) for camera in fitting)
         fitting = [one[0] if one is not None else camera for one, camera in zip(refitted, fitting, strict=True)]

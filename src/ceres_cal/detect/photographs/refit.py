@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices32
@@ -36,6 +38,28 @@ class PointHints(Frozen):
     curve: Indices32 = field(default_factory=lambda: NOTHING[0])
     places: Array = field(default_factory=lambda: NOTHING[1])
     place_sigma_px: Array = field(default_factory=lambda: NOTHING[2])
+
+    @classmethod
+    def of(
+        cls,
+        target: Target,
+        points: Mapping[str, tuple[float, float, float]],
+        places: Sequence[tuple[str, float, float, float]] = (),
+    ) -> PointHints:
+        """Points by name and places with their curve, each x, y and sigma in px; without what the target has not."""
+        points = {name: place for name, place in points.items() if name in target.point_index}
+        places = [place for place in places if place[0] in target.curve_index]
+        at, on = (
+            np.array(rows, dtype=float).reshape(-1, 3) for rows in (list(points.values()), [p[1:] for p in places])
+        )
+        index = np.array([target.point_index[name] for name in points], dtype=np.int32)
+        curve = np.array([target.curve_index[place[0]] for place in places], dtype=np.int32)
+        return cls(index, at[:, :2], at[:, 2], curve, on[:, :2], on[:, 2])
+
+    @property
+    def equations(self) -> int:
+        """Numbers that were shown: two of a point, one of a place on a curve."""
+        return 2 * len(self.feature) + len(self.curve)
 
 
 class FreeIntrinsics(Frozen):
