@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
     from ceres_cal.detect.photographs import Clicks, FieldDetections, SearchResult
     from ceres_cal.moves.refit_plan import RefitOptions
-    from ceres_cal.problem.bundle import Progress
+    from ceres_cal.problem.bundle import SolveProgress
 
 # ---- detection ------------------------------------------------------------------------------------------------------
 
@@ -248,7 +248,7 @@ def refit(
     *,
     moved: Sequence[str] | None = None,
     options: RefitOptions | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: SolveProgress | None = None,
     station: str | None = None,
     not_painted: Sequence[str] = (),
 ) -> Calibration:

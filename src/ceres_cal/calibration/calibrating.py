@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import unfilled
 from ceres_cal.posterior.assess import with_other_lenses
-from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.bundle import SolveProgress
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import problem_of
@@ -50,7 +49,7 @@ _OTHERWISE = (
 def calibrate(
     observations: Observations,
     options: Options | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: SolveProgress | None = None,
     *,
     client: Any = None,
 ) -> Calibration:
@@ -107,9 +106,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
         return _of_lens(Task(observations, knows=knows), start, sights, options).redrawn()
 
 
-def _measured(
-    observations: Observations, options: Options, progress: Callable[[Progress], None] | None, client: Any
-) -> Calibration:
+def _measured(observations: Observations, options: Options, progress: SolveProgress | None, client: Any) -> Calibration:
     """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
     # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start
     # and outliers are those of the right drawing; and how many there may be.
@@ -126,7 +123,7 @@ def _measured(
 
 
 def _calibrated(
-    observations: Observations, options: Options, progress: Callable[[Progress], None] | None = None, client: Any = None
+    observations: Observations, options: Options, progress: SolveProgress | None = None, client: Any = None
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()

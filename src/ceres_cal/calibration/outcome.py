@@ -132,10 +132,7 @@ def _share_text(share: float) -> str:
 
 
 def came_out(
-    phi_from: Mapping[str, str],
-    problem: Problem,
-    end: RobustSolution,
-    explanations: Sequence[Explanation] = (),
+    phi_from: Mapping[str, str], problem: Problem, end: RobustSolution, explanations: Sequence[Explanation] = ()
 ) -> Calibration:
     """What came out, not assessed."""
     observations = problem.observations

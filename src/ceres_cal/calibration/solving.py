@@ -28,7 +28,7 @@ from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.assess import assess, with_doubts
 from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements, shifts_by_roughness
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.bundle import Progress, Solution
+from ceres_cal.problem.bundle import Solution, SolveProgress
 from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, Layout, Options
 from ceres_cal.problem.priors import GaussianPrior
@@ -65,7 +65,7 @@ class Task(Frozen):
     """
 
     observations: Observations
-    progress: Callable[[Progress], None] | None = None
+    progress: SolveProgress | None = None
     settle: Callable[..., Settled] | None = None
     tested: bool = True
     knows: bool = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from pathlib import Path
@@ -18,7 +18,7 @@ from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations
-    from ceres_cal.problem.bundle import Progress
+    from ceres_cal.problem.bundle import Progress, SolveProgress
     from ceres_cal.problem.parameters import Options
     from ceres_cal.problem.structure import Tolerance
 
@@ -167,7 +167,7 @@ def _client(address: str | None) -> AbstractContextManager[Any]:
     return client
 
 
-def _solve_progress(bar: ProgressBar) -> Callable[[Progress], None]:
+def _solve_progress(bar: ProgressBar) -> SolveProgress:
     """The solver's callback; a solve begins with its iteration 0."""
     solves = 0
 

@@ -293,10 +293,7 @@ def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, In
 
 
 def equation_weights(
-    weighting: Weighting,
-    equations: Equations,
-    there: Residuals,
-    taking_part: tuple[Mask, Mask] | None = None,
+    weighting: Weighting, equations: Equations, there: Residuals, taking_part: tuple[Mask, Mask] | None = None
 ) -> Weights:
     """How each equation counts at a noise and a loss.
 

@@ -6,7 +6,7 @@ the old posterior is one more prior, as a full matrix.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.other_lenses import OtherLenses
-from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.bundle import SolveProgress
 from ceres_cal.problem.parameters import Estimate, Station
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.robust.other_minima import solved_soon
@@ -54,7 +54,7 @@ def refit(
     *,
     moved: Collection[str] | None = None,
     options: RefitOptions | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: SolveProgress | None = None,
 ) -> Calibration:
     """A calibration after cameras were moved, from few new observations and all that was known.
 

@@ -36,6 +36,10 @@ class Progress(Frozen, eq=True):
     step_norm: float
 
 
+SolveProgress = Callable[[Progress], None]
+"""Called at every iteration of every solve."""
+
+
 class Solution(Frozen, eq=True):
     """The end of one solve.
 
@@ -224,7 +228,7 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
 class _Watcher(pyceres.IterationCallback):
     """Passes progress on; ends the solve when nothing is left to gain, a callback has failed or Ctrl-C was pressed."""
 
-    def __init__(self, run: Run, progress: Callable[[Progress], None] | None, precision: float) -> None:
+    def __init__(self, run: Run, progress: SolveProgress | None, precision: float) -> None:
         super().__init__()
         self._run, self._progress, self._precision = run, progress, precision
         self._accepted: list[float] = []
@@ -276,7 +280,7 @@ def _parts(sight: Sights) -> list[Sights]:
 def solve(
     problem: Problem,
     estimate: Estimate,
-    progress: Callable[[Progress], None] | None = None,
+    progress: SolveProgress | None = None,
     *,
     precision: float = 1e-14,
     is_near: bool = True,

@@ -67,11 +67,7 @@ AS_DRAWN = Built()
 
 
 def solve_as_built(
-    problem: Problem,
-    end: RobustSolution,
-    explanations: tuple[Explanation, ...],
-    solver: Solver,
-    built: Built,
+    problem: Problem, end: RobustSolution, explanations: tuple[Explanation, ...], solver: Solver, built: Built
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
     """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
 

@@ -7,7 +7,7 @@ answer with sums (`shares`): here, or wherever workers have them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 from uuid import uuid4
 
@@ -18,7 +18,7 @@ from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, shown_rows, some_views
-from ceres_cal.problem.bundle import Progress, Solution, solve
+from ceres_cal.problem.bundle import Solution, SolveProgress, solve
 from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
@@ -129,7 +129,7 @@ class Bulk:
         problem: Problem,
         end: RobustSolution,
         explanations: Sequence[Explanation],
-        progress: Callable[[Progress], None] | None,
+        progress: SolveProgress | None,
     ) -> Settled:
         """All observations judged and solved for, from the end of a part.
 
@@ -227,7 +227,7 @@ class _SumRounds(Rounds[_SumRound]):
 
     def __init__(
         self, bulk: Bulk, engine: InProcess | OnWorkers, part: Subset, problem: Problem, end: RobustSolution,
-        progress: Callable[[Progress], None] | None,
+        progress: SolveProgress | None,
     ) -> None:  # fmt: skip
         self._bulk, self._engine, self._part, self._few = bulk, engine, part, part.observations
         self._problem, self._progress = problem, progress

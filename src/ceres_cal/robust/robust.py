@@ -6,7 +6,6 @@ One loop for rows that are at hand and for sums over shares of very many: what a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Generic, Self, TypeVar
 
 import numpy as np
@@ -16,7 +15,7 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.bundle import Progress, Solution, solve, with_placements_at_best
+from ceres_cal.problem.bundle import Solution, SolveProgress, solve, with_placements_at_best
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
@@ -142,7 +141,7 @@ def solve_robustly(
     problem: Problem,
     estimate: Estimate,
     usual: tuple[float, float] | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: SolveProgress | None = None,
     most_rounds: int = MOST_ROUNDS,
     *,
     is_near: bool = False,
@@ -175,9 +174,7 @@ def judge_at(problem: Problem, estimate: Estimate) -> RobustSolution:
 class _RowRounds(Rounds[RobustSolution]):
     """The rounds over rows that are at hand."""
 
-    def __init__(
-        self, problem: Problem, usual: tuple[float, float] | None, progress: Callable[[Progress], None] | None
-    ) -> None:
+    def __init__(self, problem: Problem, usual: tuple[float, float] | None, progress: SolveProgress | None) -> None:
         self._problem, self._usual, self._progress = problem, usual, progress
         self._redundancy: Redundancy | None = None
         self._moving = 0.0

@@ -143,10 +143,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
 
 
 def without_unsteadiness(
-    problem: Problem,
-    estimate: Estimate,
-    taking_part: tuple[Mask, Mask],
-    effects: Sequence[EffectEstimate],
+    problem: Problem, estimate: Estimate, taking_part: tuple[Mask, Mask], effects: Sequence[EffectEstimate]
 ) -> Problem:
     """The problem of all the observations, what was found to move them taken off."""
     sizes = {one.subject: {a.name: a.value for a in one.amounts} for one in effects if one.kind in _KINDS}
