@@ -102,7 +102,7 @@ def test_strokes_tell_how_the_camera_looks(shot: script.Shot) -> None:
     assert np.allclose(upright.floor(upright.offsets(places)), places)
     best, _ = candidates(seen)[0]
     assert any(
-        np.linalg.norm((best.cam_from_world @ turn).position - shot.camera.position) < 0.4 for turn in seen.turns
+        np.linalg.norm((best.cam_from_world @ turn).position - shot.camera.position) < 0.4 for turn in seen.grid.turns
     )
 
 

@@ -187,7 +187,9 @@ def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
     assert len(search.others) == 2
     camera, grid = candidates(search)[0]
     assert grid is search.others[0]  # 6 % narrower: 9 to 6.0 m, as is 8.28 to 5.52
-    away = [(camera.cam_from_world @ turn).position[:2] - scene().camera_at("s").position[:2] for turn in search.turns]
+    away = [
+        (camera.cam_from_world @ turn).position[:2] - scene().camera_at("s").position[:2] for turn in search.grid.turns
+    ]
     assert min(np.linalg.norm(away, axis=1)) < 0.3
 
 

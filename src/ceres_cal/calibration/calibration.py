@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -158,17 +158,12 @@ class Calibration(Frozen):
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
         """(N,) of points and (M,) of curve observations: which rows took part."""
-        masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
-        for entry in self.rejected:
-            masks[entry.kind == "curve"][entry.row] = False
-        return masks
+        points, curves = _rows_of(self.rejected, observations)
+        return ~points, ~curves
 
     def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
         """(N,) of points and (M,) of curve observations: which were taken out each for its own residual."""
-        masks = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
-        for entry in self.outliers:
-            masks[entry.kind == "curve"][entry.row] = not entry.is_of_whole
-        return masks
+        return _rows_of((entry for entry in self.outliers if not entry.is_of_whole), observations)
 
     def redrawn(self) -> Calibration:
         """The same with targets that are drawn with the dimensions that were solved for."""
@@ -291,3 +286,11 @@ class Calibration(Frozen):
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},
         )
+
+
+def _rows_of(entries: Iterable[Rejected], observations: Observations) -> tuple[Mask, Mask]:
+    """(N,) of points and (M,) of curve observations: those that are named."""
+    masks = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
+    for entry in entries:
+        masks[entry.kind == "curve"][entry.row] = True
+    return masks

@@ -284,7 +284,7 @@ def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]
         require_lens_told(end.estimate, posterior)
     known = seen if end is seen.end else replace(seen, end=end)
     if is_new and known.leaves_alike:
-        posterior = posterior.widened(*shifts_by_roughness(end, seen.task.observations))
+        posterior = posterior.widened(*shifts_by_roughness(end))
     return known, with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 

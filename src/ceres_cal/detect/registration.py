@@ -20,15 +20,14 @@ _TURNS_DEG = np.arange(-7.5, 7.6, 1.25)
 
 
 class Nearness(Frozen):
-    """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, `reduced` times smaller."""
+    """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, _REDUCED times smaller."""
 
     plane: Array32
-    reduced: int = _REDUCED
 
     @property
     def length_px(self) -> float:
         """The length of the lines, with what is near to their ends."""
-        return float(np.sum(self.plane) * self.reduced**2 / (np.sqrt(2.0 * np.pi) * _NEAR_PX))
+        return float(np.sum(self.plane) * _REDUCED**2 / (np.sqrt(2.0 * np.pi) * _NEAR_PX))
 
     def score(self, pixels: Array) -> float:
         """Mean nearness of places (N, 2) px; those outside the image count as far off."""
@@ -36,7 +35,7 @@ class Nearness(Frozen):
 
     def at(self, x: Array, y: Array) -> Array:
         """Nearness of places x, y px of any shape; 0 outside the image."""
-        column, row = (np.round((v + 0.5) / self.reduced - 0.5) for v in (x, y))
+        column, row = (np.round((v + 0.5) / _REDUCED - 0.5) for v in (x, y))
         height, width = self.plane.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)  # False for NaN
         places = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
@@ -75,7 +74,7 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
     apart_px = 25.0
     scales = (0.92, 1.0, 1.08)
     middle = 0.5 * np.array(image_size)
-    steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * near.reduced)
+    steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * _REDUCED)
     away, scored = course.pixels - middle, []
     for turn, scale in product(np.deg2rad(_TURNS_DEG), scales):
         cosine, sine = scale * np.cos(turn), scale * np.sin(turn)

@@ -51,11 +51,6 @@ class Strokes(Rows):
         """(N,)"""
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
 
-    @property
-    def total_px(self) -> float:
-        """Length of all of them."""
-        return float(np.sum(self.length_px))
-
 
 def alone(strokes: Strokes, reach_px: float) -> Array:
     """(N,) how much a stroke is a line of its own: 1, less where others run beside it, as of striped floors and sun.

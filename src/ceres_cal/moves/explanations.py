@@ -74,7 +74,7 @@ def require_labels(plan: RefitPlan, poses: Mapping[str, Pose]) -> None:
     for name, pose in poses.items():
         old = plan.calibration.estimate.stations.get(name)
         moves = None if old is None else labels_turned(pose, old.cam_from_world)
-        if moves is not None and relabelled(plan.observations, TURNED) is not None:
+        if moves is not None and relabelled(plan.sights.observations, TURNED) is not None:
             raise SolutionError(
                 f"station {name!r}: labels are swapped, it seems: as given they put the camera {moves[0]:.2f} m from "
                 f"where it was, turned by 180 degrees {moves[1]:.2f} m: relabel with --labels turned, or confirm them "

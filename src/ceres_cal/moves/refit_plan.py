@@ -91,7 +91,7 @@ class RefitPlan(Frozen):
     """A refit as it was asked for.
 
     Attributes:
-        calibration: the old one. observations: the new ones, with the targets of both. sights: theirs.
+        calibration: the old one. sights: of the new observations, with the targets of both.
         options: of the solves. what: one of WHAT. asked: how.
         stations: the observed stations and their cameras. moved: those whose poses are sought.
         stays: stations of the old calibration that are where they were, under its posterior.
@@ -101,7 +101,6 @@ class RefitPlan(Frozen):
     """
 
     calibration: Calibration
-    observations: Observations
     sights: Sights
     options: Options
     what: str
@@ -170,7 +169,6 @@ def make_plan(
     placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
     return RefitPlan(
         calibration,
-        observed,
         gather_sights(observed),
         options,
         what,
@@ -229,5 +227,5 @@ def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem,
     moving = plan.moved if plan.asked.hold_others else stations
     solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=moving)
     cameras = plan.calibration.cameras
-    priors = gather_priors(plan.observations, plan.options, start.structure, plan.prior_for(what), cameras)
+    priors = gather_priors(plan.sights.observations, plan.options, start.structure, plan.prior_for(what), cameras)
     return Problem(plan.sights, solved, priors, options=plan.options), known

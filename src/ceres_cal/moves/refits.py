@@ -82,7 +82,7 @@ def refit(
 
     def solved_with(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
         problem, known = refit_problem(plan, what, start)
-        task = Task(plan.observations, progress, tested=assessed, before=known, scales=plan.scales)
+        task = Task(plan.sights.observations, progress, tested=assessed, before=known, scales=plan.scales)
         return solved_from(task, Start(start, phi_from), problem)
 
     result = solved_with(what, estimate, assessed=True)
@@ -207,7 +207,7 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     known = plan.calibration.uncertainty.posterior
     if result.posterior is None or len(known.lenses) < 2 or plan.loosened(plan.what):
         return result
-    sights = gather_sights(plan.observations.part(*result.inlier_masks(plan.observations)))
+    sights = gather_sights(plan.sights.observations.part(*result.inlier_masks(plan.sights.observations)))
     problem, layout = refit_problem(plan, "pose-only", result.estimate)
     followed = result.posterior.followed  # where a valley says what phi may be
     free = {name: own[own == 0] if name not in followed else own[:0] for name, own in layout.free.items()}

@@ -31,7 +31,6 @@ from ceres_cal.effects.evidence import agreement as agreement_of
 from ceres_cal.effects.evidence import shifts_by
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.effects.smoothness import likeliest_sizes
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
 from ceres_cal.problem.information import Information, Key
@@ -265,17 +264,17 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
 _ALONG, _OVER = 36, (7, 21)
 
 
-def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
+def shifts_by_roughness(end: RobustSolution) -> tuple[Sequence[Key], Sequence[Array]]:
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
     lenses do to them.
     """
     reduced = end.told
-    model = _linearised(end, observations, reduced)
+    model = _linearised(end, reduced)
     shifts = [_shifts_of(model, name, camera) for name, camera in end.estimate.cameras.items()]
     return reduced.shared.keys, [shift for own in shifts for shift in own]
 
 
-def _linearised(end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> Linearised:
+def _linearised(end: RobustSolution, reduced: ReducedInformation) -> Linearised:
     """Some sights' equations, beside their share of what was known before."""
     most_equations = 12_000  # that tell how rough a lens is: of more, those of some views
     problem, estimate = end.problem, end.estimate

@@ -67,20 +67,6 @@ class FieldSearch(Frozen):
     def is_out_of_time(self) -> bool:
         return thread_time() > self.until_s
 
-    @property
-    def target(self) -> Target:
-        return self.grid.target
-
-    @property
-    def curves(self) -> tuple[str, ...]:
-        """Names of those that are painted."""
-        return self.grid.curves
-
-    @property
-    def turns(self) -> tuple[Pose, ...]:
-        """Of the target that put its painted curves onto themselves; the first is none."""
-        return self.grid.turns
-
 
 def prepare_search(
     grey: Array32,
@@ -160,10 +146,10 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
             scored += found
         if scored and max(score for score, _ in scored) > _SURE:
             break
-    distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
+    distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.grid.turns, _COMPARABLE)
     likely = _likely(search, [(camera, drawn[id(camera)]) for camera in distinct])
     before = _poses(search.looked_at)
-    new = [one for one in likely if not np.any(_same_place(one[0].cam_from_world.matrix, before, search.turns))]
+    new = [one for one in likely if not np.any(_same_place(one[0].cam_from_world.matrix, before, search.grid.turns))]
     search.looked_at.extend(camera for camera, _ in new)
     return new
 
@@ -177,11 +163,11 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
     stroke_map = replace(search.stroke_map, centre=np.array(camera.principal_point))
     upright = _upright_of(camera, search)
     x, y = camera.position[:2] @ search.grid.turn
-    along, across = offsets_of(search.target, detected, search.grid.turn)
+    along, across = offsets_of(search.grid.target, detected, search.grid.turn)
     lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
     optics = _optics(upright, stroke_map)
     others = [(one.score, _posed(optics, one)) for one in match(upright, stroke_map, search.grid, lines)]
-    distinct = [camera, *_distinct(others, search.turns, _ALIKE, camera)]
+    distinct = [camera, *_distinct(others, search.grid.turns, _ALIKE, camera)]
     likely = _likely(search, [(one, search.grid) for one in distinct])
     return [one for one, _ in likely if one is not camera]
 
@@ -190,7 +176,7 @@ def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> 
     """Those by which the target's own lines are seen in the picture about as well as by the best, the best first."""
     # who asks says that it ended early
     in_time = ((grid.target, camera) for camera, grid in cameras if not search.is_out_of_time)
-    likelihood = likelihoods_of_places(search.grey, in_time, search.curves)
+    likelihood = likelihoods_of_places(search.grey, in_time, search.grid.curves)
     order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST]
     best = likelihood[order[0]] if likelihood else 0.0
     return [cameras[row] for row in order if likelihood[row] >= min(_LIKELY * best, best)]

@@ -220,7 +220,7 @@ def _signs(grey: Array32, *, is_near: bool) -> Iterator[tuple[bool, Strokes | No
     if is_near:
         yield False, None  # a start that is near finds light ones sooner than strokes tell
     strokes = strokes_of_signs(grey)
-    light, dark = (one.total_px for one in strokes)
+    light, dark = (float(np.sum(one.length_px)) for one in strokes)
     if not is_near:
         yield dark > light, strokes[dark > light]
     if (dark > light) if is_near else min(dark, light) > nearly * max(dark, light):

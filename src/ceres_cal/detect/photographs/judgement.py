@@ -63,7 +63,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
 def objection(search: FieldSearch, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
     if not is_shown(search, followed) or followed.built.is_other:
-        return why_missed(followed, search.target, started=False)
+        return why_missed(followed, search.grid.target, started=False)
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
         return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
@@ -92,7 +92,7 @@ def is_shown(search: FieldSearch, followed: Followed) -> bool:
     explained_if_worn = 0.9
     if followed.holds or not followed.may_be_worn:
         return followed.holds
-    if 2 * len({*detected_curves(search, followed), *followed.visible}) <= len(search.curves):
+    if 2 * len({*detected_curves(search, followed), *followed.visible}) <= len(search.grid.curves):
         return False
     everywhere = explained(search, followed, everywhere=True)
     return everywhere > _EXPLAINED and explained(search, followed) > explained_if_worn
@@ -114,7 +114,7 @@ def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = Fal
     """
     course_px = 3.0
     strokes, parallel = search.stroke_map.strokes, _parallel(search, followed)
-    course = predict(followed.target, followed.camera, search.curves, course_px)
+    course = predict(followed.target, followed.camera, search.grid.curves, course_px)
     inside = parallel.along | parallel.across
     if not everywhere:
         low, high = parallel.outline
@@ -191,20 +191,20 @@ def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
     pixels = one.lines.pixels[one.lines.found]
     here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
     extent = float(np.max(np.ptp(here, axis=0)))
-    away = [np.linalg.norm(turn.inverse.transform(here) - there, axis=1) for turn in search.turns]
+    away = [np.linalg.norm(turn.inverse.transform(here) - there, axis=1) for turn in search.grid.turns]
     return min(float(np.median(np.nan_to_num(one, nan=np.inf))) for one in away) < _SAME_FLOOR * extent
 
 
 def detected_curves(search: FieldSearch, followed: Followed) -> list[str]:
     """Names of the curves that were found."""
     numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
-    return [search.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
+    return [search.grid.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
 
 
 def _in_two_directions(search: FieldSearch, names: list[str]) -> bool:
     """Whether these curves run in more than one direction."""
-    numbers = [search.target.curve_names.index(name) for name in names]
-    tracks, is_arc = search.target.tracks[0, numbers], search.target.is_arc[numbers]
+    numbers = [search.grid.target.curve_names.index(name) for name in names]
+    tracks, is_arc = search.grid.target.tracks[0, numbers], search.grid.target.is_arc[numbers]
     ways = tracks[~is_arc, 1, :2]
     parallel = np.abs(ways[:, 0] * ways[:1, 1] - ways[:, 1] * ways[:1, 0]) < 1e-6 * np.linalg.norm(ways, axis=1)
     return bool(np.any(is_arc) or not np.all(parallel))

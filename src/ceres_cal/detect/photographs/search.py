@@ -131,7 +131,7 @@ def _search_about(problem: FieldSearch, auto: Auto) -> SearchResult:
     if not good:
         return SearchResult(None, reason, seen=seen)
     best = max(good, key=likelihood)
-    problem = replace(problem, grid=grid_of(best.target, problem.curves))
+    problem = replace(problem, grid=grid_of(best.target, problem.grid.curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
     if problem.is_out_of_time:  # it may look alike in ways that nobody looked at
@@ -159,8 +159,8 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
         against = objection(problem, followed)
         if against and refined < _MOST_REFINED and (followed.holds or followed.share >= SURE_SHARE):
             refined += 1
-            free = _free(own.target, auto, followed.camera)
-            followed = refine(problem.grey, own.target, followed.camera, problem.curves, free, followed.lacks_wholly)
+            free = _free(grid.target, auto, followed.camera)
+            followed = refine(problem.grey, grid.target, followed.camera, grid.curves, free, followed.lacks_wholly)
             against = objection(problem, followed)
         if not against:
             good.append(followed)
@@ -180,15 +180,15 @@ def _given_up(seen: Followed | None) -> SearchResult:
 
 def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
     """The one of a camera's turns that what is known favours, so that it need not be followed again."""
-    ways = [camera.at(camera.cam_from_world @ turn) for turn in problem.turns]
+    ways = [camera.at(camera.cam_from_world @ turn) for turn in problem.grid.turns]
     agreeing = _consistent(problem, auto, ways)
     return ways[agreeing[0]] if agreeing else camera
 
 
 def _followed(problem: FieldSearch, auto: Auto, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
-    free = _free(problem.target, auto, camera)
-    return approach(problem.grey, problem.target, camera, problem.curves, free, problem.reached)
+    free = _free(problem.grid.target, auto, camera)
+    return approach(problem.grey, problem.grid.target, camera, problem.grid.curves, free, problem.reached)
 
 
 def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
@@ -203,12 +203,12 @@ def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
 
 def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> SearchResult:
     """The one way that agrees with what is known; SeveralWaysError where none does, or several."""
-    target, curves = problem.target, problem.curves
-    ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
+    target, curves = problem.grid.target, problem.grid.curves
+    ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.grid.turns]
     agreeing = _consistent(problem, auto, ways)
     number = agreeing[0] if agreeing else 0
-    camera, one = ways[number], distinct[number // len(problem.turns)]
-    is_refined = one.built.names and number % len(problem.turns) == 0  # and not turned
+    camera, one = ways[number], distinct[number // len(problem.grid.turns)]
+    is_refined = one.built.names and number % len(problem.grid.turns) == 0  # and not turned
     free = _free(one.target, auto, camera)
     followed = one if is_refined else refine(problem.grey, one.target, camera, curves, free, one.lacks_wholly)
     if against := objection(problem, followed):
@@ -229,7 +229,7 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
 def _consistent(problem: FieldSearch, auto: Auto, cameras: Sequence[Camera]) -> list[int]:
     """Numbers of the cameras that agree with what is known; one alone needs no old calibration to agree with."""
     if auto.facing:
-        return agreeing_with_facing(cameras, auto.facing, problem.target, problem.curves)
+        return agreeing_with_facing(cameras, auto.facing, problem.grid.target, problem.grid.curves)
     if auto.before is not None and len(cameras) > 1:
         return nearest_to_before(cameras, auto.before)
     return list(range(len(cameras)))
