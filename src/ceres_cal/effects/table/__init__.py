@@ -75,23 +75,28 @@ class JointStep(Frozen):
 
 
 def joint_step(case: Case, selection: Selection, solved: Collection[tuple[str, str, str | None]]) -> JointStep:
-    """The step with the chosen effects, and with what an amount that is not to be expected may be instead.
+    """The step with the chosen effects, and in place of one whose amount is not to be expected with what it may be
+    instead. Where nothing else is known to look like it, it moves nothing: what it shows stays wrong all the same.
 
     Args:
         solved: effects by kind, subject and frame that are in the calibration already: what more is asked of them is
             free, and no fault.
     """
     every = list(selection.chosen)
-    for score in selection.chosen:
-        if EFFECTS[score.effect.kind].is_implausible(case, score):
-            known = {(one.effect.kind, one.subject) for one in every}
-            every += [rival for rival in score.rivals if (rival.effect.kind, rival.subject) not in known]
+    unlike = [score for score in every if EFFECTS[score.effect.kind].is_implausible(case, score)]
+    for score in unlike:
+        known = {(one.effect.kind, one.subject) for one in every}
+        every += [rival for rival in score.rivals if (rival.effect.kind, rival.subject) not in known]
     if not every:
         return JointStep(case, ())
     variances = [EFFECTS[score.effect.kind].variances(case, score) for score in every]
     together = case.model.freed(np.hstack([score.columns for score in every])).under(np.concatenate(variances))
     amounts = np.split(together, np.cumsum([len(one) for one in variances])[:-1])
-    is_known = [(one.effect.kind, one.subject, one.frame) in solved for one in every]
-    causes = zip(every, amounts, is_known, strict=True)
-    wrong = [(one, by) for one, by, is_in in causes if EFFECTS[one.effect.kind].wrong == "model" and not is_in]
-    return JointStep(case, tuple(wrong))
+    causes = tuple(
+        (one, by)
+        for one, by in zip(every, amounts, strict=True)
+        if one not in unlike
+        and EFFECTS[one.effect.kind].wrong == "model"
+        and (one.effect.kind, one.subject, one.frame) not in solved
+    )
+    return JointStep(case, causes)
