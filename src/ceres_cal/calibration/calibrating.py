@@ -103,7 +103,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with single_threaded_blas(), at_most(options.threads):
-        return _of_lens(Task(observations, knows=knows), start, sights, options).redrawn()
+        return _of_lens(Task(knows=knows), start, sights, options).redrawn()
 
 
 def _measured(observations: Observations, options: Options, progress: SolveProgress | None, client: Any) -> Calibration:
@@ -128,21 +128,21 @@ def _calibrated(
     """See `calibrate`."""
     observations.require_inside()
     if options.closed_form_only or not (client is not None or is_bulk(observations)):
-        return _chosen(Task(observations, progress), options)
+        return _chosen(Task(progress), observations, options)
     from ceres_cal.robust.bulk import Bulk
 
     digest, bulk = meanwhile(lambda: observations.digest), Bulk(observations, client)
     try:
         part = _part(bulk, options)
-        calibration = _chosen(Task(part.observations, progress, partial(bulk.settled, part)), options)
+        calibration = _chosen(Task(progress, partial(bulk.settled, part)), part.observations, options)
     finally:
         bulk.close()
     return replace(calibration, digest=digest.result())
 
 
-def _chosen(task: Task, options: Options) -> Calibration:
+def _chosen(task: Task, observations: Observations, options: Options) -> Calibration:
     """With the lens that is named, or the one that is chosen."""
-    sights = gather_sights(task.observations)
+    sights = gather_sights(observations)
     if options.lens == AUTO:
         return _of_any_lens(replace(task, chosen=True), sights, options)
     return _of_lens(task, initialise(sights, options), sights, options)
@@ -153,7 +153,6 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
     from ceres_cal.calibration.lens_choice import choose_lens
     from ceres_cal.calibration.lens_forms import papers
 
-    observations = task.observations
     start = initialise(sights, papers(options))
     if options.closed_form_only:
         return _of_lens(task, start, sights, papers(options))
@@ -163,7 +162,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         problem = problem_of(sights, named, one.start.estimate)
         return explained(task, one.start, problem, one.built)
 
-    chosen = choose_lens(observations, options, start)
+    chosen = choose_lens(sights.observations, options, start)
     seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     too_few = chosen.choice.share < 1.0 and seen.leaves_alike
     if too_few or (seen.as_built and not chosen.built.every):
@@ -172,7 +171,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         near = replace(seen.end.estimate, structure=EXACT)
         before, anew = chosen, replace(start, estimate=near)
         built = Built(seen.as_built, seen.end.estimate.structure)
-        chosen = choose_lens(observations, options, anew, built, by_most=too_few)
+        chosen = choose_lens(sights.observations, options, anew, built, by_most=too_few)
         if chosen.choice.chosen != before.choice.chosen:
             seen, chosen = chosen.first_solved(seen_with, papers(options), start)
     said = []

@@ -23,7 +23,6 @@ from ceres_cal.calibration.outcome import (
 from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
-from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.assess import assess, with_doubts
 from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements, shifts_by_roughness
@@ -52,10 +51,10 @@ if TYPE_CHECKING:
 
 
 class Task(Frozen):
-    """What is solved for, and who is told of it.
+    """How a problem is solved, and who is told of it.
 
     Attributes:
-        progress: called at every iteration. settle: where these observations are a part, what solves for all of them
+        progress: called at every iteration. settle: where the observations are a part, what solves for all of them
             from the end of the part, see `Bulk.settled`.
         tested: whether what was stated is held against everything else. knows: whether it is then asked what is known
             of the numbers. chosen: whether the data chose the lens: what one that is too simple leaves looks like a
@@ -64,7 +63,6 @@ class Task(Frozen):
             where the solve holds it. scales: noise scales of points and curves that were seen before it.
     """
 
-    observations: Observations
     progress: SolveProgress | None = None
     settle: Callable[..., Settled] | None = None
     tested: bool = True
@@ -107,7 +105,7 @@ class Explained(Frozen):
         inliers = self.end.inliers
         if inliers.rows.all():
             return ~inliers.points, ~inliers.curves
-        return self.came_out.outlier_masks(self.task.observations)
+        return self.came_out.outlier_masks(self.problem.observations)
 
     @property
     def came_out(self) -> Calibration:
@@ -119,7 +117,7 @@ class Explained(Frozen):
     @property
     def effects(self) -> tuple[EffectEstimate, ...]:
         """What was solved for beside the problem."""
-        moving = self.unsteady.estimates(self.task.observations) if self.unsteady else ()
+        moving = self.unsteady.estimates(self.problem.observations) if self.unsteady else ()
         return (*moving, *(self.beside.estimates if self.beside else ()))
 
     @property
@@ -159,9 +157,8 @@ def solved_from(task: Task, start: Start, problem: Problem, built: Built = AS_DR
 def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
     """Solve and explain what is left; see `solved_from`."""
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
-    observations = task.observations
-    takes_long = observations.rows > long_to_digest
-    digest = meanwhile(lambda: observations.digest) if takes_long and task.settle is None else None
+    takes_long = problem.observations.rows > long_to_digest
+    digest = meanwhile(lambda: problem.observations.digest) if takes_long and task.settle is None else None
     seen, may_move = _solved(task, start, problem, built), task.chosen and not task.settle
     steady = _made_steady(seen, problem) if may_move else None
     if steady is None:
@@ -173,7 +170,7 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
 
 def known_of(seen: Explained) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
-    task, observations, conflicts = seen.task, seen.task.observations, Conflicts()
+    task, conflicts = seen.task, Conflicts()
     if task.tested:
         part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
         conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at)
@@ -192,7 +189,7 @@ def known_of(seen: Explained) -> Calibration:
         phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
         strange = (
             *unusual_pixels(seen.end, seen.problem),
-            *seen_from_behind(seen.end.estimate, observations),
+            *seen_from_behind(seen.end.estimate, seen.problem.observations),
         )
         warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
     calibration = seen.came_out

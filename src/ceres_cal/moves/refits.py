@@ -82,7 +82,7 @@ def refit(
 
     def solved_with(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
         problem, known = refit_problem(plan, what, start)
-        task = Task(plan.sights.observations, progress, tested=assessed, before=known, scales=plan.scales)
+        task = Task(progress, tested=assessed, before=known, scales=plan.scales)
         return solved_from(task, Start(start, phi_from), problem)
 
     result = solved_with(what, estimate, assessed=True)

@@ -63,8 +63,7 @@ def score(
         raise InputError("with its stations held nothing is left to be posed: `ceres-cal check` is for that")
     start = Start(_start(calibration, sights, known), calibration.phi_from)
     priors = gather_priors(observed, given, EXACT)
-    task = Task(observed, tested=False, before=layout)
-    posed = solved_from(task, start, Problem(sights, layout, priors, options=given))
+    posed = solved_from(Task(tested=False, before=layout), start, Problem(sights, layout, priors, options=given))
     left = residuals(sights, posed.estimate)
     noise = _noise_ratios(posed, calibration)
     views = [(view.camera, _view(number, observed, left, posed, noise)) for number, view in enumerate(observed.views)]
