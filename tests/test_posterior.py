@@ -17,10 +17,10 @@ from ceres_cal.base.tails import student_95
 from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations.sights import STRUCTURE, gather_sights
 from ceres_cal.posterior.posterior import make_posterior
-from ceres_cal.problem.bundle import _ParameterBlocks, solve
-from ceres_cal.problem.costs import PriorCost, Run, SightCost
+from ceres_cal.problem.bundle import packed, solve
+from ceres_cal.problem.costs import CachedCost, PriorCost, Run, SightCost
 from ceres_cal.problem.information import Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
 from ceres_cal.problem.priors import gather_priors
@@ -72,22 +72,16 @@ def step_of_block(kind: str, name: str, estimate: Estimate, layout: Layout) -> A
 def covariance_of_pyceres(whole: Problem, estimate: Estimate) -> dict[tuple[str, str], Array]:
     """Covariance of each block by pyceres, nothing eliminated, no kernel of `information` in it."""
     layout = whole.layout
-    blocks = _ParameterBlocks.pack(estimate, layout, frozenset())
+    blocks = packed(estimate, layout, frozenset())
     ceres, run = pyceres.Problem(), Run()
-    costs: list[tuple[Any, list[Array]]] = []
-    for number, key in enumerate(whole.sights.keys):
-        cost = SightCost(run, whole.sights[number], whole, estimate)
-        costs.append((cost, blocks.of(key, cost.slots)))
-    for prior in whole.priors_at(estimate):
-        block = PriorCost(run, prior, estimate, layout)
-        costs.append((block, [blocks.owned_by(*owner) for owner in block.owners]))
-    for cost, arrays in costs:
+    costs: list[CachedCost] = [SightCost(run, sight, whole, estimate) for sight in whole.sights]
+    costs += [PriorCost(run, prior, estimate, layout) for prior in whole.priors_at(estimate)]
+    for cost in costs:
+        arrays = [blocks[owner] for owner in cost.owners]
         cost.evaluate(*arrays)
         ceres.add_residual_block(cost, None, arrays)
-    named = {("camera", name): array for name, array in blocks.cameras.items()}
-    named |= {("station", name): blocks.stations[name] for name in layout.stations}
-    named |= {("placement", name): blocks.placements[name] for name in layout.placements}
-    named |= {("structure", "board"): blocks.structure} if len(blocks.structure) else {}
+    named = {owner: array for owner, array in blocks.items() if owner != STRUCTURE}
+    named |= {("structure", "board"): blocks[STRUCTURE]} if len(blocks[STRUCTURE]) else {}
     options = pyceres.CovarianceOptions()
     options.algorithm_type = pyceres.CovarianceAlgorithmType.DENSE_SVD
     options.null_space_rank = 0

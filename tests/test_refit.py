@@ -36,7 +36,7 @@ from ceres_cal.moves.poses import movement
 from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitOptions, carried_prior, make_plan, relabelled
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
-from ceres_cal.problem.bundle import _ParameterBlocks
+from ceres_cal.problem.bundle import packed
 from ceres_cal.problem.costs import PriorCost, Run
 from ceres_cal.problem.parameters import Layout, Options, Station
 from ceres_cal.problem.priors import GaussianPrior
@@ -95,8 +95,8 @@ def test_the_prior_says_what_its_matrix_says(two_cameras: tuple[Calibration, dic
     away = moved(estimate, posterior.keys, step)
     np.testing.assert_allclose(prior.offsets(away), step, rtol=1e-6, atol=1e-12)
     cost = PriorCost(Run(), prior, away, layout)
-    blocks = _ParameterBlocks.pack(away, layout, frozenset())
-    arrays = [blocks.owned_by(*owner) for owner in cost.owners]
+    blocks = packed(away, layout, frozenset())
+    arrays = [blocks[owner] for owner in cost.owners]
 
     def value(arrays: list[np.ndarray]) -> np.ndarray:
         found = np.empty(len(root))

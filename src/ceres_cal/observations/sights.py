@@ -30,6 +30,12 @@ from ceres_cal.scene.curves import nearest_to_rays
 _RUN = 256  # rows between two that go, from which on those between are moved together
 _Rows: TypeAlias = "Indices | slice | list[slice]"
 
+Owner = tuple[str, str]
+"""Whose numbers they are that a solver moves together: a "camera", "station" or "placement", and its name."""
+
+STRUCTURE: Owner = ("structure", "")
+"""Of all targets."""
+
 
 class SightKey(NamedTuple):
     """Camera, station and frame of a sight; `placement` None is the world."""
@@ -40,6 +46,11 @@ class SightKey(NamedTuple):
 
     def __str__(self) -> str:
         return f"station {self.station!r}" + (f", placement {self.placement!r}" if self.placement is not None else "")
+
+    @property
+    def owners(self) -> tuple[Owner, ...]:
+        """Of the numbers that it depends on: its camera, station, placement, and the structure."""
+        return ("camera", self.camera), ("station", self.station), ("placement", self.placement or ""), STRUCTURE
 
 
 class Sights(Frozen, Sequence["Sights"]):

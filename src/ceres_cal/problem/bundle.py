@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -16,8 +15,16 @@ from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
-from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, CostFunction, EliminatedCost, PriorCost, Run, SightCost
+from ceres_cal.observations.sights import STRUCTURE, Owner, Sights
+from ceres_cal.problem.costs import (
+    ROWS_WORTH_A_THREAD,
+    CachedCost,
+    CostFunction,
+    EliminatedCost,
+    PriorCost,
+    Run,
+    SightCost,
+)
 from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, unit_px, with_intrinsics
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.scene.camera import Camera
@@ -99,6 +106,12 @@ def chart_of(camera: Camera, free: Indices) -> Chart | None:
     return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
 
 
+def _charts(estimate: Estimate, layout: Layout) -> dict[Owner, Chart]:
+    """Of the cameras whose numbers are not moved as they are."""
+    charts = {("camera", name): chart_of(camera, layout.free[name]) for name, camera in estimate.cameras.items()}
+    return {owner: chart for owner, chart in charts.items() if chart is not None}
+
+
 class ChartedCost(CostFunction):
     """A cost function over what Ceres moves, of one over the numbers themselves."""
 
@@ -125,104 +138,55 @@ class ChartedCost(CostFunction):
 # ---- the problem --------------------------------------------------------------------------------------------------
 
 
-@dataclass(eq=False)
-class _ParameterBlocks:
-    """The arrays that Ceres moves, by name; the caller's estimate is never touched."""
-
-    cameras: dict[str, Array]
-    stations: dict[str, Array]
-    placements: dict[str, Array]
-    structure: Array
-
-    @classmethod
-    def pack(cls, estimate: Estimate, layout: Layout, eliminated: frozenset[str | None]) -> _ParameterBlocks:
-        kept = layout.placements - eliminated
-        return cls(
-            {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()},
-            {n: estimate.stations[n].cam_from_world.log() for n in estimate.stations if n in layout.stations},
-            {n: estimate.placements[n].log() for n in estimate.placements if n in kept},
-            estimate.structure.values.copy(),
-        )
-
-    def of(self, key: SightKey, slots: Iterable[int]) -> list[Array]:
-        """The arrays of a sight's camera (slot 0), station (1), placement (2) and structure (3)."""
-        every = (
-            lambda: self.cameras[key.camera],
-            lambda: self.stations[key.station],
-            lambda: self.placements[str(key.placement)],
-            lambda: self.structure,
-        )
-        return [every[slot]() for slot in slots]
-
-    def owned_by(self, kind: str, name: str) -> Array:
-        """The array of a camera, a station, or the structure."""
-        return self.cameras[name] if kind == "camera" else self.stations[name] if kind == "station" else self.structure
-
-    def charts(self, estimate: Estimate, layout: Layout) -> dict[int, Chart]:
-        """Those of the arrays that are not moved as they are, by the array's id."""
-        charts = {id(self.cameras[n]): chart_of(camera, layout.free[n]) for n, camera in estimate.cameras.items()}
-        return {number: chart for number, chart in charts.items() if chart is not None}
-
-    def change(self, charts: Mapping[int, Chart], by: Callable[[Chart, Array], Array]) -> None:
-        """Each array that has a chart, in its place."""
-        for array in self.cameras.values():
-            if id(array) in charts:
-                array[:] = by(charts[id(array)], array)
-
-    def unpack(self, estimate: Estimate, layout: Layout) -> Estimate:
-        cameras = {}
-        for name, camera in estimate.cameras.items():
-            vector = intrinsics_vector(camera)
-            vector[layout.free[name]] = self.cameras[name]
-            cameras[name] = with_intrinsics(camera, vector) if len(layout.free[name]) else camera
-        stations = {
-            name: Station(old.camera, Pose.exp(self.stations[name])) if name in layout.stations else old
-            for name, old in estimate.stations.items()
-        }
-        moved = Poses.of({name: Pose.exp(vector) for name, vector in self.placements.items()})
-        placements = Poses.of(estimate.placements).updated(list(moved), moved.stack)
-        return Estimate(cameras, stations, placements, estimate.structure.with_values(self.structure))
+def packed(estimate: Estimate, layout: Layout, eliminated: frozenset[str | None]) -> dict[Owner, Array]:
+    """The arrays that Ceres moves; the caller's estimate is never touched."""
+    cameras = {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()}
+    stations = {n: station.cam_from_world.log() for n, station in estimate.stations.items() if n in layout.stations}
+    kept = layout.placements - eliminated
+    placements = {name: estimate.placements[name].log() for name in estimate.placements if name in kept}
+    by_kind = {"camera": cameras, "station": stations, "placement": placements}
+    blocks = {(kind, name): array for kind, arrays in by_kind.items() for name, array in arrays.items()}
+    return {**blocks, STRUCTURE: estimate.structure.values.copy()}
 
 
-@dataclass(eq=False)
-class _Assembly:
-    """Every cost of a problem with the arrays it depends on; costs that depend on nothing free have no array."""
+def _unpacked(blocks: Mapping[Owner, Array], estimate: Estimate, layout: Layout) -> Estimate:
+    cameras = {}
+    for name, camera in estimate.cameras.items():
+        vector = intrinsics_vector(camera)
+        vector[layout.free[name]] = blocks["camera", name]
+        cameras[name] = with_intrinsics(camera, vector) if len(layout.free[name]) else camera
+    stations = {
+        name: Station(old.camera, Pose.exp(blocks["station", name])) if name in layout.stations else old
+        for name, old in estimate.stations.items()
+    }
+    moved = Poses.of({name: Pose.exp(vector) for (kind, name), vector in blocks.items() if kind == "placement"})
+    placements = Poses.of(estimate.placements).updated(list(moved), moved.stack)
+    return Estimate(cameras, stations, placements, estimate.structure.with_values(blocks[STRUCTURE]))
 
-    blocks: _ParameterBlocks
-    costs: list[tuple[Any, list[Array]]]
-    eliminated: list[tuple[EliminatedCost, list[Array]]]
-    threads: int = 1
-    """Blocks that are worth a thread each."""
 
-
-def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
+def _costs_of(run: Run, problem: Problem, estimate: Estimate) -> tuple[list[CachedCost], int]:
+    """Every cost of a problem, and how many blocks are worth a thread each."""
     private, sights, layout = problem.private, problem.sights, problem.layout
-    blocks = _ParameterBlocks.pack(estimate, layout, private)
-    assembly, stated = _Assembly(blocks, [], []), problem.stated_at(estimate)
+    eliminated, threads, stated = list[EliminatedCost](), 1, problem.stated_at(estimate)
     for camera in estimate.cameras:
         own = sights.numbers(camera, placements=private)
         if len(own):
             of_camera = [PriorCost(run, prior, estimate, layout) for prior in stated if prior.is_of(camera)]
             stated = [prior for prior in stated if not prior.is_of(camera)]
-            cost = EliminatedCost(run, sights.take(own), problem, estimate, [one.evaluated for one in of_camera])
-            assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
-    assembly.costs += assembly.eliminated
+            known = [one.evaluated for one in of_camera]
+            eliminated.append(EliminatedCost(run, sights.take(own), problem, estimate, known))
+    costs: list[CachedCost] = [*eliminated]
     for number, key in enumerate(sights.keys):
         if key.placement not in private:
             parts = list(_parts(sights[number]))
-            assembly.threads = max(assembly.threads, len(parts))
-            for part in parts:
-                sight_cost = SightCost(run, part, problem, estimate)
-                assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
+            threads = max(threads, len(parts))
+            costs += [SightCost(run, part, problem, estimate) for part in parts]
     if problem.elsewhere is not None:
-        more = problem.elsewhere.cost(run, problem, estimate)
-        assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
-    posed = {cost.camera for cost, _ in assembly.eliminated}
+        costs.append(problem.elsewhere.cost(run, problem, estimate))
+    posed = {cost.camera for cost in eliminated}
     smooth = (problem.smooth_at(estimate, name) for name in estimate.cameras if name not in posed)
-    for prior in (*stated, *chain.from_iterable(smooth)):
-        prior_cost = PriorCost(run, prior, estimate, layout)
-        assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
-    return assembly
+    costs += [PriorCost(run, prior, estimate, layout) for prior in (*stated, *chain.from_iterable(smooth))]
+    return costs, threads
 
 
 class _Watcher(pyceres.IterationCallback):
@@ -299,14 +263,18 @@ def solve(
     _require_enough(problem, estimate)
     run, layout = Run(), problem.layout
     with at_most(problem.options.threads):
-        assembly = _assemble(run, problem, estimate)
-    ceres, charts = pyceres.Problem(), assembly.blocks.charts(estimate, layout)
-    for cost, arrays in assembly.costs:
-        own = [charts.get(id(array)) for array in arrays]
-        if arrays:
+        costs, threads = _costs_of(run, problem, estimate)
+    ceres, blocks, charts = pyceres.Problem(), packed(estimate, layout, problem.private), _charts(estimate, layout)
+    for cost in costs:
+        own = [charts.get(owner) for owner in cost.owners]
+        if own:  # else it depends on nothing free
+            arrays = [blocks[owner] for owner in cost.owners]
             ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
-    assembly.blocks.change(charts, Chart.moved)
-    settings = _solver_options(problem, assembly, precision)
+    for owner, chart in charts.items():
+        blocks[owner][:] = chart.moved(blocks[owner])
+    settings = _solver_options(problem, blocks, precision)
+    # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.
+    settings.num_threads = threads
     settings.callbacks = [_Watcher(run, progress, precision)]
     if is_near and problem.weighting.is_convex:
         settings.initial_trust_region_radius = 1e8
@@ -315,13 +283,15 @@ def solve(
         pyceres.solve(settings, ceres, summary)
     if run.failure is not None:
         raise run.failure
-    assembly.blocks.change(charts, Chart.numbers)
+    for owner, chart in charts.items():
+        blocks[owner][:] = chart.numbers(blocks[owner])
     try:
-        solved = assembly.blocks.unpack(estimate, layout)
+        solved = _unpacked(blocks, estimate, layout)
     except InputError as error:  # phi or aspect below 0
         raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
-    for eliminated, arrays in assembly.eliminated:
-        solved = solved.with_placements(*eliminated.converged(arrays))
+    for cost in costs:
+        if isinstance(cost, EliminatedCost):
+            solved = solved.with_placements(*cost.converged([blocks[owner] for owner in cost.owners]))
     usable = bool(summary.IsSolutionUsable())
     return Solution(
         solved,
@@ -377,23 +347,22 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
         )
 
 
-def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> Any:
+def _solver_options(problem: Problem, blocks: Mapping[Owner, Array], precision: float) -> Any:
     dense_limit = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
     dense_blocks = 2000  # of few full blocks: of two with 850 a sparse step takes half a minute, a dense one .1 s
     most_invalid = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
     solver = pyceres.SolverOptions()
-    kept = sum(len(free) for free in problem.layout.free.values()) + len(assembly.blocks.structure)
+    kept = sum(len(free) for free in problem.layout.free.values()) + len(blocks[STRUCTURE])
     left = kept + 6 * len(problem.layout.stations)
     few = left < dense_limit
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
-    if not assembly.blocks.placements and left < dense_blocks:  # nothing is left to be eliminated, and blocks are full
+    has_placements = any(kind == "placement" for kind, _ in blocks)
+    if not has_placements and left < dense_blocks:  # nothing is left to be eliminated, and blocks are full
         solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
     solver.max_num_iterations = problem.options.max_iterations
     solver.max_num_consecutive_invalid_steps = most_invalid
     solver.function_tolerance = precision
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14
-    # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.
-    solver.num_threads = assembly.threads
     solver.logging_type = pyceres.LoggingType.SILENT
     return solver

@@ -5,7 +5,7 @@ What Ceres calls: the last answer is kept, and an exception ends the solve inste
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose, left_jacobian, rotation_log, skew
-from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.observations.sights import STRUCTURE, Owner, SightKey, Sights
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior
@@ -61,14 +61,24 @@ CostFunction: Any = pyceres.CostFunction  # which has no types
 class CachedCost(CostFunction):
     """A cost function; what it costs is `evaluated`: the answer in a place, whole and by blocks; None where an
     observation cannot be projected from there. pyceres' metaclass lets no class with abstract methods join.
+
+    Attributes:
+        owners: whose blocks the solver hands over; the others are held.
     """
 
     evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
+    owners: list[Owner]
 
     def __init__(self, run: Run) -> None:
         super().__init__()
         self._run = run
         self._known: CostValue | None = None
+
+    def _take(self, sizes: Mapping[Owner, int], residuals: int) -> None:
+        """Tell Ceres of the blocks, of so many numbers each, and of the residuals."""
+        self.owners = list(sizes)
+        self.set_num_residuals(residuals)
+        self.set_parameter_block_sizes(list(sizes.values()))
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
         known = None
@@ -100,14 +110,7 @@ _LEFT_TO_THE_COMPLEMENT = 1e-2
 
 
 class _SightsCost(CachedCost):
-    """What sights of one camera cost.
-
-    Attributes:
-        slots: which of its camera (0), station (1), placement (2) and structure (3) the solver hands over; the others
-            are held.
-    """
-
-    slots: list[int]
+    """What sights of one camera cost."""
 
     def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
@@ -119,12 +122,6 @@ class _SightsCost(CachedCost):
         self._points = point_columns(sights, self._structure, weighting.point_scale)
         self._curves = curve_columns(sights, self._structure, feet, weighting.curve_scale)
         self._loss = kernel_loss(weighting)
-
-    def _take(self, sizes: Sequence[int], is_free: Sequence[bool], residuals: int) -> None:
-        """Tell Ceres of the slots that are free, of so many numbers each, and of the residuals."""
-        self.slots = [slot for slot in range(len(sizes)) if is_free[slot]]
-        self.set_num_residuals(residuals)
-        self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
 
     def _as_built(self, structure: Structure) -> tuple[kernels.PointColumns, kernels.CurveColumns]:
         """The columns with points and tracks where the structure has them."""
@@ -143,8 +140,10 @@ class SightCost(_SightsCost):
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
         if key.placement is not None:
             self._poses[1] = estimate.placements[key.placement].log()
-        is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
-        self._take((len(free), 6, 6, count), is_free, len(free) + self._unknowns.structure + 7)
+        sizes = len(free), 6 * (key.station in layout.stations), 6 * (key.placement in layout.placements), count
+        self._slots = [slot for slot in range(len(sizes)) if sizes[slot]]
+        taken = {key.owners[slot]: sizes[slot] for slot in self._slots}
+        self._take(taken, len(free) + self._unknowns.structure + 7)
 
     def block(self, parameters: Sequence[Array]) -> Array | None:
         """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
@@ -157,7 +156,7 @@ class SightCost(_SightsCost):
         structure = 3  # slot
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
-        for place, slot in enumerate(self.slots):
+        for place, slot in enumerate(self._slots):
             size = self._unknowns.structure if slot == structure else len(parameters[place])
             numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * size)
         residuals = np.empty(rows)
@@ -168,7 +167,7 @@ class SightCost(_SightsCost):
         )  # fmt: skip
         if mixing is not None:
             jacobians[structure] = (jacobians[structure].reshape(rows, -1) @ mixing).reshape(-1)
-        return CostValue(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
+        return CostValue(at, residuals, [jacobians[slot] for slot in self._slots]) if answered else None
 
 
 def kernel_loss(weighting: Weighting) -> kernels.Loss:
@@ -213,7 +212,8 @@ class EliminatedCost(_SightsCost):
         self._last = self._accepted
         self._smooth, self._stated = _smoothness(problem, estimate, self.camera, self._size), stated
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
-        self._take((len(free), 0, 0, count), (len(free) > 0, False, False, count > 0), self._size + 1)
+        sizes = {("camera", self.camera): len(free), STRUCTURE: count}
+        self._take({owner: size for owner, size in sizes.items() if size}, self._size + 1)
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
@@ -339,20 +339,14 @@ def _of_station(rows: Sequence[int], rotation: Array) -> _Coordinates:
 
 
 class PriorCost(CachedCost):
-    """root (x - mean), in standard deviations, of a prior on free numbers alone.
-
-    Attributes:
-        owners: whose blocks the solver hands over, as ("camera" or "station", name), or ("structure", "").
-    """
+    """root (x - mean), in standard deviations, of a prior on free numbers alone."""
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
         super().__init__(run)
         self._prior, self._root = prior, prior.information.root
         parts = list(_parts(prior, estimate, layout))
-        self.owners: list[tuple[str, str]] = [owner for owner, _, _, _ in parts]
         self._coordinates = [(columns, coordinates) for _, _, columns, coordinates in parts]
-        self.set_num_residuals(len(self._root))
-        self.set_parameter_block_sizes([size for _, size, _, _ in parts])
+        self._take({owner: size for owner, size, _, _ in parts}, len(self._root))
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
         off, root, slopes = -self._prior.mean, self._root, []
@@ -380,7 +374,7 @@ def _bent(residuals: Array) -> tuple[Array, Array]:
 
 def _parts(
     prior: GaussianPrior, estimate: Estimate, layout: Layout
-) -> Iterator[tuple[tuple[str, str], int, list[int], _Coordinates]]:
+) -> Iterator[tuple[Owner, int, list[int], _Coordinates]]:
     """The blocks that a prior depends on: owner, size, columns of the prior, and what stands there."""
     for (kind, owner), columns in columns_by_owner(prior.keys).items():
         quantities = [prior.keys[column].quantity for column in columns]
@@ -398,4 +392,4 @@ def _parts(
     if structure:
         names = estimate.structure.names
         slots = [names.index(prior.keys[column].structure_name) for column in structure]
-        yield ("structure", ""), len(names), structure, _linear(slots, np.ones(len(slots)), len(names))
+        yield STRUCTURE, len(names), structure, _linear(slots, np.ones(len(slots)), len(names))

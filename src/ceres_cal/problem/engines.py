@@ -20,11 +20,11 @@ from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.threads import at_most, available, keep_freed_memory, single_threaded_blas
 from ceres_cal.base.transforms import Poses
-from ceres_cal.observations.sights import SightKey
+from ceres_cal.observations.sights import Owner, SightKey
 from ceres_cal.problem.costs import CachedCost, CostValue, Run
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.shares import Share, ShareRequest, owners_of
+from ceres_cal.problem.shares import Share, ShareRequest
 
 _A = TypeVar("_A")
 _RETRIES = 3  # of what a worker that was lost had to do
@@ -221,34 +221,23 @@ class SharedObservations(Frozen):
 
 
 class SharedCost(CachedCost):
-    """The compressed blocks of all sights of the shares: a round trip for each place that Ceres looks at.
-
-    Attributes:
-        owners: by kind and name, of the numbers that it depends on.
-    """
+    """The compressed blocks of all sights of the shares: a round trip for each place that Ceres looks at."""
 
     def __init__(self, run: Run, judged: SharedObservations, problem: Problem, estimate: Estimate) -> None:
         super().__init__(run)
         self._judged, self._asked = judged, judged.asked(problem, estimate)
-        layout, sizes = problem.layout, dict[tuple[str, str], int]()
-        self._of: dict[SightKey, list[tuple[str, str]]] = {}
+        layout, sizes, count = problem.layout, dict[Owner, int](), len(estimate.structure.values)
+        self._of: dict[SightKey, list[Owner]] = {}
         for key in judged.keys:
-            own = (
-                len(layout.free[key.camera]),
-                6 * (key.station in layout.stations),
-                0,
-                len(estimate.structure.values),
-            )
-            slots = [slot for slot in range(4) if own[slot]]
-            self._of[key] = owners_of(key, slots)
-            sizes |= dict(zip(self._of[key], (own[slot] for slot in slots), strict=True))
-        self.owners: list[tuple[str, str]] = list(sizes)
+            every = len(layout.free[key.camera]), 6 * (key.station in layout.stations), 0, count
+            own = {owner: size for owner, size in zip(key.owners, every, strict=True) if size}
+            self._of[key] = list(own)
+            sizes |= own
         ends = np.cumsum([0, *sizes.values()])
         self._columns = {owner: np.arange(*ends[n : n + 2]) for n, owner in enumerate(sizes)}
         rows = sum(1 + sum(sizes[owner] for owner in own) for own in self._of.values())
         self._shape = rows, int(ends[-1])
-        self.set_num_residuals(rows)
-        self.set_parameter_block_sizes(list(sizes.values()))
+        self._take(sizes, rows)
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         numbers = {owner: at[columns] for owner, columns in self._columns.items()}

@@ -20,7 +20,7 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
-from ceres_cal.observations.sights import SightKey, Sights, column_of, shown_rows, sights_of
+from ceres_cal.observations.sights import Owner, SightKey, Sights, column_of, shown_rows, sights_of
 from ceres_cal.problem.costs import Run, SightCost
 from ceres_cal.problem.parameters import Estimate, Layout
 from ceres_cal.problem.problem import Problem, Weighting
@@ -302,12 +302,12 @@ class Share:
             np.bincount(view[there & ~inside], minlength=size),
         )
 
-    def blocks(self, asked: ShareRequest, numbers: Mapping[tuple[str, str], Array]) -> CompressedBlocks:
-        """Compressed blocks at some numbers, by kind and name of what owns them."""
+    def blocks(self, asked: ShareRequest, numbers: Mapping[Owner, Array]) -> CompressedBlocks:
+        """Compressed blocks at some numbers."""
         answers: dict[SightKey, Array] = {}
         for sight, problem in self._problems(asked):
             cost = SightCost(Run(), sight, problem, asked.estimate)
-            rows = cost.block([numbers[owner] for owner in owners_of(sight.key, cost.slots)])
+            rows = cost.block([numbers[owner] for owner in cost.owners])
             if rows is None:
                 return CompressedBlocks(None)
             answers[sight.key] = compressed(rows)
@@ -341,12 +341,6 @@ class Share:
         feet = self._feet_of(sights, asked)
         problem = Problem(part, asked.layout, (), asked.weighting, feet=feet)
         return ((sight, problem) for sight in part)
-
-
-def owners_of(key: SightKey, slots: Sequence[int]) -> list[tuple[str, str]]:
-    """What owns the numbers that a sight of the world depends on: its camera (0), station (1), structure (3)."""
-    every = {0: ("camera", key.camera), 1: ("station", key.station), 3: ("structure", "")}
-    return [every[slot] for slot in slots]
 
 
 def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -> Iterator[Share]:
