@@ -53,6 +53,8 @@ def _fields(of: type) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """NumPy's numbers and arrays as Python's, also inside of lists and mappings."""
+    if isinstance(value, str):  # which is most of them
+        return value
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):

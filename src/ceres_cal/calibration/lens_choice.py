@@ -127,15 +127,18 @@ class Comparison(Frozen):
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
-        if self.chosen.form.blank.roughness:
+        each = [
+            (one, likely)
+            for one, likely in zip(self.tried, self.probabilities, strict=True)
+            if one is not self.chosen and likely >= least_probability and not (one.form.blank.roughness or one.fault)
+        ]
+        if self.chosen.form.blank.roughness or not each:
             return found
         near = attempt(lambda: self.seen.solved_near(self.chosen))  # reads: "other lenses could not be compared, ..."
         if isinstance(near, CalibrationError):
             return replace(found, failed=str(near))
         found = replace(found, near=near)
-        for one, likely in zip(self.tried, self.probabilities, strict=True):
-            if one is self.chosen or likely < least_probability or one.form.blank.roughness or one.fault:
-                continue
+        for one, likely in each:
             # quiet: what cannot be solved for, or ends in another minimum, says nothing
             near = attempt(partial(self.seen.solved_near, one, as_promised=True))
             if not isinstance(near, CalibrationError):

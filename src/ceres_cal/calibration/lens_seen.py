@@ -16,7 +16,7 @@ from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.bundle import solve, with_placements_at_best
+from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, problem_of
@@ -289,8 +289,7 @@ class InlierRows(Frozen):
         # and of all, where the next step is of a thousandth of a standard deviation.
         at_best = 1e-6
         problem = self._problem(candidate.form.of(self.options), candidate.estimate)
-        near = with_placements_at_best(problem, candidate.estimate, at_best)
-        solution = solve(problem, near, precision=at_best)
+        solution = solve(problem, candidate.estimate, precision=at_best, posed=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
         if as_promised and 2.0 * solution.cost > _KEPT * candidate.least:

@@ -229,7 +229,10 @@ class Observations(Content):
 
     def part(self, points: Mask | Indices, curves: Mask | Indices) -> Observations:
         """The same views with some of the observations: their numbers, or True for each that stays."""
-        return replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
+        part = replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
+        if "copies" in vars(self) and not self.copies.are_there:  # nor does a part repeat anything
+            vars(part)["copies"] = Copies(self.copies.points[points], self.copies.curves[curves])
+        return part
 
     def with_targets(self, targets: Mapping[str, Target]) -> Observations:
         """The same observations of targets that are drawn otherwise; their digest stays."""

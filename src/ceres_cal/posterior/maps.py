@@ -266,6 +266,8 @@ class Picture(Frozen):
         """(N, 2) px from where this camera shows its rays to where another one does, turned as well as can be; NaN
         where either shows nothing.
         """
+        if other == self.camera:
+            return np.where(np.isfinite(self._rays[:, :2]), 0.0, np.nan)
         shift = other.project(self._rays) - self.pixels
         known = np.isfinite(shift[:, 0])
         return shift - self._turned(np.nan_to_num(shift)[:, :, None], known)[:, :, 0]

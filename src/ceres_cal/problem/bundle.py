@@ -248,6 +248,7 @@ def solve(
     *,
     precision: float = 1e-14,
     is_near: bool = True,
+    posed: float = 0.0,
 ) -> Solution:
     """Minimise the robust cost over everything free, from `estimate`.
 
@@ -255,6 +256,7 @@ def solve(
         progress: called at every iteration. precision: relative change of the cost at which the solve ends.
         is_near: whether the estimate is near the minimum. There plain Gauss-Newton is right where the loss is convex,
             and phi against height creeps without it.
+        posed: to which share of its cost each private placement is at its best before the first step; 0: it stays.
 
     Raises:
         DegenerateError: fewer observations than free numbers.
@@ -267,6 +269,8 @@ def solve(
     ceres, blocks, charts = pyceres.Problem(), packed(estimate, layout, problem.private), _charts(estimate, layout)
     for cost in costs:
         own = [charts.get(owner) for owner in cost.owners]
+        if posed and isinstance(cost, EliminatedCost):
+            cost.posed(posed)
         if own:  # else it depends on nothing free
             arrays = [blocks[owner] for owner in cost.owners]
             ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
@@ -314,7 +318,7 @@ def placement_costs(
     """
     held = Layout({sights.keys[0].camera: np.empty(0, dtype=np.int64)}, frozenset(), frozenset())
     problem = Problem(sights, held, weighting=weighting)
-    return EliminatedCost(Run(), sights, problem, estimate).from_poses(poses, tolerance)
+    return EliminatedCost(Run(), sights, problem, estimate).posed(tolerance, poses)
 
 
 def with_placements_at_best(problem: Problem, estimate: Estimate, tolerance: float = _POSED) -> Estimate:

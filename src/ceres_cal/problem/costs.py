@@ -279,12 +279,14 @@ class EliminatedCost(_SightsCost):
         reduced = np.sum(run_parts(part, self._parts), axis=0)
         return kernels.Sweep(poses, gains, costs, reduced if chain is None else chain.T @ reduced @ chain)
 
-    def from_poses(self, poses: Array, tolerance: float) -> tuple[Array, Array]:
-        """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,
-        everything else held; an infinite cost where a start cannot be seen.
+    def posed(self, tolerance: float, poses: Array | None = None) -> tuple[Array, Array]:
+        """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts where it is, or
+        from `poses`, everything else held; an infinite cost where a start cannot be seen.
         """
+        poses = self._accepted.poses if poses is None else poses
         self._accepted = replace(self._accepted, poses=poses, gains=np.zeros_like(self._accepted.gains))
         swept = self._swept(self._accepted.at, tolerance)
+        self._accepted = replace(self._accepted, poses=swept.poses, gains=swept.gains)
         return swept.costs, swept.poses
 
     def converged(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:

@@ -76,8 +76,8 @@ class Problem(Frozen):
     sights: Sights
     layout: Layout
     priors: tuple[GaussianPrior, ...] = ()
-    weighting: Weighting = field(default_factory=Weighting)
-    options: Options = field(default_factory=Options)
+    weighting: Weighting = Weighting()
+    options: Options = Options()
     feet: Array | None = None
     smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     elsewhere: Elsewhere | None = None
@@ -112,12 +112,11 @@ class Problem(Frozen):
 
     def smooth_at(self, estimate: Estimate, camera: str) -> Iterator[GaussianPrior]:
         """What its smoothness says of a camera's lens, of mean nought, where no posterior says so already."""
-        lens = estimate.cameras[camera].lens
-        if not (forms := lens.roughness) or self.knows_lens(camera, lens):
+        lens, numbers = estimate.cameras[camera].lens, self.layout.free[camera]
+        if not (len(numbers) and (forms := lens.roughness)) or self.knows_lens(camera, lens):
             return
-        keys = {key.quantity: key for key in intrinsic_keys(camera, lens)}
-        every = list(keys.values())
-        free = {every[number] for number in self.layout.free[camera]}
+        every = intrinsic_keys(camera, lens)
+        keys, free = {key.quantity: key for key in every}, {every[number] for number in numbers.tolist()}
         sigmas = self.smoothness.get(camera, tuple(form.loose for form in forms))
         for form, sigma in zip(forms, sigmas, strict=True):
             own = tuple(keys[quantity] for quantity in form.names)
@@ -126,17 +125,15 @@ class Problem(Frozen):
 
     def knows_lens(self, camera: str, lens: Lens) -> bool:
         """Whether a posterior states a camera's lens in every direction: how smooth it is, is in there."""
-        if camera not in self._stated_whole:
-            return False
         rough = {name for form in lens.roughness for name in form.names}
-        return bool(rough) and rough <= self._stated_whole[camera]
+        return bool(rough) and rough <= self._stated_whole.get(camera, frozenset())
 
     @cached_property
     def _stated_whole(self) -> dict[str, frozenset[str]]:
         """Camera -> the coefficients of its lens, where a prior states these in every direction."""
         stated: dict[str, frozenset[str]] = {}
         for prior in self.priors:
-            for name in {key.owner for key in prior.keys if key.kind == "camera"}:
+            for name in {key.owner for key in prior.keys if key.kind == "camera" and not prior.is_usual}:
                 of_camera = [key for key in prior.keys if key[:2] == ("camera", name)]
                 own = [key for key in of_camera if key.quantity not in (*OF_PIXELS, "skew")]
                 if own and prior.information.given(own).known_rank == len(own):

@@ -21,7 +21,7 @@ from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.problem.parameters import Estimate, intrinsics_vector, unit_px
-from ceres_cal.problem.structure import Structure, Tolerance, bends_of, make_structure
+from ceres_cal.problem.structure import Structure, Tolerance, make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import LENSES
@@ -346,7 +346,7 @@ def _of_points(
     size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 6 + kernels.BUILT))
     points = point_columns(own, estimate.structure)
-    bends = np.concatenate([bends_of(target) for target in own.observations.targets.values()])
+    bends = np.concatenate([target.bends for target in own.observations.targets.values()])
     points = points._replace(bends=bends[own.point_index])
     kernels.point_rows(optics, poses, points, rows)
     return {

@@ -25,11 +25,10 @@ from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.scene.curves import Curve
 from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
+from ceres_cal.scene.targets.target import WARP as WARP
 
 Kind = Literal["lines", "points", "warp", "heights"]
 """What a tolerance speaks of."""
-WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
-"""What the warp of a board is made of: see `bends_of`."""
 
 
 class Tolerance(Frozen, eq=True):
@@ -286,7 +285,7 @@ def _slots(targets: Mapping[str, Target], place: Indices32) -> tuple[Indices32, 
         start = ends + 3 * count
     return (
         np.concatenate(point_slots),
-        np.concatenate([bends_of(target) for target in targets.values()]),
+        np.concatenate([target.bends for target in targets.values()]),
         np.array(track_slots, dtype=np.int32).reshape(-1, 3),
     )
 
@@ -310,20 +309,6 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
         }
         numbers |= {of: slots for of, slots in every.items() if len(slots)}
     return numbers
-
-
-def bends_of(target: Target) -> Array:
-    """(N, W + 1) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a
-    side, x (1 - x^2) and y (1 - y^2) with 1 as their largest, and 1 for a height; 0 where it does not bow.
-    """
-    if not target.bows or not target.points:
-        return np.zeros((len(target.points), len(WARP) + 1))
-    flat = target.point_array[:, :2]
-    half = 0.5 * np.ptp(flat, axis=0)
-    across = (flat - flat.min(axis=0) - half) / half
-    bows = 1.0 - across**2
-    waves = 1.5 * np.sqrt(3.0) * across * bows
-    return np.column_stack([bows, across[:, 0] * across[:, 1], waves, np.ones(len(flat))])
 
 
 _STEP = 1e-3  # of a dimension: features move in proportion

@@ -182,32 +182,23 @@ def _model(
     return make_linear_model(problem, estimate, equations, weights)
 
 
-def _over_view(equations: Equations) -> Array:
-    """(2, E) x and y from -1 to 1 over what is seen of each view."""
+def _modes(equations: Equations, *, smooth: bool = True) -> Array:
+    """(E, 18) px per px of each coefficient of a view: the principal point's x and y; a turn and a shift of the pose
+    that grow from row to row; polynomials along both axes of the image but for the constant, which is the pose's, where
+    `smooth` asks for them. x and y are from -1 to 1 over what is seen of the view.
+    """
     starts = equations.bounds[:-1]
     low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
     half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
-    return np.asarray(((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T)
-
-
-def _displacing(equations: Equations, y: Array) -> Array:
-    """(E, 8) px per px of the principal point's x and y, and of a turn and a shift of the pose that grow from row to
-    row.
-    """
+    x, y = ((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T
     read_out = equations.pose * y[:, None]
     read_out /= np.sqrt(np.maximum(np.mean(read_out**2, axis=0), 1e-300))
-    return np.hstack([equations.intrinsics[:, _CENTRE], read_out])
-
-
-def _modes(equations: Equations) -> Array:
-    """(E, 18) px per px of each coefficient of a view: what may displace it; and polynomials along both axes of the
-    image but for the constant, which is the pose's.
-    """
-    x, y = _over_view(equations)
-    third = 1.0 / 3.0  # the mean of x^2
-    smooth = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
-    along = [smooth * equations.direction[:, axis, None] for axis in range(2)]
-    return np.hstack([_displacing(equations, y), *along])
+    modes = [equations.intrinsics[:, _CENTRE], read_out]
+    if smooth:
+        third = 1.0 / 3.0  # the mean of x^2
+        each = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
+        modes += [each * equations.direction[:, axis, None] for axis in range(2)]
+    return np.hstack(modes)
 
 
 def _seem_displaced(model: Linearised) -> bool:
@@ -215,7 +206,7 @@ def _seem_displaced(model: Linearised) -> bool:
     points seem to move by themselves, by moments: their scores have the variance T + T^2 sigma^2. Beside what else
     displaces views they move by less.
     """
-    whole_told, scores = _of_views(model, _displacing(model.equations, _over_view(model.equations)[1]))
+    whole_told, scores = _of_views(model, _modes(model.equations, smooth=False))
     read_out = np.linalg.pinv(whole_told[:, 2:, 2:], _TOLD, hermitian=True)
     taken = np.sum(scores[:, 2:] * np.einsum("vij,vj->vi", read_out, scores[:, 2:]))
     told, score = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2)[:, :2], 1e-300), scores[:, :2]

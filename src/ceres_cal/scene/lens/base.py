@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import replace
+from ceres_cal.base.frozen import cached_property, replace
 from ceres_cal.base.words import no_such
 
 LinearEquations = tuple[dict[str, Array], Array]
@@ -206,7 +206,7 @@ class Lens(ABC):
         """(N,) whether the model has an answer at measured offsets (N, 2) px."""
         return np.asarray(np.hypot(offsets[:, 0], offsets[:, 1]) <= self.monotone_radius(phi))
 
-    @property
+    @cached_property
     def lengths(self) -> tuple[int, ...]:
         """The power of px that each coefficient's unit is; 0 of what acts on directions."""
         return tuple([1 - order for order in self.orders]) if self.acts_on_pixels else (0,) * len(self.names)

@@ -231,11 +231,11 @@ class Spline(Planar):
         object.__setattr__(self, "values", tuple(self.values) or (0.0,) * len(self.names))
         super().__post_init__()
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return (*_names(self.powers), *self.names_of_terms)
 
-    @property
+    @cached_property
     def orders(self) -> tuple[int, ...]:
         return tuple([int(name in EXTENTS) for name in self.names])
 

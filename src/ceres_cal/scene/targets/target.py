@@ -54,6 +54,8 @@ MOST_FEATURES = 100_000
 """Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
 
 
+WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
+"""What the warp of a board is made of: see `Target.bends`."""
 LARGEST_M = 1e7
 """Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
 
@@ -192,6 +194,20 @@ class Target(Frozen):
     def places(self) -> Array:
         """(P, 3) m: its points, and where its curves begin."""
         return np.concatenate([self.point_array, self.tracks[0, :, 0] + self.tracks[0, :, 1]])
+
+    @cached_property
+    def bends(self) -> Array:
+        """(P, W + 1) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a
+        side, x (1 - x^2) and y (1 - y^2) with 1 as their largest, and 1 for a height; 0 where it does not bow.
+        """
+        if not self.bows or not self.points:
+            return np.zeros((len(self.points), len(WARP) + 1))
+        flat = self.point_array[:, :2]
+        half = 0.5 * np.ptp(flat, axis=0)
+        across = (flat - flat.min(axis=0) - half) / half
+        bows = 1.0 - across**2
+        waves = 1.5 * np.sqrt(3.0) * across * bows
+        return np.column_stack([bows, across[:, 0] * across[:, 1], waves, np.ones(len(flat))])
 
     @property
     def reach_m(self) -> float:
