@@ -194,7 +194,7 @@ def _followed(problem: FieldSearch, auto: Auto, camera: Camera) -> Followed:
 def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
     pixels = camera.project(target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
-    hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
+    hints = PointHints(target, rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
     return unknown_optics(camera, hints, auto.lengths)
 
 
