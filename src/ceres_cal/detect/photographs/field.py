@@ -125,12 +125,16 @@ def detect_field(
     results: dict[str, SearchResult] = {}
     places: list[SearchResult] = []  # one for each that a camera stood at, where the last picture was taken first
     elsewhere = isinstance(start, Auto)  # whether it is looked for at another place, too: once in vain is enough
+
+    def looked_for(path: Path, grey: Array32, starts: Sequence[Camera | Clicks | Auto | SearchResult]) -> SearchResult:
+        return _looked_for(_without(grey, options.left_out, path), drawn, painted, starts, (path, options))
+
     for number, path in enumerate(paths, start=1):
-        grey, where = _without(read_light(path), options.left_out, path), (path, options)
-        result = _looked_for(grey, drawn, painted, places or [start], where)
+        grey = read_light(path)
+        result = looked_for(path, grey, places or [start])
         if result.followed is None and places and elsewhere:
             # reads: "its lines were not found ...", where others show them
-            other = attempt(partial(_looked_for, grey, drawn, painted, [start], where), InputError)
+            other = attempt(partial(looked_for, path, grey, [start]), InputError)
             elsewhere = isinstance(other, SearchResult) and other.followed is not None
             result = other if isinstance(other, SearchResult) and elsewhere else result
         results[str(path)] = result
@@ -139,11 +143,10 @@ def detect_field(
         if progress is not None:
             progress(number, len(paths), path.name)
     for path in takewhile(lambda path: results[str(path)].followed is None, paths if places else ()):
-        grey = _without(read_light(path), options.left_out, path)  # later ones told where it is
-        results[str(path)] = _looked_for(grey, drawn, painted, places, (path, options))
+        results[str(path)] = looked_for(path, read_light(path), places)  # later ones told where it is
     if not places and len(paths) > 1:
         # reads: "no field in any of ... images"
-        together = attempt(partial(_together, paths, drawn, painted, start, options), InputError)
+        together = attempt(partial(_together, paths, partial(looked_for, starts=[start])), InputError)
         results = results if isinstance(together, CalibrationError) else together
     results = _of_one_place(results)
     for name, result in results.items():
@@ -191,13 +194,7 @@ def _of_one_place(results: Mapping[str, SearchResult]) -> dict[str, SearchResult
     return kept
 
 
-def _together(
-    paths: Sequence[Path],
-    target: Target,
-    painted: tuple[str, ...],
-    start: Camera | Clicks | Auto,
-    options: FieldOptions,
-) -> dict[str, SearchResult]:
+def _together(paths: Sequence[Path], looked_for: Callable[[Path, Array32], SearchResult]) -> dict[str, SearchResult]:
     """The field in the one picture of all of them, each of which shows too little of it.
 
     Raises:
@@ -205,8 +202,7 @@ def _together(
     """
     one = merged((str(path), read_colour(path)) for path in paths[:: -(-len(paths) // MOST_PICTURES)])
     name = f"{one.used[0]} and {len(one.used) - 1} more, together"
-    grey = _without(one.picture, options.left_out, Path(name))
-    result = _looked_for(grey, target, painted, [start], (Path(name), options))
+    result = looked_for(Path(name), one.picture)
     if result.followed is None:
         raise InputError(result.reason)
     return {name: result, **{path: SearchResult(None, reason) for path, reason in one.left_out}}
