@@ -42,6 +42,7 @@ from ceres_cal.problem.bundle import Solution, solve
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import values_of
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import in_image
@@ -288,6 +289,22 @@ def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: 
     assert not few.others and not few.failed
 
 
+def test_a_lens_of_boards_near_its_best_is_where_a_solve_ends() -> None:
+    """Within a tenth of a standard deviation: so that no solve is needed."""
+    observations = _seen("brown", "boards")
+    among = choose_lens(observations, Options(), initialise(gather_sights(observations), papers(Options()))).among
+    assert among is not None
+    near = [one for one in among.tried if one.is_near and one.squares is not None and not one.fault]
+    assert len(near) == 3
+    for one in near:
+        normals, names = one.of.normals, set(one.of.forms[0].names) - set(one.form.names)
+        assert normals is not None
+        at = np.array([i for i, key in enumerate(normals.keys) if key.quantity not in names])
+        keys = [normals.keys[i] for i in at]
+        off = values_of(among.seen.solved_near(one), keys) - values_of(one.estimate, keys)
+        assert off @ (normals.normal.sum(axis=0) + normals.known)[np.ix_(at, at)] @ off < 0.1**2
+
+
 def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:
     same = np.full(12, 10.0)
     assert decide(["brown k1 k2", "kannala-brandt k1"], [2, 1], [same, same])[1] == 1
@@ -437,10 +454,11 @@ def test_what_a_lens_does_not_solve_for_is_no_statement() -> None:
 
 
 def test_that_no_other_lens_could_be_compared_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
+    def fails(*_: object, **__: object) -> None:
         raise SolutionError("nothing came out")
 
     monkeypatch.setattr("ceres_cal.calibration.lens_seen.InlierRows.solved_near", fails)
+    monkeypatch.setattr("ceres_cal.calibration.lens_seen._NEAR", -1.0)
     calibration = calibrate(_seen("radial-2-3", "boards"))
     without = "so the standard deviations do not include what they would say: nothing came out"
     assert f"other lenses could not be compared, {without}" in calibration.warnings

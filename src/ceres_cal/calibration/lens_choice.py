@@ -134,13 +134,17 @@ class Comparison(Frozen):
         ]
         if self.chosen.form.blank.roughness or not each:
             return found
-        near = attempt(lambda: self.seen.solved_near(self.chosen))  # reads: "other lenses could not be compared, ..."
+
+        def solved(one: Candidate, *, as_promised: bool = False) -> Estimate:
+            return one.estimate if one.is_near else self.seen.solved_near(one, as_promised=as_promised)
+
+        near = attempt(partial(solved, self.chosen))  # reads: "other lenses could not be compared, ..."
         if isinstance(near, CalibrationError):
             return replace(found, failed=str(near))
         found = replace(found, near=near)
         for one, likely in each:
             # quiet: what cannot be solved for, or ends in another minimum, says nothing
-            near = attempt(partial(self.seen.solved_near, one, as_promised=True))
+            near = attempt(partial(solved, one, as_promised=True))
             if not isinstance(near, CalibrationError):
                 found = replace(found, others=(*found.others, near), weights=(*found.weights, likely))
         # What they say by chance is less by as much as there are more observations than took part.

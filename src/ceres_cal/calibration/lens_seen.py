@@ -159,6 +159,16 @@ class Candidate(Frozen):
             cameras[name] = replace(camera, lens=lens)
         return replace(there, cameras=cameras)
 
+    @property
+    def is_near(self) -> bool:
+        """Whether normal equations have it at its best, but for placements: of boards, where its kind was nearly so.
+        Over a floor they lead along a valley, and ten standard deviations off it.
+        """
+        kind = self.of.normals
+        if kind is None or any(key.kind != "camera" for key in kind.keys):
+            return False
+        return float(kind.squares.sum()) + self.least - 2.0 * self.of.least <= _NEAR
+
     @cached_property
     def fault(self) -> str:
         """Why it cannot be used, "" where it can."""
@@ -175,6 +185,9 @@ class Candidate(Frozen):
 MOST_ROUNDS = 8  # of a robust solve
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
+# Variances by which a kind was off its best, and by which one of its lenses is off that. So far a solve moved lenses
+# of 24 simulated sets of boards by less than a tenth of a standard deviation, at three times as many by a third.
+_NEAR = 4.0
 _KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
 
 

@@ -302,10 +302,10 @@ def sights_of(observations: Observations) -> Sights:
     """The sights of all observations; a sight without any is left out."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
-    views_of: list[list[int]] = [[] for _ in order]
-    for number, sight in enumerate(sight_of_view):
+    sights, views_of = [order[key] for key in keys], [list[int]() for _ in order]
+    for number, sight in enumerate(sights):
         views_of[sight].append(number)
+    sight_of_view = np.array(sights, dtype=np.int64)
 
     names = {name: number for number, name in enumerate(observations.targets)}
     targets = list(observations.targets.values())

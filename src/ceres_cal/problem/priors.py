@@ -11,9 +11,9 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, cached_property, field, replace
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
@@ -113,10 +113,6 @@ class GaussianPrior(Frozen):
                     off[self.information.columns([key])] += angle
         return self.bent(off)[0]
 
-    @cached_property
-    def _of_logs(self) -> Indices:
-        return self.information.columns(self.information.among(self.logs))
-
     def bent(self, off: Array) -> tuple[Array, Array]:
         """(K,) offsets of numbers that are `off` the mean, and their derivatives by these; of numbers whose logarithms
         are normal, far below 0 where they are 0 or less.
@@ -124,7 +120,7 @@ class GaussianPrior(Frozen):
         least_ratio = 1e-6  # of a number to its mean: a step of the solver may pass 0
         slope = np.ones(len(off))
         if self.logs:
-            at = self._of_logs
+            at = self.information.columns(self.information.among(self.logs))
             ratio = np.maximum(1.0 + off[at] / self.mean[at], least_ratio)
             off = off.copy()
             off[at], slope[at] = self.mean[at] * np.log(ratio), 1.0 / ratio

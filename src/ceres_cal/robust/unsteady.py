@@ -35,7 +35,7 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import free_keys
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, write_equations
-from ceres_cal.robust.as_built import smooth_image, some_sights
+from ceres_cal.robust.as_built import smooth_image
 from ceres_cal.robust.robust import RobustSolution
 
 MOVES, ROLLING = "principal point moves", "rolling shutter"
@@ -118,11 +118,10 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
     Args:
         problem: of all the observations, what was found `before` taken off. end: of its rounds.
     """
-    count, estimate = problem.observations.rows, end.estimate
-    off = np.zeros((count, 2)) if before is None else before.displacement
+    estimate = end.estimate
 
     def model_of(some: Problem, there: Estimate = estimate, *, of_poses: bool = False) -> Linearised:
-        return _model(there, end.residuals, end.weights_of, off, some, of_poses=of_poses)
+        return _model(there, end.residuals, end.weights_of, before, some, of_poses=of_poses)
 
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
@@ -130,8 +129,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
         boards = [number for number in sights.tolist() if problem.sights.keys[number].placement is not None]
         if len(boards) < _FEWEST:
             continue
-        few = set(some_sights(problem.sights.take(np.array(boards)), _ENOUGH).keys)
-        some = problem.of_sights(np.flatnonzero([key in few for key in problem.sights.keys]))
+        some = problem.of_sights(np.array(boards[:: -(-len(boards) // _ENOUGH)]))
         if before is not None or _seem_displaced(model_of(*some.built_as(estimate), of_poses=True)):
             model = model_of(some)
             if before is None and any(lens_changes(Case(some, estimate, model))):
@@ -139,7 +137,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own:
                 sizes[camera], noise = own, max(left, noise)
-    return _predicted(model_of(problem), problem, estimate, sizes, noise, count) if sizes else None
+    return _predicted(model_of(problem), problem, estimate, sizes, noise) if sizes else None
 
 
 def without_unsteadiness(
@@ -149,22 +147,22 @@ def without_unsteadiness(
     sizes = {one.subject: {a.name: a.value for a in one.amounts} for one in effects if one.kind in _KINDS}
     if not sizes:
         return problem
-    there, off = residuals(problem.sights, estimate), np.zeros((problem.observations.rows, 2))
+    there = residuals(problem.sights, estimate)
     weights_of = partial(equation_weights, problem.weighting, there=there, taking_part=taking_part)
-    model = _model(estimate, there, weights_of, off, problem)
-    return _predicted(model, problem, estimate, sizes, 1.0, len(off)).taken_off(problem)
+    model = _model(estimate, there, weights_of, None, problem)
+    return _predicted(model, problem, estimate, sizes, 1.0).taken_off(problem)
 
 
 def _model(
     estimate: Estimate,
     there: Residuals,
     weights_of: Callable[[Equations], Weights],
-    off: Array,
+    before: Unsteady | None,
     problem: Problem,
     *,
     of_poses: bool = False,
 ) -> Linearised:
-    """Of a problem's sights, with the residuals before anything was taken off; views that were taken out as a whole
+    """Of a problem's sights, with the residuals `before` anything was taken off; views that were taken out as a whole
     speak again, for they may be those that are displaced most. What takes part counts whole: a robust weight is that of
     an observation whose view is displaced.
 
@@ -172,7 +170,8 @@ def _model(
         of_poses: whether nothing else is free, which takes half the time.
     """
     equations = write_equations(problem.sights, estimate, there)
-    equations = replace(equations, residual=equations.residual - equations.along(off))
+    if before is not None:
+        equations = replace(equations, residual=equations.residual - equations.along(before.displacement))
     weights = weights_of(equations)
     silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0
     used = weights.used | silent[equations.sight]
@@ -262,10 +261,10 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
 
 
 def _predicted(
-    own: Linearised, problem: Problem, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float, count: int
+    own: Linearised, problem: Problem, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float
 ) -> Unsteady:
     """The best linear unbiased predictions at these sizes and a mean square of the noise, everything that is free at
-    its best beside them; of so many observations.
+    its best beside them.
 
     Of each view, T is what its equations say of its coefficients beyond its pose, z how, and G what shared directions
     have in common with them, all over the noise. C = (T + 1 / sigma^2)^-1 is what they leave open. Of the shared
@@ -291,7 +290,7 @@ def _predicted(
     moved = model.beyond_private((moved * model.weight)[:, None])[:, 0] / model.weight  # what poses do not follow
     return Unsteady(
         sizes,
-        equations.displacement(moved, count),
+        equations.displacement(moved, problem.observations.rows),
         float(np.einsum("sij,sji->", told, left_open)),
         free_keys(estimate, problem.layout, problem.private),
         _shifts(own, common, through, covariance) * np.sqrt(noise),
