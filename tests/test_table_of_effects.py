@@ -7,18 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy import diagnostic_scenes as scenes
+from accuracy.league import SetUp, scene_of
 from scenes import RADIAL
 
 from ceres_cal import write_report
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects import table
 from ceres_cal.effects.table import EFFECTS, rows
-from ceres_cal.observations import Observations
+from ceres_cal.observations import COMA, Observations, Prior
+from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.quantities import difference
-from ceres_cal.simulate import simulate
+from ceres_cal.simulate import Disturbance, simulate
 
 SWAY_PX, PERIOD_PX = 1.5, 1500.0  # long: the camera takes up a part of it
 
@@ -124,3 +127,47 @@ def test_sound_data_are_left_alone(added: None) -> None:
     for seed in (2, 3):
         sound = simulate(scenes.overhead(boards=8), scenes.NOISE, seed).observations
         assert not any(one.amounts for one in calibrate(sound, RADIAL).effects)
+
+
+# ---- an effect that is stated with the observations ------------------------------------------------------------------
+
+
+def over_stated(coma_px: float, *stated: Prior) -> float:
+    """Error over the stated one, root mean squares on the floor, of lines that coma drew outwards by so much."""
+    scene = scene_of(SetUp(1, 20.0, AUTO, False, False), np.random.default_rng(4))
+    (name,) = scene.stations
+    camera = scene.camera_at(name)
+    observations = simulate(scene, Disturbance(0.05, 0.05), 3).observations
+
+    def drawn(pixels: Array) -> Array:
+        half = 0.5 * (np.array(camera.image_size) - 1.0)
+        away = (pixels - half) / np.hypot(*half)
+        return np.asarray(pixels + coma_px * away * np.linalg.norm(away, axis=1)[:, None])
+
+    points, curves = observations.points, observations.curves
+    points = replace(points, pixels=drawn(points.pixels))
+    curves = replace(curves, pixels=drawn(curves.pixels))
+    calibration = calibrate(replace(observations, points=points, curves=curves, priors=stated), Options(lens="brown"))
+    x, y = np.meshgrid(np.linspace(-3.0, 3.0, 9), np.linspace(-2.0, 2.0, 7))
+    places = np.column_stack([x.ravel(), y.ravel()])
+    known = calibration.uncertainty.located(camera.project(np.column_stack([places, np.zeros(len(places))])), 0.0, name)
+    off = np.sum((known.located - places) ** 2, axis=1)
+    return float(np.sqrt(np.mean(off) / np.mean(known.sd_m**2)))
+
+
+@pytest.mark.parametrize("coma_px", [3.0, -3.0])
+def test_coma_that_is_stated_is_in_the_standard_deviations(coma_px: float) -> None:
+    """A lens takes up what it draws outwards, so no residual tells."""
+    assert over_stated(coma_px) > 2.0  # 4.2 and 2.9
+    assert 0.5 < over_stated(coma_px, Prior("camera", "c0", COMA, (0.0,), (3.0,))) < 1.6  # 1.35 and 0.92
+
+
+def test_coma_is_stated_with_the_observations_that_it_is_in() -> None:
+    with pytest.raises(InputError, match="an offset is about 0"):
+        Prior("camera", "c0", COMA, (0.1,), (3.0,))
+    observations = scenes.longer_polynomial(1)
+    with pytest.raises(InputError, match="camera 'nobody'"):
+        calibrate(replace(observations, priors=(Prior("camera", "nobody", COMA, (0.0,), (3.0,)),)))
+    (name,) = observations.cameras
+    with pytest.raises(InputError, match="it has no 'coma'"):
+        calibrate(observations, Options(priors=(Prior("camera", name, COMA, (0.0,), (3.0,)),)))

@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
 from ceres_cal.base.frozen import Rows
-from ceres_cal.detect.blur import blur_of, no_blur, with_coma
+from ceres_cal.detect.blur import blur_of, from_middle, no_blur, with_coma
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
 from ceres_cal.detect.sampling import drawn_aside
@@ -61,7 +61,8 @@ class Lines(Rows):
         sigma_px: (N,) standard deviation of it. contrast: (N,) grey levels.
         blur_px: standard deviation of the picture's blur, lens, pixel and motion together.
         stretch: the paint's width over what the target says, as far as the blur lets it be seen.
-        is_even: whether no coma was seen.
+        coma_px: standard deviation of how far coma may still draw all of them outwards, growing with the square of the
+            radius, at half a diagonal from the picture's middle; 0 where none was seen.
     """
 
     course: Course
@@ -71,7 +72,12 @@ class Lines(Rows):
     contrast: Array
     blur_px: float
     stretch: float
-    is_even: bool = True
+    coma_px: float = 0.0
+
+    @property
+    def is_even(self) -> bool:
+        """Whether no coma was seen."""
+        return self.coma_px == 0.0
 
     @property
     def pixels(self) -> Array:
@@ -182,12 +188,13 @@ def measure(
         if _AS_FAR * np.max(blur.blur_px) <= beyond:
             break
         beyond = _AS_FAR * float(np.max(blur.blur_px))
-    fits, drawn = blur.fitted(windows, course), np.zeros(len(course))
-    coma = None if is_even else with_coma(windows, course, blur, fits, (grey.shape[0], grey.shape[1]))
+    fits, coma_px = blur.fitted(windows, course), 0.0
+    size = (grey.shape[0], grey.shape[1])
+    coma = None if is_even else with_coma(windows, course, blur, fits, size)
     if coma is not None:
         leaning, remains = coma[0].fitted(windows, course), coma[1]
-        alike = np.sqrt(np.bincount(course.curve)[course.curve])  # all places of a line err alike
-        drawn = remains * alike * np.nan_to_num(leaning.offset_px - fits.offset_px)
+        out, by = np.prod(from_middle(course, size), axis=0), np.nan_to_num(leaning.offset_px - fits.offset_px)
+        coma_px = remains * float(abs(out @ by) / (out @ out))
         blur, fits = (coma[0], leaning) if remains < 1.0 else (blur, fits)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     # What is blurred along a line as well is drawn to the inside of its bend.
@@ -196,10 +203,10 @@ def measure(
     found = _goes_on(course, found, offset, fits.sigma_px)
     aside, open_px = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
     offset = offset - aside
-    sigma = np.hypot(np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), drawn), open_px)
+    sigma = np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), open_px)
     found = _goes_on(course, found, offset, sigma)
     offset = np.where(found, offset, np.nan)
-    return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma is None)
+    return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma_px)
 
 
 def _window_px(course: Course, beyond_px: float) -> Array:

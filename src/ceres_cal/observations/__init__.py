@@ -4,6 +4,7 @@ A view is what one frame shows of one target; a sight is what one camera at one 
 all its views, and so what one pose projects (see `observations.sights`).
 """
 
+from ceres_cal.observations.columns import COMA as COMA
 from ceres_cal.observations.columns import NO_CURVES as NO_CURVES
 from ceres_cal.observations.columns import NO_POINTS as NO_POINTS
 from ceres_cal.observations.columns import Columns as Columns

@@ -29,7 +29,7 @@ class View(Frozen, eq=True):
     placement: str | None = None
 
 
-_OFFSET = ".offset_m"
+_OFFSET, COMA = ".offset_m", "coma"
 PRIOR_OWNERS = ("camera", "station", "target")
 
 
@@ -39,7 +39,8 @@ class Prior(Frozen, eq=True):
     Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
     coefficients by name in the units of the files. Of a target: its dimensions (m), which are solved for then; a sigma
     that is infinite says that the value is only where to start from. And CURVE.offset_m, of a curve that lies
-    beside its drawing: about 0, it is solved for, too.
+    beside its drawing: about 0, it is solved for, too. Of a camera also COMA, about 0: how far its lens's coma may draw
+    everything outwards, by the square of the radius, px at half a diagonal of the image.
 
     Raises:
         InputError: on construction: an unknown owner, numbers that are not finite, a sigma that is not above 0.
@@ -63,8 +64,8 @@ class Prior(Frozen, eq=True):
         finite = np.all(np.isfinite(self.value)) and (self.is_open or np.all(np.isfinite(self.sigma)))
         if not finite or not min(self.sigma) > 0.0:
             raise InputError(f"{here}: finite numbers and a sigma above 0")
-        if self.curve and (self.value != (0.0,) or self.is_open):
-            raise InputError(f"{here}: an offset is about 0 m, and its sigma finite")
+        if (self.curve or self.is_coma) and (self.value != (0.0,) or self.is_open):
+            raise InputError(f"{here}: an offset is about 0, and its sigma finite")
         if self.dimension and not self.value[0] > 0.0:
             raise InputError(f"{here}: a length is above 0 m, not {self.value[0]:g}")
 
@@ -72,6 +73,11 @@ class Prior(Frozen, eq=True):
     def is_open(self) -> bool:
         """Whether a target's dimension is not known at all."""
         return self.owner == "target" and self.sigma == (np.inf,)
+
+    @property
+    def is_coma(self) -> bool:
+        """Whether it is about what coma does to a camera's picture."""
+        return self.owner == "camera" and self.quantity == COMA
 
     @property
     def dimension(self) -> str:

@@ -175,7 +175,8 @@ def gather_priors(
     stated = []
     for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
         observations.require_owner(prior)
-        if not (prior.is_open or prior.curve):  # which are among the tolerances
+        is_effect = prior.is_coma and prior in observations.priors
+        if not (prior.is_open or prior.curve or is_effect):  # the first two are among the tolerances
             stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))

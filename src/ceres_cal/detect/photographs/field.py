@@ -35,7 +35,7 @@ from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.detect.strokes import Strokes, strokes_of_signs
-from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
+from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
 from ceres_cal.scene.camera import Camera
@@ -382,6 +382,8 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
         is_long = drawn_m > 0.5 * extent_m and bool(features_of(target, name) & set(built.names))
         if off_m := off_m or (np.inf if built.scatter_m and is_long else 0.0):
             priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (min(off_m, 0.5 * built.usual_m),)))
+    if lines.coma_px:
+        priors.append(Prior("camera", options.camera, COMA, (0.0,), (lines.coma_px,)))
     if camera.aspect != 1.0:  # else it is solved for as one with square pixels
         priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(

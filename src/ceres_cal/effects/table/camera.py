@@ -10,9 +10,11 @@ from functools import partial
 import numpy as np
 
 from ceres_cal.base.arrays import Array, numbers_of
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
-from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect
+from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
+from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.quantities import pixel_slopes
 
@@ -166,7 +168,39 @@ def _of_shift(evidence: Evidence) -> Words:
     )
 
 
+def _coma_px(case: Case, camera: str) -> float:
+    """Standard deviation that was stated of it; 0 of none."""
+    stated = case.problem.observations.priors
+    return max((prior.sigma[0] for prior in stated if prior.is_coma and prior.name == camera), default=0.0)
+
+
+def _drawn_out(case: Case, camera: str, pixels: Array) -> Array | None:
+    """What coma may draw outwards, where a picture's lines are lopsided: each moves along its normal alone, so together
+    they look like another lens, and no residual tells.
+    """
+    if not _coma_px(case, camera):
+        return None
+    away = half_diagonals(case.estimate.cameras[camera], pixels)
+    return np.asarray((away * np.linalg.norm(away, axis=1)[:, None])[:, :, None])
+
+
+def _of_coma(evidence: Evidence) -> Words:
+    px, sd = evidence.score.amount, evidence.score.sd
+    return Words(
+        f"camera {evidence.score.subject!r}: its lens has coma, which draws everything outwards by {px[0]:+.2f} ± "
+        f"{sd[0]:.2f} px at the corners of the image ({evidence.size})",
+        "stop the lens down, or take another one",
+        amounts(["coma"], px, sd, "px"),
+    )
+
+
 EFFECTS = (
+    replace(
+        camera_effect("coma", _drawn_out, _of_coma),
+        prior=SizePrior(0.0, (1.0,)),
+        reach=lambda columns, number, case: _coma_px(case, columns.subjects[number]),
+        concerns=lambda observations: any(prior.is_coma for prior in observations.priors),
+    ),
     Effect("moved after", partial(_moves, onwards=True), _of_move),
     Effect("moved in", partial(_moves, onwards=False), _of_move),
     camera_effect("skew", _leaning, _of_skew),
