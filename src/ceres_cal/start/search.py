@@ -21,40 +21,14 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.transforms import rotation_exp, skews
 from ceres_cal.observations import joined
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
-from ceres_cal.start.sightlines import Candidates, Sightlines
+from ceres_cal.start.sightlines import LEAST_PX, Beforehand, Candidates, Sightlines
 
 _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
 _TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
 _AZIMUTHS, _ROLLS = (1, 6, 11, 15, 18, 18), 18
 _FIRST_STEPS, _STEPS, _LAST_STEPS = 6, 12, 20
-_LEAST_PX = 1e-3  # of a scale: below it all data are exact
 _ROUGH_PX = 2.0  # scale of a search's first rounds
 _DAMPING, _LEAST_DAMPING, _GIVEN_UP = 1e-2, 1e-9, 1e2
-
-
-class Beforehand(Frozen):
-    """What is known of a camera beforehand: means and standard deviations, infinite where nothing is, 0 where a number
-    is held; and the least scale that residuals can have.
-    """
-
-    position: Array
-    position_sd: Array
-    log_phi: tuple[float, float]
-    bend_sd: float
-    least_px: float = _LEAST_PX
-
-    @property
-    def held(self) -> Mask:
-        """(8,) numbers that do not move."""
-        sd = np.array([np.inf, np.inf, np.inf, *self.position_sd, self.log_phi[1], self.bend_sd])
-        return np.asarray(sd == 0.0)
-
-    def residuals(self, poses: Candidates) -> tuple[Array, Array]:
-        """(K, 5) in standard deviations, and the diagonal (5,) of their derivatives."""
-        sd = np.array([*self.position_sd, self.log_phi[1], self.bend_sd])
-        share = np.where(sd > 0.0, 1.0 / np.maximum(sd, 1e-12), 0.0)
-        off = np.column_stack([poses.positions - self.position, poses.log_phi - self.log_phi[0], poses.bend])
-        return np.where(share > 0.0, off, 0.0) * share, share
 
 
 class BestCameras(Frozen):
@@ -69,32 +43,32 @@ class BestCameras(Frozen):
     scale_px: float
 
 
-def information(lines: Sightlines, known: Beforehand, pose: Candidates, scale_px: float) -> Array:
+def information(lines: Sightlines, pose: Candidates, scale_px: float) -> Array:
     """(8, 8) what is known of one camera's numbers by rows that fit it, and beforehand; 0 of those that are held."""
     r, derivatives = lines.equations(pose)
     weights = 1.0 / (scale_px**2 * (1.0 + (r[0] / (2.0 * scale_px)) ** 2) ** 2)
     matrix = (derivatives[0] * weights[:, None]).T @ derivatives[0]
-    matrix[range(3, 8), range(3, 8)] += known.residuals(pose)[1] ** 2
-    free = ~known.held
+    matrix[range(3, 8), range(3, 8)] += lines.known.residuals(pose)[1] ** 2
+    free = ~lines.known.held
     return np.asarray(matrix * free[:, None] * free)
 
 
-def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int, most_px: float = np.inf) -> Candidates:
+def refined(lines: Sightlines, poses: Candidates, steps: int, most_px: float = np.inf) -> Candidates:
     """Each brought towards its minimum, at the scale of its own residuals, at most so many px."""
     nothing = 1e-3  # variances: who gains less is there
     if not len(poses):
         return poses
     damping = np.full(len(poses), _DAMPING)
-    free = np.flatnonzero(~known.held)
+    free = np.flatnonzero(~lines.known.held)
     at = lines.equations(poses)
     for _ in range(steps):
-        scale = np.clip(scales(at[0], lines.weight, len(free)), known.least_px, most_px)
-        step = _step(lines, at, known, poses, scale, damping)
+        scale = np.clip(scales(at[0], lines.weight, len(free)), lines.known.least_px, most_px)
+        step = _step(lines, at, poses, scale, damping)
         moved = poses.moved(step)
         there = lines.equations(moved)
-        gained = _cost(lines, at[0], known, poses, scale) - _cost(lines, there[0], known, moved, scale)
+        gained = _cost(lines, at[0], poses, scale) - _cost(lines, there[0], moved, scale)
         better = gained > 0.0
-        better &= _possible(lines, known, moved)
+        better &= _possible(lines, moved)
         poses = moved.where(better, poses)
         at = np.where(better[:, None], there[0], at[0]), np.where(better[:, None, None], there[1], at[1])
         damping = np.clip(damping * np.where(better, 0.2, 6.0), _LEAST_DAMPING, 1e6)
@@ -103,19 +77,17 @@ def refined(lines: Sightlines, known: Beforehand, poses: Candidates, steps: int,
     return poses
 
 
-def _step(
-    lines: Sightlines, at: tuple[Array, Array], known: Beforehand, poses: Candidates, scale: Array, damping: Array
-) -> Array:
+def _step(lines: Sightlines, at: tuple[Array, Array], poses: Candidates, scale: Array, damping: Array) -> Array:
     """(K, 8) a damped Gauss-Newton step of each, reweighted against what does not fit."""
     most_step = 0.3  # rad, and of log phi
     r, derivatives = at
-    free = np.flatnonzero(~known.held)
+    free = np.flatnonzero(~lines.known.held)
     weights = lines.weight / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
     jacobian = derivatives[:, :, free]
     weighted = jacobian * weights[..., None]
     normal = np.swapaxes(weighted, 1, 2) @ jacobian
     right = (np.swapaxes(weighted, 1, 2) @ r[..., None])[..., 0]
-    said, share = known.residuals(poses)
+    said, share = lines.known.residuals(poses)
     diagonal, sums = np.zeros(8), np.zeros((len(poses), 8))
     diagonal[3:], sums[:, 3:] = share**2, said * share
     each = range(len(free))
@@ -143,25 +115,25 @@ def scales(r: Array, share: Array, free: int) -> Array:
     sums = np.cumsum(np.take_along_axis(np.broadcast_to(share, r.shape), order, 1), axis=1)
     total = sums[:, -1:]
     middle = np.argmax(sums >= np.minimum(0.5 * (total + free), total) - rounding, axis=1)[:, None]
-    return np.maximum(np.abs(np.take_along_axis(r, np.take_along_axis(order, middle, 1), 1)), _LEAST_PX)
+    return np.maximum(np.abs(np.take_along_axis(r, np.take_along_axis(order, middle, 1), 1)), LEAST_PX)
 
 
-def _cost(lines: Sightlines, r: Array, known: Beforehand, poses: Candidates, scale: Array | float) -> Array:
-    said, _ = known.residuals(poses)
+def _cost(lines: Sightlines, r: Array, poses: Candidates, scale: Array | float) -> Array:
+    said, _ = lines.known.residuals(poses)
     robust = 4.0 * np.log1p((r / (2.0 * scale)) ** 2)
     return np.asarray(robust @ lines.weight + np.sum(said**2, axis=1))
 
 
-def _possible(lines: Sightlines, known: Beforehand, poses: Candidates) -> Mask:
+def _possible(lines: Sightlines, poses: Candidates) -> Mask:
     """(K,) whether a camera stands over what it sees, with a phi that lenses have."""
     widest = 2.7  # of log phi from the middle: from a fisheye to a telescope
     lowest = 0.01  # of the extent of what is seen: a camera that lies on a line sees it everywhere
     floor, reach = float(lines.places[:, 2].min()), float(np.ptp(lines.places, axis=0).max())
-    is_lens = np.abs(poses.log_phi - known.log_phi[0]) < widest
+    is_lens = np.abs(poses.log_phi - lines.known.log_phi[0]) < widest
     return np.asarray(is_lens & (poses.positions[:, 2] > floor + lowest * reach))
 
 
-def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> tuple[Array, Array]:
+def judged(lines: Sightlines, poses: Candidates, least_px: float) -> tuple[Array, Array]:
     """Costs (K,), minus twice the logarithm of the likelihood of Cauchy errors, each camera's at the scale (K, 1) px of
     its own residuals, at least so many px; with what is seen where it cannot be.
 
@@ -171,13 +143,13 @@ def judged(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: fl
     behind = 20.0  # what a row costs that is seen behind the camera or beyond its line, as if so many scales off
     far_px = 1e6
     r = np.nan_to_num(lines.distances(poses), nan=far_px, posinf=far_px, neginf=-far_px)
-    free = int(np.count_nonzero(~known.held))
+    free = int(np.count_nonzero(~lines.known.held))
     scale = np.maximum(scales(r, lines.weight, free), least_px)
     r = np.where(lines.seen(poses), r, np.maximum(np.abs(r), behind * scale))
     wrong = _by_labels(lines, r, np.maximum(scales(r, lines.weight, free), least_px))[1]
     scale = np.maximum(scales(r, np.where(wrong, 0.0, 1.0), free), least_px)
-    cost = _by_labels(lines, r, scale)[0] + np.sum(known.residuals(poses)[0] ** 2, axis=1)
-    return np.where(_possible(lines, known, poses), cost, np.inf), scale
+    cost = _by_labels(lines, r, scale)[0] + np.sum(lines.known.residuals(poses)[0] ** 2, axis=1)
+    return np.where(_possible(lines, poses), cost, np.inf), scale
 
 
 def _by_labels(lines: Sightlines, r: Array, scale: Array) -> tuple[Array, Mask]:
@@ -193,12 +165,12 @@ def _by_labels(lines: Sightlines, r: Array, scale: Array) -> tuple[Array, Mask]:
     return np.sum(rows[:, : first[0]], axis=1) + np.sum(np.minimum(right, otherwise), axis=1), wrong
 
 
-def costs(lines: Sightlines, known: Beforehand, poses: Candidates, least_px: float) -> Array:
+def costs(lines: Sightlines, poses: Candidates, least_px: float) -> Array:
     """(K,) of `judged`."""
-    return judged(lines, known, poses, least_px)[0]
+    return judged(lines, poses, least_px)[0]
 
 
-def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Candidates | None = None) -> BestCameras:
+def searched(lines: Sightlines, few: Sightlines, proposed: Candidates | None = None) -> BestCameras:
     """The best cameras of those proposed and of a grid.
 
     Args:
@@ -206,21 +178,21 @@ def searched(lines: Sightlines, few: Sightlines, known: Beforehand, proposed: Ca
     """
     near = 0.02  # rad, and of the height: as near, cameras are on the way to one minimum
     first, then = 64, 20  # cameras that take the first steps, then the rest
-    proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, known.least_px)
-    some = _drawn(few, known)
-    some = some.take(np.argsort(costs(few, known, some, 8.0 * rough_px))[:first])
-    sets = minimal_sets(few, _logs(known, np.geomspace(_PHI_GRID[0], _PHI_GRID[-1], 60)))
-    sets = sets.take(np.argsort(costs(few, known, sets, rough_px))[:then]) if len(sets) else sets
-    some = refined(few, known, joined([proposed, some]), _FIRST_STEPS)
-    some = joined([refined(few, known, sets, _FIRST_STEPS, rough_px), some])
-    some = some.take(apart(some, costs(few, known, some, rough_px), near)[:then])
-    return best_of(lines, known, joined([proposed, refined(lines, known, some, _STEPS)]))
+    proposed, rough_px = proposed or Candidates.none(), max(_ROUGH_PX, lines.known.least_px)
+    some = _drawn(few)
+    some = some.take(np.argsort(costs(few, some, 8.0 * rough_px))[:first])
+    sets = minimal_sets(few, _logs(few.known, np.geomspace(_PHI_GRID[0], _PHI_GRID[-1], 60)))
+    sets = sets.take(np.argsort(costs(few, sets, rough_px))[:then]) if len(sets) else sets
+    some = refined(few, joined([proposed, some]), _FIRST_STEPS)
+    some = joined([refined(few, sets, _FIRST_STEPS, rough_px), some])
+    some = some.take(apart(some, costs(few, some, rough_px), near)[:then])
+    return best_of(lines, joined([proposed, refined(lines, some, _STEPS)]))
 
 
-def best_of(lines: Sightlines, known: Beforehand, some: Candidates) -> BestCameras:
+def best_of(lines: Sightlines, some: Candidates) -> BestCameras:
     """The best of them, brought to their minima."""
-    some = refined(lines, known, some, _LAST_STEPS)
-    cost, scale = judged(lines, known, some, known.least_px)
+    some = refined(lines, some, _LAST_STEPS)
+    cost, scale = judged(lines, some, lines.known.least_px)
     order = np.argsort(cost)
     return BestCameras(some.take(order), cost[order], float(scale[order[0], 0]))
 
@@ -247,9 +219,9 @@ def _logs(known: Beforehand, grid: Array) -> Array:
     return middle + np.log(grid) - np.log(1.1) if sd > 0.2 else np.array([middle])
 
 
-def _drawn(few: Sightlines, known: Beforehand) -> Candidates:
+def _drawn(few: Sightlines) -> Candidates:
     """A grid of rotations and phi, each with its position."""
-    logs = _logs(known, np.array(_PHI_GRID))
+    logs = _logs(few.known, np.array(_PHI_GRID))
     rotations = np.tile(_grid(), (len(logs), 1, 1))
     log_phi = np.repeat(logs, len(_grid()))
     positions, floor = few.positions(rotations, log_phi), float(few.places[:, 2].min())

@@ -14,6 +14,7 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
 from ceres_cal.base.frozen import Frozen, Rows, cached_property
 from ceres_cal.base.transforms import skews
 
+LEAST_PX = 1e-3  # of a scale: below it all data are exact
 _LEAST = 1e-12  # of a length, which is divided by
 _RIDGE = 1e-6  # of squares of order one
 
@@ -50,16 +51,43 @@ class Candidates(Rows):
         )
 
 
+class Beforehand(Frozen):
+    """What is known of a camera beforehand: means and standard deviations, infinite where nothing is, 0 where a number
+    is held; and the least scale that residuals can have.
+    """
+
+    position: Array
+    position_sd: Array
+    log_phi: tuple[float, float]
+    bend_sd: float
+    least_px: float = LEAST_PX
+
+    @property
+    def held(self) -> Mask:
+        """(8,) numbers that do not move."""
+        sd = np.array([np.inf, np.inf, np.inf, *self.position_sd, self.log_phi[1], self.bend_sd])
+        return np.asarray(sd == 0.0)
+
+    def residuals(self, poses: Candidates) -> tuple[Array, Array]:
+        """(K, 5) in standard deviations, and the diagonal (5,) of their derivatives."""
+        sd = np.array([*self.position_sd, self.log_phi[1], self.bend_sd])
+        share = np.where(sd > 0.0, 1.0 / np.maximum(sd, 1e-12), 0.0)
+        off = np.column_stack([poses.positions - self.position, poses.log_phi - self.log_phi[0], poses.bend])
+        return np.where(share > 0.0, off, 0.0) * share, share
+
+
 class Sightlines(Frozen):
-    """Of N observations: points first, twice each (their rows in x, then those in y), then lines, then arcs.
+    """What is known of a camera by N observations: points first, twice each (their rows in x, then those in y), then
+    lines, then arcs.
 
     Attributes:
-        pixels: (N, 2) offsets p, px. w: (N,). slope: (N,) of w by r, over r.
+        known: beforehand. pixels: (N, 2) offsets p, px. w: (N,). slope: (N,) of w by r, over r.
         unit_px: of the radius that the bend multiplies. places: (N, 3) P or M, m. along: (N, 3) a of lines; of arcs the
             radius and two zeros.
         counts: of points, lines and arcs. curve: (N,) which feature each row belongs to.
     """
 
+    known: Beforehand
     pixels: Array
     w: Array
     slope: Array
@@ -96,12 +124,12 @@ class Sightlines(Frozen):
         return 2 * self.counts[0] + 2 * len(straight) + 5 * len(distinct(self.curve[self._arcs]))
 
     @classmethod
-    def of_points(cls, pixels: Array, places: Array, unit_px: float) -> Sightlines:
+    def of_points(cls, known: Beforehand, pixels: Array, places: Array, unit_px: float) -> Sightlines:
         """Of places (N, 3) m alone, seen at undistorted offsets (N, 2) px."""
         twice, count = np.vstack([pixels, pixels]), len(pixels)
         ones, zeros, along = np.ones(2 * count), np.zeros(2 * count), np.zeros((2 * count, 3))
         none = np.full(2 * count, -1)
-        return cls(twice, ones, zeros, unit_px, np.vstack([places, places]), along, (count, 0, 0), none)
+        return cls(known, twice, ones, zeros, unit_px, np.vstack([places, places]), along, (count, 0, 0), none)
 
     @property
     def _points(self) -> slice:

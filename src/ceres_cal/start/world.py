@@ -17,10 +17,10 @@ from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
-from ceres_cal.start.search import Beforehand, BestCameras, apart, best_of, information, searched
-from ceres_cal.start.sightlines import Candidates, Sightlines
+from ceres_cal.start.search import BestCameras, apart, best_of, information, searched
+from ceres_cal.start.sightlines import Beforehand, Candidates, Sightlines
 
-_MOST_POINTS, _MOST_OF_A_CURVE = 20, 12  # beyond which a start learns nothing more
+_MOST = (20, 12)  # points, and places of each curve, beyond which a start learns nothing more
 _HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
 _SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
 _ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
@@ -78,16 +78,16 @@ def placed(
         may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
     """
     bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
-    lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
+    lines = _lines_of(sight, profile, known)
     given = Candidates.none()
     if proposed is not None and np.all(np.isfinite(proposed)):
         rotation = proposed[:, :3].T
         given = Candidates(rotation[None], (-rotation @ proposed[:, 3])[None], np.array([log_phi]), np.zeros(1))
-        found = best_of(lines, known, given)
-        if holds(lines, known, found, profile.unit_px):
+        found = best_of(lines, given)
+        if holds(lines, found):
             if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
                 found = replace(found, poses=given, costs=found.costs[:1])
-            return _answered(lines, profile, known, found)
+            return _answered(lines, profile, found)
     known = replace(known, bend_sd=bend_sd if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
     tried = [_searched(sight, one, known, given) for one in ((profile, none) if may_bend else (profile,))]
@@ -96,31 +96,30 @@ def placed(
 
 def _searched(
     sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates
-) -> tuple[Sightlines, RadialProfile, Beforehand, BestCameras]:
-    few_points, few_of_a_curve = 8, 4  # for the first rounds of a search
-    lines = sightlines_of(sight, profile, _MOST_POINTS, _MOST_OF_A_CURVE)
-    few = sightlines_of(sight, profile, few_points, few_of_a_curve)
-    return lines, profile, known, searched(lines, few, known, given)
+) -> tuple[Sightlines, RadialProfile, BestCameras]:
+    few = 8, 4  # points, and places of each curve, for the first rounds of a search
+    lines = _lines_of(sight, profile, known)
+    return lines, profile, searched(lines, _lines_of(sight, profile, known, few), given)
 
 
-def _answered(lines: Sightlines, profile: RadialProfile, known: Beforehand, found: BestCameras) -> Placed:
+def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> Placed:
     """With what the best place leaves open, and the others that fit alike."""
     finest_px = 1e-2  # of a scale: exact data are told no better
     most_places = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, finest_px)
-    matrix = information(lines, known, best, scale)
+    matrix = information(lines, best, scale)
     alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
     places = tuple(_place(found.poses, number, profile) for number in alike[:most_places])
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
-def holds(lines: Sightlines, known: Beforehand, found: BestCameras, unit_px: float) -> bool:
+def holds(lines: Sightlines, found: BestCameras) -> bool:
     """Whether nearly all of what is seen agrees with a place, and more than any place would take up."""
     best = found.poses.take(np.array([0]))
     distance = np.abs(lines.distances(best)[0])
-    limit = min(_SCALES * found.scale_px, _ROUGH * unit_px) + 1e-3
+    limit = min(_SCALES * found.scale_px, _ROUGH * lines.unit_px) + 1e-3
     near = (distance < limit) & lines.seen(best)[0]
-    return bool(np.mean(near) > _HOLDS and lines.independent >= np.count_nonzero(~known.held) + _LEFT_OVER)
+    return bool(np.mean(near) > _HOLDS and lines.independent >= np.count_nonzero(~lines.known.held) + _LEFT_OVER)
 
 
 def open_numbers(matrix: Array) -> tuple[str, ...]:
@@ -156,11 +155,11 @@ def _place(poses: Candidates, number: int, profile: RadialProfile) -> CameraPlac
     return CameraPlace(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
 
 
-def sightlines_of(sight: Sights, profile: RadialProfile, most_points: int, most_of_a_curve: int) -> Sightlines:
+def _lines_of(sight: Sights, profile: RadialProfile, known: Beforehand, most: tuple[int, int] = _MOST) -> Sightlines:
     """Some of what a sight shows, evenly."""
-    points = _evenly(np.arange(len(sight.points)), most_points)
+    points = _evenly(np.arange(len(sight.points)), most[0])
     tracks = sight.track_index
-    rows = [_evenly(np.flatnonzero(tracks == track), most_of_a_curve) for track in distinct(tracks)]
+    rows = [_evenly(np.flatnonzero(tracks == track), most[1]) for track in distinct(tracks)]
     some = np.concatenate([np.empty(0, np.int64), *rows])
     arc = sight.on_arc[some]
     some, arcs = np.concatenate([some[~arc], some[arc]]), int(np.count_nonzero(arc))
@@ -171,6 +170,7 @@ def sightlines_of(sight: Sights, profile: RadialProfile, most_points: int, most_
     places = np.vstack([sight.points[points], sight.points[points], starts])
     radius = np.linalg.norm(pixels, axis=1)
     return Sightlines(
+        known,
         pixels,
         profile.lift(pixels)[:, 2],
         profile.slope(radius),

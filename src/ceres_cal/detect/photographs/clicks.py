@@ -28,8 +28,8 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
-from ceres_cal.start.search import Beforehand, searched
-from ceres_cal.start.sightlines import Sightlines
+from ceres_cal.start.search import searched
+from ceres_cal.start.sightlines import Beforehand, Sightlines
 
 FORMAT, VERSION = "ceres-cal/corners", 1
 # How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
@@ -146,8 +146,8 @@ def _with_stretch(stretch: float, pixels: Array, plane: Array, image_size: tuple
     lifted = (pixels - middle) * (1.0 + lens.values[1] * np.sum((pixels - middle) ** 2, axis=1))[:, None]
     usual = float(np.log(USUAL_PHI * half)), float(np.log(USUAL_PHI_FACTOR))
     known = Beforehand(np.zeros(3), np.full(3, np.inf), usual, 0.0, least_px=0.5 * SIGMA_PX)
-    lines = Sightlines.of_points(lifted, plane, half)
-    best = searched(lines, lines, known).poses
+    lines = Sightlines.of_points(known, lifted, plane, half)
+    best = searched(lines, lines).poses
     rotation, phi = best.rotations[0].T, float(np.exp(best.log_phi[0]))
     pose = Pose(rotation, -rotation @ best.positions[0])
     camera = Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose)
