@@ -27,7 +27,7 @@ from ceres_cal.base.arrays import Array, Indices, known_inverses
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
-from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.observations.sights import Owner, SightKey, Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -186,7 +186,7 @@ def _alike(groups: Sights, alone: Set[str | None]) -> Iterator[Indices]:
     return (np.array(numbers) for numbers in every.values())
 
 
-def _drop_rounding(columns: Mapping[tuple[str, str], Indices], sizes: Array, products: Array) -> None:
+def _drop_rounding(columns: Mapping[Owner, Indices], sizes: Array, products: Array) -> None:
     """Take what is left of a turn that nothing tells, which is rounding of the others, out of sizes and products."""
     rounding = 1e-12  # of a sum over a group's rows
     for (kind, _), own in columns.items():

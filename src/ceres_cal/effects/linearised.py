@@ -15,7 +15,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.observations.sights import ranges
+from ceres_cal.observations.sights import STRUCTURE, ranges
 from ceres_cal.problem.costs import robust_weights
 from ceres_cal.problem.information import Information, Key, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
@@ -419,8 +419,7 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
             columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]
         if own := owned.get(("placement", str(key.placement)), []):
             columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
-    structure = [column for column, key in enumerate(keys) if key.is_structure]
-    if structure:
+    if structure := owned.get(STRUCTURE, []):
         columns[:, structure] = equations.structure_columns(estimate.structure)
     return columns
 

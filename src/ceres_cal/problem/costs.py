@@ -390,8 +390,7 @@ def _parts(
             # Without turns among its numbers any rotation will do.
             rotation = prior.rotations.get(owner, estimate.stations[owner].cam_from_world.rotation)
             yield (kind, owner), 6, columns, _of_station(rows, rotation)
-    structure = [column for column, key in enumerate(prior.keys) if key.is_structure]
-    if structure:
-        names = estimate.structure.names
-        slots = [names.index(prior.keys[column].structure_name) for column in structure]
-        yield STRUCTURE, len(names), structure, _linear(slots, np.ones(len(slots)), len(names))
+        elif kind == "structure":
+            slots = estimate.structure.places(prior.keys[column] for column in columns)
+            size = len(estimate.structure.names)
+            yield STRUCTURE, size, columns, _linear(slots, np.ones(len(slots)), size)

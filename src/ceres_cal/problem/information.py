@@ -20,6 +20,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Spread, known_inverses, without
 from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.observations.sights import STRUCTURE, Owner
 
 _TURNS = ("turn_x", "turn_y", "turn_z")
 STATION_QUANTITIES = ("x", "y", "height", *_TURNS)
@@ -86,11 +87,11 @@ def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:
     return whole
 
 
-def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
-    """(kind, owner) -> where its keys are."""
-    columns: dict[tuple[str, str], list[int]] = {}
+def columns_by_owner(keys: Sequence[Key]) -> dict[Owner, list[int]]:
+    """Where the keys of each owner are."""
+    columns: dict[Owner, list[int]] = {}
     for column, key in enumerate(keys):
-        columns.setdefault((key.kind, key.owner), []).append(column)
+        columns.setdefault(STRUCTURE if key.is_structure else (key.kind, key.owner), []).append(column)
     return columns
 
 

@@ -85,9 +85,8 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0, "skew": 1.0}
             known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
             sizes[columns] = [known[keys[column].quantity] for column in columns]
-        elif keys[columns[0]].is_structure:
-            names = [keys[column].structure_name for column in columns]
-            sizes[columns] = estimate.structure.sizes_m[[estimate.structure.names.index(name) for name in names]]
+        elif kind == "structure":
+            sizes[columns] = estimate.structure.sizes_m[estimate.structure.places(keys[column] for column in columns)]
         else:
             distance = _distance_m(estimate, kind, owner)
             sizes[columns] = [distance if keys[column].unit == "m" else 1.0 for column in columns]
@@ -113,9 +112,8 @@ def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
             numbers = camera.phi, camera.aspect, *camera.principal_point, *camera.lens.values, camera.skew
             known = dict(zip(intrinsic_names(camera.lens), numbers, strict=True))
             values[columns] = [known[name] for name in names]
-        elif keys[columns[0]].is_structure:
-            at = [estimate.structure.names.index(keys[column].structure_name) for column in columns]
-            values[columns] = estimate.structure.values[at]
+        elif kind == "structure":
+            values[columns] = estimate.structure.values[estimate.structure.places(keys[column] for column in columns)]
         else:
             held = estimate.placements[owner].translation if kind == "placement" else None
             place = estimate.stations[owner].cam_from_world.position if held is None else held
@@ -212,8 +210,8 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
         names = [keys[column].quantity for column in columns]
         if kind == "camera":
             cameras[owner] = camera_moved(cameras[owner], names, step[columns])
-        elif keys[columns[0]].is_structure:
-            values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[columns]
+        elif kind == "structure":
+            values[estimate.structure.places(keys[column] for column in columns)] += step[columns]
         else:
             change = np.zeros(6)
             change[[POSE_QUANTITIES[kind].index(name) for name in names]] = step[columns]

@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import Array, Indices, known_inverses
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.observations.sights import STRUCTURE, Owner, SightKey, Sights
 from ceres_cal.problem.costs import NORMAL_NS, kernel_loss
 from ceres_cal.problem.information import Information, Key, columns_by_owner, pose_keys, sigma_limits
 from ceres_cal.problem.parameters import Estimate, intrinsics_scales
@@ -116,23 +116,20 @@ def normals_with_residuals(sights: Sights, problem: Problem, estimate: Estimate)
     return _kernel_normals(sights, problem, estimate)(0, len(sights))
 
 
-def owned_columns(keys: Sequence[Key]) -> dict[tuple[str, str], Indices]:
-    """(kind, owner) -> where its keys are, those of the structure under ("structure", "")."""
-    columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(keys).items()}
-    structure = [column for column, key in enumerate(keys) if key.is_structure]
-    return columns | {("structure", ""): np.array(structure, dtype=np.int64)}
+def owned_columns(keys: Sequence[Key]) -> dict[Owner, Indices]:
+    """Where the keys of each owner are, and of the structure where it has none."""
+    columns = {STRUCTURE: list[int](), **columns_by_owner(keys)}
+    return {owner: np.array(at, dtype=np.int64) for owner, at in columns.items()}
 
 
-def steps_of(
-    key: SightKey, pose: Array, estimate: Estimate, columns: Mapping[tuple[str, str], Indices]
-) -> tuple[Array, Indices]:
+def steps_of(key: SightKey, pose: Array, estimate: Estimate, columns: Mapping[Owner, Indices]) -> tuple[Array, Indices]:
     """What steps of the shared numbers do to those of a sight (see `normals_of`), (K, P), and which numbers they are.
 
     Args:
         pose: (3, 4) cam_from_frame. columns: see `owned_columns`.
     """
     world, nothing = estimate.stations[key.station].cam_from_world, np.empty(0, dtype=np.int64)
-    at = [columns.get(("camera", key.camera), nothing), columns["structure", ""]]
+    at = [columns.get(("camera", key.camera), nothing), columns[STRUCTURE]]
     lead = len(at[0]) + len(at[1])
     steps = [np.eye(lead + 6)[:, :lead]]
     if (station := ("station", key.station)) in columns:
@@ -205,7 +202,7 @@ class _InformationSums:
         """The private placements of one station; what is left of their sights is added to the sums."""
         key = sights.keys[0]
         world = self._estimate.stations[key.station].cam_from_world
-        lead = np.concatenate([self._owned("camera", key.camera), self._owned("structure", "")])
+        lead = np.concatenate([self._owned("camera", key.camera), self._columns[STRUCTURE]])
         station = self._owned("station", key.station)
         stacks, reduced = [], np.zeros((2, len(lead), len(lead)))
         for poses, normals in self._normals(sights):

@@ -10,7 +10,7 @@ The lengths that targets are drawn by, and how another value of one moves points
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import repeat
 from typing import Literal
 
@@ -133,6 +133,10 @@ class Structure(Frozen):
         whole[:before, :before], whole[before + rows :, before + columns :] = np.eye(before), np.eye(behind)
         whole[before : before + rows, before : before + columns] = self.mixing
         return whole
+
+    def places(self, keys: Iterable[Key]) -> list[int]:
+        """Where the numbers of some keys are."""
+        return [self.names.index(key.structure_name) for key in keys]
 
     def with_values(self, values: Array) -> Structure:
         """The same corrections with other numbers."""
