@@ -23,7 +23,7 @@ from ceres_cal.detect.lines import SPACING_PX, measure
 from ceres_cal.detect.photographs import Auto, Facing, detect_field
 from ceres_cal.detect.photographs.candidates import candidates, off_centre, prepare_search
 from ceres_cal.detect.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
-from ceres_cal.detect.photographs.follow import refine
+from ceres_cal.detect.photographs.follow import Tracker
 from ceres_cal.detect.photographs.grid import grid_of
 from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
@@ -90,7 +90,7 @@ def test_strokes_lie_on_paint(shot: script.Shot) -> None:
 
 
 def test_strokes_tell_how_the_camera_looks(shot: script.Shot) -> None:
-    seen = prepare_search(shot.grey, FIELD, NAMES)
+    seen = prepare_search(shot.grey, FIELD, NAMES, Auto())
     upright = find_upright(seen.stroke_map.ends, seen.stroke_map.strokes.length_px, 3)[0]
     rotation = shot.camera.cam_from_world.rotation
     assert upright.rotation[:, 2] @ rotation[:, 2] > np.cos(np.deg2rad(1.5))  # 0.4 degrees
@@ -301,7 +301,7 @@ def test_lines_that_motion_makes_faint_are_seen() -> None:
 def test_corners_are_not_extrapolated_along_a_lens_that_folds() -> None:
     """Brown's suits these smeared lines best, and folds 13 px beyond the corner that nothing was measured next to."""
     shot = disturbed.taken("motion", 307, FIELD)
-    seen = refine(light(shot.image), FIELD, shot.camera, NAMES, FreeIntrinsics()).camera
+    seen = Tracker(light(shot.image), FIELD, NAMES, FreeIntrinsics()).refined_from(shot.camera).camera
     assert not seen.folds
     corner = FIELD.points["TopRightCorner"]
     assert np.max(np.abs(seen.project([corner]) - shot.camera.project([corner]))) < 0.3  # 0.15 px; 0.6 with Brown's
@@ -317,6 +317,6 @@ def test_strokes_of_striped_floors_are_not_alone() -> None:
 
 def test_the_middle_of_the_lens_is_told_by_its_strokes() -> None:
     """A part of a sensor: about its own quarter strokes are straighter than about the picture's middle."""
-    problem = prepare_search(light(disturbed.taken("cropped", 14, FIELD).image), FIELD, FIELD.curve_names)
+    problem = prepare_search(light(disturbed.taken("cropped", 14, FIELD).image), FIELD, FIELD.curve_names, Auto())
     centre = off_centre(problem).stroke_map.centre
     assert np.allclose(centre, (0.28 * 780.0, 0.72 * 580.0))

@@ -21,7 +21,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.lens_forms import AS_GOOD_BESIDE_LENGTHS, PAPER, decide, standard_errors
 from ceres_cal.cli import main
 from ceres_cal.cli.arguments import parse_estimates
-from ceres_cal.detect.photographs.candidates import candidates, prepare_search
+from ceres_cal.detect.photographs.candidates import Auto, candidates, prepare_search
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refits import refit
@@ -183,7 +183,7 @@ def picture() -> Image:
 def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
     grey, drawn = cv2.cvtColor(picture(), cv2.COLOR_BGR2GRAY).astype(np.float32), ssl_field("B", field_width_m=6.4)
     width = Prior("target", "field", "field_width_m", (6.4,), (0.9,))
-    search = prepare_search(grey, drawn, drawn.curve_names, (width,))
+    search = prepare_search(grey, drawn, drawn.curve_names, Auto(lengths=(width,)))
     assert len(search.others) == 2
     camera, grid = candidates(search)[0]
     assert grid is search.others[0]  # 6 % narrower: 9 to 6.0 m, as is 8.28 to 5.52

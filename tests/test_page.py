@@ -66,8 +66,8 @@ def test_the_model_is_where_it_was_dragged_to(count: int) -> None:
     pixels = camera.project(np.array([FIELD.points[name] for name in names]))
     shown = PointHints.of(FIELD, {name: (*pixel, 3.0) for name, pixel in zip(names, pixels, strict=True)}, [])
     base = by_hand.guess(FIELD, (1280, 960))
-    found = by_hand.solved(FIELD, shown, base, base)
-    off_px, _ = by_hand.off(FIELD, shown, found)
+    found = by_hand.solved(shown, base, base)
+    off_px, _ = by_hand.off(shown, found)
     assert np.max(off_px) < 1.0  # measured: 0.3 px, held by where the others were
     if count >= 6:
         every = found.project(FIELD.point_array) - camera.project(FIELD.point_array)
@@ -77,7 +77,7 @@ def test_the_model_is_where_it_was_dragged_to(count: int) -> None:
 def test_a_place_of_a_line_draws_the_line() -> None:
     base = by_hand.guess(FIELD, (1280, 960))
     shown = PointHints.of(FIELD, {}, [("HalfwayLine", 700.0, 300.0, 3.0), ("HalfwayLine", 720.0, 700.0, 3.0)])
-    assert np.max(by_hand.off(FIELD, shown, by_hand.solved(FIELD, shown, base, base))[0]) < 1.0
+    assert np.max(by_hand.off(shown, by_hand.solved(shown, base, base))[0]) < 1.0
 
 
 def test_a_click_that_contradicts_the_others_is_named() -> None:
@@ -85,7 +85,7 @@ def test_a_click_that_contradicts_the_others_is_named() -> None:
     points = {name: (*camera.project(np.array(FIELD.points[name])), 3.0) for name in list(FIELD.points)[:10]}
     points["TopRightCorner"] = (points["TopRightCorner"][0] + 60.0, points["TopRightCorner"][1], 3.0)
     shown, base = PointHints.of(FIELD, points, []), by_hand.guess(FIELD, (1280, 960))
-    _, against = by_hand.judged(FIELD, shown, by_hand.solved(FIELD, shown, base, base), base)
+    _, against = by_hand.judged(shown, by_hand.solved(shown, base, base), base)
     assert list(against) == ["TopRightCorner"] and against["TopRightCorner"] == pytest.approx(60.0, abs=12.0)
 
 
@@ -103,7 +103,7 @@ def test_places_of_lines_take_part_in_a_start(tmp_path: Path) -> None:
         starts, free = starts_from_clicks(clicks, FIELD, (1280, 960))
         assert free.hints is not None and len(free.hints.places) == len(clicks.curves)
         shown = PointHints.of(FIELD, {}, [(name, x, y, 1.0) for name, x, y in curves])
-        return float(np.median([np.max(by_hand.off(FIELD, shown, start)[0]) for start in starts]))
+        return float(np.median([np.max(by_hand.off(shown, start)[0]) for start in starts]))
 
     clicks = load_clicks(file)
     assert clicks == Clicks(points, curves)

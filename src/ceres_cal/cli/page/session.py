@@ -125,7 +125,7 @@ class Session:
         target = self._required_target()
         state = drag.of(self.state, target)
         base = self._base(target)
-        self._camera = by_hand.solved(target, _shown(state, target), self._camera or base, base, quickly=True)
+        self._camera = by_hand.solved(_shown(state, target), self._camera or base, base, quickly=True)
         if drag.last:
             self._become(state, camera=self._camera)
 
@@ -158,7 +158,7 @@ class Session:
         target = self.target(self.state)
         if target is not None and self._now.found is None:
             base, shown = self._base(target), _shown(self.state, target)
-            settled = by_hand.settled(target, shown, self._camera or base, base)
+            settled = by_hand.settled(shown, self._camera or base, base)
             self._camera, self._against, self.message = settled
         elif target is not None:
             self._camera = self._now.base
@@ -219,7 +219,7 @@ class Session:
             return self._now is moment
         if target is None or len(moment.state.points) < FEWEST:
             return False
-        seen = by_hand.observed(target, _shown(moment.state, target), self.sitting.sizes[0])
+        seen = _shown(moment.state, target).observed(self.sitting.sizes[0])
         told = known_of(quality_of(calibrate(seen, _BY_HAND), seen))
         with self.lock:
             current = self.revision == revision
@@ -270,7 +270,7 @@ class Session:
                 name: np.round(line, 1).tolist() for name, line in by_hand.curves_in_image(target, camera).items()
             },
             "points": dict(zip(target.point_names, np.round(points, 1).tolist(), strict=True)),
-            "feet": np.round(by_hand.feet(target, shown, camera), 1).tolist(),
+            "feet": np.round(by_hand.feet(shown, camera), 1).tolist(),
         }
 
     def everything(self) -> dict[str, Any]:

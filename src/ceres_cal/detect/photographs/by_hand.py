@@ -11,8 +11,7 @@ from ceres_cal.base.errors import answer_or_reason
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.photographs.clicks import FEWEST, Clicks, starts_from_clicks, unknown_optics
-from ceres_cal.detect.photographs.refit import NOTHING, ROBUST, PointHints, observations_of, refit_camera
-from ceres_cal.observations import Observations
+from ceres_cal.detect.photographs.refit import ROBUST, PointHints, refit_camera
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.scene.camera import Camera
@@ -49,7 +48,7 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
     return Camera(image_size, phi, middle, Radial((0.0,) * 4, (2, 3, 4, 5)), 1.0, Pose(rotation, -rotation @ position))
 
 
-def solved(target: Target, shown: PointHints, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
+def solved(shown: PointHints, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
     """The camera by all clicks, each as well as a hand hits it; what nobody showed goes along with them.
 
     Args:
@@ -59,88 +58,79 @@ def solved(target: Target, shown: PointHints, before: Camera, base: Camera, *, q
     if not shown.equations:
         return base
     best: Camera | None = None
-    base = _turned(target, shown, base)
+    base = _turned(shown, base)
     for start in (before, base) if shown.equations >= _FREED[0][0] else (base, before):
-        there = _fitted(target, shown, start, base, _AS_SHOWN)
-        if there is not None and (best is None or _cost(target, shown, there) < _cost(target, shown, best)):
+        there = _fitted(shown, start, base, _AS_SHOWN)
+        if there is not None and (best is None or _cost(shown, there) < _cost(shown, best)):
             best = there
-        if best is not None and (quickly or _cost(target, shown, best) < _AGAINST**2):
+        if best is not None and (quickly or _cost(shown, best) < _AGAINST**2):
             break
     return best or before
 
 
-def _fitted(target: Target, shown: PointHints, start: Camera, base: Camera, weighting: Weighting) -> Camera | None:
+def _fitted(shown: PointHints, start: Camera, base: Camera, weighting: Weighting) -> Camera | None:
     """The camera that suits best what was shown, with as much of it free as that can tell."""
     wanted: tuple[str, ...] = next((names for least, names in reversed(_FREED) if shown.equations >= least), ())
     free = tuple(name for name in wanted if name in intrinsic_names(base.lens))
-    optics, hints = unknown_optics(base, None), _hints(target, shown, base)
-    observed = observations_of(target, base.image_size, *NOTHING, hints)
-    fitted = refit_camera(start, observed, free, optics.priors, weighting)
+    observed = _hints(shown, base).observed(base.image_size)
+    fitted = refit_camera(start, observed, free, unknown_optics(base, None).priors, weighting)
     return None if fitted is None else fitted[0]
 
 
-def settled(target: Target, shown: PointHints, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
+def settled(shown: PointHints, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
     """The camera once nothing is dragged any more, the clicks that contradict the others (see `judged`), and what is
     wrong with them all.
     """
     far = 10.0  # of them: no camera near puts it there
-    camera, wrong = solved(target, shown, before, base), ""
-    off_px, sigma_px = off(target, shown, camera)
+    camera, wrong = solved(shown, before, base), ""
+    off_px, sigma_px = off(shown, camera)
     if len(shown.feature) >= FEWEST and np.any(off_px > far * sigma_px):
-        other, wrong = answer_or_reason(lambda: anew(target, shown, base.image_size))
+        other, wrong = answer_or_reason(lambda: anew(shown, base.image_size))
         camera = other or camera
-    return *judged(target, shown, camera, base), wrong
+    return *judged(shown, camera, base), wrong
 
 
-def observed(target: Target, shown: PointHints, image_size: tuple[int, int]) -> Observations:
-    """What was shown, as observations."""
-    return observations_of(target, image_size, *NOTHING, shown)
-
-
-def judged(target: Target, shown: PointHints, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
+def judged(shown: PointHints, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
     """The camera without the clicks that contradict the others, and by how many px those are off, by name or "#2" of a
     place of a curve.
     """
     enough = 10  # equations from which on a contradiction can be seen
-    off_px, sigma_px = off(target, shown, camera)
+    off_px, sigma_px = off(shown, camera)
     if shown.equations < enough or np.all(off_px <= 0.5 * _AGAINST * sigma_px):  # others take a share of it
         return camera, {}
-    robust = _fitted(target, shown, camera, _turned(target, shown, base), ROBUST) or camera
-    off_px, sigma_px = off(target, shown, robust)
-    names = (*_names(target, shown), *(f"#{number}" for number in range(len(shown.curve))))
+    robust = _fitted(shown, camera, _turned(shown, base), ROBUST) or camera
+    off_px, sigma_px = off(shown, robust)
+    names = (*shown.names, *(f"#{number}" for number in range(len(shown.curve))))
     rows = zip(names, off_px.tolist(), (off_px > _AGAINST * sigma_px).tolist(), strict=True)
     return robust, {name: distance for name, distance, against in rows if against}
 
 
-def anew(target: Target, shown: PointHints, image_size: tuple[int, int]) -> Camera:
+def anew(shown: PointHints, image_size: tuple[int, int]) -> Camera:
     """The camera that the named points tell from nothing, as `detect_field` starts from them.
 
     Raises:
         InputError: fewer than four, or none can be right, and why.
     """
-    points = dict(zip(_names(target, shown), map(tuple, shown.pixels.tolist()), strict=True))
-    curves = tuple((target.curve_names[n], x, y) for n, (x, y) in zip(shown.curve, shown.places.tolist(), strict=True))
-    cameras, _ = starts_from_clicks(Clicks(points, curves), target, image_size)
-    return min(cameras, key=lambda camera: _cost(target, shown, camera))
+    points = dict(zip(shown.names, map(tuple, shown.pixels.tolist()), strict=True))
+    names = (shown.target.curve_names[number] for number in shown.curve)
+    curves = tuple((name, x, y) for name, (x, y) in zip(names, shown.places.tolist(), strict=True))
+    cameras, _ = starts_from_clicks(Clicks(points, curves), shown.target, image_size)
+    return min(cameras, key=lambda camera: _cost(shown, camera))
 
 
-def _names(target: Target, shown: PointHints) -> list[str]:
-    return [target.point_names[number] for number in shown.feature]
-
-
-def off(target: Target, shown: PointHints, camera: Camera) -> tuple[Array, Array]:
+def off(shown: PointHints, camera: Camera) -> tuple[Array, Array]:
     """(N,) how far each click is from its point or curve, px, and how well a hand hits it."""
-    ends = np.concatenate([shown.pixels, shown.places]) - feet(target, shown, camera)
+    ends = np.concatenate([shown.pixels, shown.places]) - feet(shown, camera)
     return np.nan_to_num(np.linalg.norm(ends, axis=1), nan=1e6), np.concatenate([shown.sigma_px, shown.place_sigma_px])
 
 
-def feet(target: Target, shown: PointHints, camera: Camera) -> Array:
+def feet(shown: PointHints, camera: Camera) -> Array:
     """(N, 2) px where the model has what each click shows."""
-    points = camera.project(target.point_array[shown.feature]) if len(shown.feature) else np.empty((0, 2))
-    lines = curves_in_image(target, camera)
+    points = camera.project(shown.target.point_array[shown.feature]) if len(shown.feature) else np.empty((0, 2))
+    lines = curves_in_image(shown.target, camera)
     nearest = []
     for curve, place in zip(shown.curve, shown.places, strict=True):
-        line = lines[target.curve_names[curve]]
+        line = lines[shown.target.curve_names[curve]]
         apart = np.nan_to_num(np.linalg.norm(line - place, axis=1), nan=np.inf)
         nearest.append(_foot(line, int(np.argmin(apart)), place))
     return np.concatenate([points, np.array(nearest).reshape(-1, 2)])
@@ -164,17 +154,17 @@ def curves_in_image(target: Target, camera: Camera, steps: int = 60) -> Mapping[
     return {name: camera.project(curve_points(curve, 0, steps)) for name, curve in target.curves.items()}
 
 
-def _cost(target: Target, shown: PointHints, camera: Camera) -> float:
+def _cost(shown: PointHints, camera: Camera) -> float:
     """Of the clicks, the largest square of how far one is off, in standard deviations."""
-    off_px, sigma_px = off(target, shown, camera)
+    off_px, sigma_px = off(shown, camera)
     return float(np.max((off_px / sigma_px) ** 2, initial=0.0))
 
 
-def _hints(target: Target, shown: PointHints, base: Camera) -> PointHints:
+def _hints(shown: PointHints, base: Camera) -> PointHints:
     """What was shown, and loosely the other points where they were."""
     held_px = 300.0  # how loosely points that nobody showed stay where they were
-    rest = np.setdiff1d(np.arange(len(target.points), dtype=np.int32), shown.feature)
-    there = base.project(target.point_array[rest])
+    rest = np.setdiff1d(np.arange(len(shown.target.points), dtype=np.int32), shown.feature)
+    there = base.project(shown.target.point_array[rest])
     rest, there = rest[np.isfinite(there[:, 0])], there[np.isfinite(there[:, 0])]
     return replace(
         shown,
@@ -184,12 +174,12 @@ def _hints(target: Target, shown: PointHints, base: Camera) -> PointHints:
     )
 
 
-def _turned(target: Target, shown: PointHints, base: Camera) -> Camera:
+def _turned(shown: PointHints, base: Camera) -> Camera:
     """The base shifted, and from two points on turned about its axis and lifted, so that they come near their place."""
     if not len(shown.feature):
         return base
     axis = np.array(base.principal_point)
-    seen, wanted = base.project(target.point_array[shown.feature]) - axis, shown.pixels - axis
+    seen, wanted = base.project(shown.target.point_array[shown.feature]) - axis, shown.pixels - axis
     if not np.all(np.isfinite(seen)):
         return base
     a, b = seen @ (1.0, 1.0j), wanted @ (1.0, 1.0j)

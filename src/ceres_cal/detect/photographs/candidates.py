@@ -11,6 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose, chained, inverted
+from ceres_cal.detect.photographs.facing import Facing
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
@@ -44,11 +45,25 @@ field is asked for, whose lines fit in ever more places, the search took more th
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
+class Auto(Frozen, eq=True):
+    """No start: the field is to be found in the photograph.
+
+    Attributes:
+        facing: which way round it is, where it looks alike turned.
+        before: or the station's camera before it was moved; the way that it is turned least is taken.
+        lengths: what is known of dimensions of the target that are to be told by the photograph.
+    """
+
+    facing: tuple[Facing, ...] = ()
+    before: Camera | None = None
+    lengths: tuple[Prior, ...] = ()
+
+
 class FieldSearch(Frozen):
     """A photograph and the target that it may show.
 
     Attributes:
-        others: the target drawn with other lengths, where some are not known.
+        asked: what is known of it. others: the target drawn with other lengths, where some are not known.
         until_s: of this thread's processor time, after which no further camera is looked at.
         looked_at: cameras of candidates so far. reached: what was followed. refused: those of it that are surely not
             the field.
@@ -57,6 +72,7 @@ class FieldSearch(Frozen):
     grey: Array32
     stroke_map: StrokeMap
     grid: LineGrid
+    asked: Auto
     others: tuple[LineGrid, ...] = ()
     until_s: float = np.inf
     looked_at: list[Camera] = field(default_factory=list)
@@ -69,23 +85,19 @@ class FieldSearch(Frozen):
 
 
 def prepare_search(
-    grey: Array32,
-    target: Target,
-    curves: Collection[str],
-    lengths: Sequence[Prior] = (),
-    strokes: Strokes | None = None,
+    grey: Array32, target: Target, curves: Collection[str], asked: Auto, strokes: Strokes | None = None
 ) -> FieldSearch:
     """The strokes of a photograph, beside what they are to be taken for.
 
     Args:
-        lengths: what is known of dimensions of the target that may be others. strokes: where they are known already.
+        strokes: where they are known already.
 
     Raises:
         InputError: the target has too few straight lines.
     """
-    grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
+    grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, asked.lengths))
     until_s = thread_time() + BUDGET_S
-    return FieldSearch(grey, _stroke_map(grey, strokes or find_strokes(grey)), grid, tuple(others), until_s)
+    return FieldSearch(grey, _stroke_map(grey, strokes or find_strokes(grey)), grid, asked, tuple(others), until_s)
 
 
 def narrowed(search: FieldSearch) -> FieldSearch:

@@ -15,14 +15,7 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import check_header, convert, read_json
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
-from ceres_cal.detect.photographs.refit import (
-    CAMERA,
-    NOTHING,
-    FreeIntrinsics,
-    PointHints,
-    observations_of,
-    refit_camera,
-)
+from ceres_cal.detect.photographs.refit import CAMERA, FreeIntrinsics, PointHints, refit_camera
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -114,7 +107,7 @@ def starts_from_clicks(
         raise InputError(_odd_one(list(clicks.points), min((off for _, off in every), key=np.median)))
     phi = float(np.median([camera.phi for camera in fitting]))
     if clicks.curves:
-        shown = observations_of(target, image_size, *NOTHING, hints)
+        shown = hints.observed(image_size)
         refitted = (refit_camera(camera, shown) for camera in fitting)
         fitting = [one[0] if one is not None else camera for one, camera in zip(refitted, fitting, strict=True)]
     return fitting, unknown_optics(replace(fitting[0], phi=phi), hints, lengths)

@@ -27,13 +27,13 @@ from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_colour, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.median import MOST_PICTURES, merged
-from ceres_cal.detect.photographs.candidates import prepare_search
+from ceres_cal.detect.photographs.candidates import Auto, prepare_search
 from ceres_cal.detect.photographs.clicks import STRETCH, Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
-from ceres_cal.detect.photographs.search import Auto, SearchResult, SeveralWaysError, search
+from ceres_cal.detect.photographs.search import SearchResult, SeveralWaysError, search
 from ceres_cal.detect.strokes import Strokes, strokes_of_signs
 from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.problem.structure import features_of
@@ -331,7 +331,7 @@ def _looked_from(
 @or_none  # reads: "its lines were not found ..."
 def _is_worn(grey: Array32, followed: Followed) -> bool:
     """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
-    return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
+    return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves, Auto()), followed)
 
 
 def _starts(

@@ -64,7 +64,7 @@ def follow(
     Returns:
         The best that was reached; whether it is the field, `Followed.holds` tells.
     """
-    tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
+    tracker = Tracker(grey, target, curves, free or FreeIntrinsics())
     tried = tracker.tried(starts)
     best = next(tried)
     if not tracker.free.names:
@@ -80,45 +80,15 @@ def follow(
     return best
 
 
-def approach(
-    grey: Array32,
-    target: Target,
-    camera: Camera,
-    curves: Collection[str],
-    free: FreeIntrinsics,
-    reached: list[Followed],
-) -> Followed:
-    """`follow` from one start, up to where the lens remains that it started from.
-
-    Args:
-        reached: what other starts led to, and by and by this one: what leads there, too, is not followed to its end.
-    """
-    return next(_Tracker(grey, target, curves, free, reached=reached, rest_px=_NEARLY_PX).tried([camera]))
-
-
-def refine(
-    grey: Array32,
-    target: Target,
-    camera: Camera,
-    curves: Collection[str],
-    free: FreeIntrinsics,
-    lacking: Sequence[tuple[str, ...]] = (),
-) -> Followed:
-    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside, as drawn
-    next to where lines were followed that look like another field's, or in a picture that was stretched.
-
-    Args:
-        lacking: parts that this field is known to lack.
-    """
-    tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
-    lines = tracker.measured(camera)
-    tracker = replace(tracker, is_even=lines.is_even)  # the picture has coma, or none, wherever its lines are now
-    return tracker.told(tracker.followed(camera, lines))
-
-
 @dataclass(frozen=True, eq=False)
-class _Tracker:
-    """A photograph, the target's painted curves that are followed in it, and what of the camera is free."""
+class Tracker:
+    """A photograph, the target's painted curves that are followed in it, and what of the camera is free.
+
+    Attributes:
+        missing: curves that the target may lack, and this field does. reached: what starts led to so far.
+        known: what was made of a camera before. rest_px: by which nothing moves any more. is_even: whether the picture
+            is known to have no coma.
+    """
 
     grey: Array32
     target: Target
@@ -130,18 +100,36 @@ class _Tracker:
     rest_px: float = _AT_REST_PX
     is_even: bool = False
 
+    def approached(self, camera: Camera) -> Followed:
+        """`follow` from one start, up to where the lens remains that it started from. What others led to, and leads to
+        again, is not followed to its end.
+        """
+        return next(replace(self, rest_px=_NEARLY_PX).tried([camera]))
+
+    def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> Followed:
+        """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside, as
+        drawn next to where lines were followed that look like another field's, or in a picture that was stretched.
+
+        Args:
+            lacking: parts that this field is known to lack.
+        """
+        tracker = self.lacking(lacking).of_painted(camera)
+        lines = tracker.measured(camera)
+        tracker = replace(tracker, is_even=lines.is_even)  # the picture has coma, or none, wherever its lines are now
+        return tracker.told(tracker.followed(camera, lines))
+
     def followed(self, camera: Camera, lines: Lines) -> Followed:
         """What was measured from a camera."""
         visible = visible_curves(self.grey, self.target, camera, self.curves)
         return Followed(camera, self.target, tuple(self.curves), self.missing, lines, visible)
 
-    def of_painted(self, camera: Camera) -> _Tracker:
+    def of_painted(self, camera: Camera) -> Tracker:
         """The same without what the target may lack and this camera does not see."""
         painted = painted_curves(self.grey, self.target, camera, self.curves)
         missing = (*self.missing, *(name for name in self.curves if name not in painted))
         return replace(self, curves=painted, missing=missing)
 
-    def lacking(self, parts: Sequence[tuple[str, ...]]) -> _Tracker:
+    def lacking(self, parts: Sequence[tuple[str, ...]]) -> Tracker:
         """The same without some parts that the target may lack."""
         names = [name for part in parts for name in part]
         return replace(self, curves=[one for one in self.curves if one not in names], missing=tuple(names))
@@ -283,7 +271,7 @@ class _Tracker:
         one_px, other_px = (misfit(it.camera, self._with(it)._observed(it.lines, it.camera)) for it in (one, other))
         return one.share < _KEPT * other.share or one_px > _WORSE * other_px
 
-    def _with(self, followed: Followed) -> _Tracker:
+    def _with(self, followed: Followed) -> Tracker:
         """The same for curves, and a target as drawn, as they were followed."""
         return replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
 
@@ -371,12 +359,12 @@ class _Tracker:
 
     def _refitted(
         self, camera: Camera, observations: Observations, names: tuple[str, ...]
-    ) -> tuple[_Tracker, Camera] | None:
+    ) -> tuple[Tracker, Camera] | None:
         """The camera refitted with these intrinsics free, and the tracker of the target as it is then."""
         refitted = refit_camera(camera, observations, names, self.free.priors)
         return None if refitted is None else (replace(self, target=refitted[1]), refitted[0])
 
-    def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> tuple[_Tracker, Camera] | None:
+    def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> tuple[Tracker, Camera] | None:
         """The camera refitted to what is brightest along the normals; None where too little is."""
         course = self._predicted(camera, 2.0)
         if len(course) < _FEWEST:
@@ -396,6 +384,7 @@ class _Tracker:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
     def measured(self, camera: Camera, *, is_even: bool = False) -> Lines:
+        """The lines next to where a camera has them."""
         is_even = is_even or self.is_even
         return self._once(camera, ("lines", is_even), lambda: self._measured(camera, is_even))
 

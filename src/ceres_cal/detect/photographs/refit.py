@@ -28,10 +28,11 @@ ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
 class PointHints(Frozen):
-    """What somebody showed: points by their index (P,) among the target's, pixels (P, 2), sigma_px (P,), and places
-    (N, 2) px of curves (N,), with sigmas (N,).
+    """What somebody showed of a target: points by their index (P,) among its own, pixels (P, 2), sigma_px (P,), and
+    places (N, 2) px of curves (N,), with sigmas (N,).
     """
 
+    target: Target
     feature: Indices32
     pixels: Array
     sigma_px: Array
@@ -54,7 +55,16 @@ class PointHints(Frozen):
         )
         index = np.array([target.point_index[name] for name in points], dtype=np.int32)
         curve = np.array([target.curve_index[place[0]] for place in places], dtype=np.int32)
-        return cls(index, at[:, :2], at[:, 2], curve, on[:, :2], on[:, 2])
+        return cls(target, index, at[:, :2], at[:, 2], curve, on[:, :2], on[:, 2])
+
+    @property
+    def names(self) -> list[str]:
+        """(P,) of the points."""
+        return [self.target.point_names[number] for number in self.feature]
+
+    def observed(self, image_size: tuple[int, int]) -> Observations:
+        """The same as observations."""
+        return observations_of(self.target, image_size, *NOTHING, self)
 
     @property
     def equations(self) -> int:

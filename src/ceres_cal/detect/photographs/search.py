@@ -11,6 +11,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.detect.photographs.candidates import (
     BUDGET_S,
+    Auto,
     FieldSearch,
     alike,
     candidates,
@@ -20,20 +21,18 @@ from ceres_cal.detect.photographs.candidates import (
 )
 from ceres_cal.detect.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.detect.photographs.facing import (
-    Facing,
     agreeing_with_facing,
     distinguishing_feature,
     nearest_to_before,
     require_sides,
     side_of,
 )
-from ceres_cal.detect.photographs.follow import approach, refine
+from ceres_cal.detect.photographs.follow import Tracker
 from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.grid import grid_of
 from ceres_cal.detect.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
-from ceres_cal.detect.photographs.refit import FreeIntrinsics, PointHints
+from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.detect.strokes import Strokes
-from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.targets import Target
 
@@ -49,20 +48,6 @@ _NO_LINES = (
     "no lines at right angles that could be this field's, two one way and one across: "
     "check the target's dimensions, or start from corners"
 )
-
-
-class Auto(Frozen, eq=True):
-    """No start: the field is to be found in the photograph.
-
-    Attributes:
-        facing: which way round it is, where it looks alike turned.
-        before: or the station's camera before it was moved; the way that it is turned least is taken.
-        lengths: what is known of dimensions of the target that are to be told by the photograph.
-    """
-
-    facing: tuple[Facing, ...] = ()
-    before: Camera | None = None
-    lengths: tuple[Prior, ...] = ()
 
 
 class SeveralWaysError(InputError):
@@ -110,20 +95,20 @@ def search(
         InputError: the target has too few straight lines, or nothing that `auto.facing` names.
     """
     require_sides(auto.facing, target, curves)
-    problem = prepare_search(grey, target, curves, auto.lengths, strokes)
-    result = _search_about(problem, auto)
+    problem = prepare_search(grey, target, curves, auto, strokes)
+    result = _search_about(problem)
     moved = off_centre(problem) if result.followed is None else problem
     if moved is problem:
         return result
-    about = _search_about(moved, auto)
+    about = _search_about(moved)
     return about if about.followed is not None else result
 
 
-def _search_about(problem: FieldSearch, auto: Auto) -> SearchResult:
+def _search_about(problem: FieldSearch) -> SearchResult:
     """The same about one middle of the lens."""
-    good, seen, reason = _looked(problem, problem, auto)
+    good, seen, reason = _looked(problem, problem)
     if not good:
-        good, other, against = _looked(problem, narrowed(problem), auto)
+        good, other, against = _looked(problem, narrowed(problem))
         if seen is None or (other is not None and other.share > seen.share):
             seen, reason = other, against
     if problem.is_out_of_time:
@@ -133,7 +118,7 @@ def _search_about(problem: FieldSearch, auto: Auto) -> SearchResult:
     best = max(good, key=likelihood)
     problem = replace(problem, grid=grid_of(best.target, problem.grid.curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
-    others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
+    others = [_followed(problem, _turned(problem, camera)) for camera in similar]
     if problem.is_out_of_time:  # it may look alike in ways that nobody looked at
         return _given_up(best)
     distinct = [best]
@@ -141,10 +126,10 @@ def _search_about(problem: FieldSearch, auto: Auto) -> SearchResult:
         as_good = likelihood(other) >= _AS_GOOD * likelihood(best)
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
-    return _one_way(problem, auto, distinct)
+    return _one_way(problem, distinct)
 
 
-def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[Followed], Followed | None, str]:
+def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[Followed], Followed | None, str]:
     """What may be the field, by candidates from some strokes; else the best there is, and what speaks against it."""
     good: list[Followed] = []
     seen: Followed | None = None
@@ -153,14 +138,14 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
         if problem.is_out_of_time:
             break
         own = replace(problem, grid=grid)
-        first = followed = _followed(own, auto, _turned(problem, auto, camera))
+        first = followed = _followed(own, _turned(problem, camera))
         if any(followed is one for one in problem.refused):
             continue
         against = objection(problem, followed)
         if against and refined < _MOST_REFINED and (followed.holds or followed.share >= SURE_SHARE):
             refined += 1
-            free = _free(grid.target, auto, followed.camera)
-            followed = refine(problem.grey, grid.target, followed.camera, grid.curves, free, followed.lacks_wholly)
+            there = followed.camera
+            followed = _tracker(problem, grid.target, there).refined_from(there, followed.lacks_wholly)
             against = objection(problem, followed)
         if not against:
             good.append(followed)
@@ -178,43 +163,43 @@ def _given_up(seen: Followed | None) -> SearchResult:
     return SearchResult(None, f"{why}: check the target's dimensions, or start from corners", seen=seen)
 
 
-def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
+def _turned(problem: FieldSearch, camera: Camera) -> Camera:
     """The one of a camera's turns that what is known favours, so that it need not be followed again."""
     ways = [camera.at(camera.cam_from_world @ turn) for turn in problem.grid.turns]
-    agreeing = _consistent(problem, auto, ways)
+    agreeing = _consistent(problem, ways)
     return ways[agreeing[0]] if agreeing else camera
 
 
-def _followed(problem: FieldSearch, auto: Auto, camera: Camera) -> Followed:
+def _followed(problem: FieldSearch, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
-    free = _free(problem.grid.target, auto, camera)
-    return approach(problem.grey, problem.grid.target, camera, problem.grid.curves, free, problem.reached)
+    return _tracker(problem, problem.grid.target, camera).approached(camera)
 
 
-def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
+def _tracker(problem: FieldSearch, target: Target, camera: Camera) -> Tracker:
+    """What follows a target as it is drawn, from about there."""
     pixels = camera.project(target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
-    hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
-    return unknown_optics(camera, hints, auto.lengths)
+    hints = PointHints(target, rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
+    free = unknown_optics(camera, hints, problem.asked.lengths)
+    return Tracker(problem.grey, target, problem.grid.curves, free, reached=problem.reached)
 
 
 # ---- which way round ------------------------------------------------------------------------------------------------
 
 
-def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> SearchResult:
+def _one_way(problem: FieldSearch, distinct: Sequence[Followed]) -> SearchResult:
     """The one way that agrees with what is known; SeveralWaysError where none does, or several."""
     target, curves = problem.grid.target, problem.grid.curves
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.grid.turns]
-    agreeing = _consistent(problem, auto, ways)
+    agreeing = _consistent(problem, ways)
     number = agreeing[0] if agreeing else 0
     camera, one = ways[number], distinct[number // len(problem.grid.turns)]
     is_refined = one.built.names and number % len(problem.grid.turns) == 0  # and not turned
-    free = _free(one.target, auto, camera)
-    followed = one if is_refined else refine(problem.grey, one.target, camera, curves, free, one.lacks_wholly)
+    followed = one if is_refined else _tracker(problem, one.target, camera).refined_from(camera, one.lacks_wholly)
     if against := objection(problem, followed):
         return SearchResult(None, against, seen=followed)
     if not agreeing:
-        given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
+        given = ", ".join(f"{one.feature}={one.side}" for one in problem.asked.facing)
         raise SeveralWaysError(f"not with {given}: in this photograph {_sides(ways, target, curves)}", followed)
     if len(agreeing) > 1:
         raise SeveralWaysError(
@@ -222,16 +207,16 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
             f"{_sides([ways[number] for number in agreeing], target, curves)}",
             followed,
         )
-    chosen_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
+    chosen_by = "" if len(ways) == 1 else "facing" if problem.asked.facing else "before"
     return SearchResult(followed, "", len(ways), chosen_by)
 
 
-def _consistent(problem: FieldSearch, auto: Auto, cameras: Sequence[Camera]) -> list[int]:
+def _consistent(problem: FieldSearch, cameras: Sequence[Camera]) -> list[int]:
     """Numbers of the cameras that agree with what is known; one alone needs no old calibration to agree with."""
-    if auto.facing:
-        return agreeing_with_facing(cameras, auto.facing, problem.grid.target, problem.grid.curves)
-    if auto.before is not None and len(cameras) > 1:
-        return nearest_to_before(cameras, auto.before)
+    if problem.asked.facing:
+        return agreeing_with_facing(cameras, problem.asked.facing, problem.grid.target, problem.grid.curves)
+    if problem.asked.before is not None and len(cameras) > 1:
+        return nearest_to_before(cameras, problem.asked.before)
     return list(range(len(cameras)))
 
 
