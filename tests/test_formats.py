@@ -36,7 +36,7 @@ def write_folder(request: ExportRequest) -> Exported:
     return Exported({f"{name}.txt": b"here" for name in request.stations}, (), "a file for each station")
 
 
-TOY = ExportFormat("toy", "for this test", (".toy", ".gz.toy"), write_toy, several_stations=True, edits=True)
+TOY = ExportFormat("toy", "for this test", (".toy", ".gz.toy"), write_toy, most_stations=None, edits=True)
 FOLDER = ExportFormat("folder", "for this test, too", (), write_folder)
 
 

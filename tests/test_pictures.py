@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from photos import shots as script
 from photos import straightness
-from scenes import LENSES, camera
+from scenes import LENSES, camera, two_cameras
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -33,7 +33,7 @@ from ceres_cal.report.pictures.frames import (
     jpeg_of_at_most,
     marks_of,
     model_of,
-    photographs_by_frame,
+    photographs_of,
 )
 from ceres_cal.report.pictures.model import model_seen
 from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay
@@ -41,7 +41,7 @@ from ceres_cal.report.pictures.straight import Straight, straighten
 from ceres_cal.report.pictures.warp import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.simulate import overhead_pose
+from ceres_cal.simulate import overhead_pose, simulate
 
 POSE = overhead_pose(-2.27, -0.12, 4.02, 3.0, -2.0, 90.0)
 FISHEYE = Camera(
@@ -350,11 +350,17 @@ def test_the_field_is_shown_before_boards() -> None:
     assert first_of_each(frames) == {"left": frames[2], "right": frames[1]}
 
 
-def test_photographs_by_frame() -> None:
-    paths = [Path("a/0001.png"), Path("a/0002.jpg")]
-    assert photographs_by_frame(paths) == {"0001": paths[0], "0002": paths[1]}
+def test_photographs_of_frames_and_stations() -> None:
+    """By their names; by their folders where these are called like stations or cameras."""
+    observations = simulate(two_cameras(LENSES[0])).observations
+    frame = observations.views[0].frame
+    west, east, alone, again = (Path(f"{folder}/{frame}.png") for folder in ("a/west", "a/east", "a", "b"))
+    of_west, of_east = (frame, "west"), (frame, "east")
+    assert photographs_of([west, east, Path("a/nothing.png")], observations) == {of_west: west, of_east: east}
+    assert photographs_of([east], observations) == {of_east: east}
+    assert photographs_of([alone], observations) == {of_west: alone, of_east: alone}
     with pytest.raises(InputError, match="has the same name as"):
-        photographs_by_frame([*paths, Path("b/0001.png")])
+        photographs_of([alone, again], observations)
 
 
 def test_image_files_keep_to_their_bytes() -> None:

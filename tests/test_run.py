@@ -121,3 +121,32 @@ def test_a_plan_names_the_first_of_many_photographs() -> None:
     shown = " ".join(f"--images {number}.jpg" for number in range(9))
     assert _short(f"ceres-cal calibrate x.json {shown}") == "ceres-cal calibrate x.json --images 0.jpg ..."
     assert _short("ceres-cal detect field 0.jpg 1.jpg -o x") == "ceres-cal detect field 0.jpg 1.jpg -o x"
+
+
+def test_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One calibration of all of them; each is called like its folder, and has a report's photograph of its own."""
+    cameras, out = tmp_path / "cameras", tmp_path / "out"
+    for name, turned in (("left", False), ("right", True)):
+        (cameras / name).mkdir(parents=True)
+        image = np.asarray(cv2.imread(PHOTOGRAPH))
+        cv2.imwrite(str(cameras / name / "0001.png"), image[::-1, ::-1] if turned else image)
+    asked = ["run", str(cameras), "--target", "ssl-b", "--lens", "radial", "--quiet", "-o", str(out)]
+    assert main(asked) == 2
+    assert "say which, such as --facing left.LeftGoalLine=" in capsys.readouterr().err
+    sides = ("--facing", "left.LeftGoalLine=top", "--facing", "right.LeftGoalLine=bottom")
+    main([*asked, *sides, "--to", "opencv", "--to", "paper"])
+    said = capsys.readouterr().out
+    found = Calibration.load(out / "calibration.json")
+    heights = [found.station(name).position[2] for name in ("left", "right")]
+    assert heights[0] == pytest.approx(heights[1], rel=0.01)
+    for made in ("opencv.yml", "left/paper.txt", "right/paper.txt", "report.html", "left/field.json"):
+        assert (out / made).exists(), said
+    assert main([*asked, "--camera", "left"]) == 2
+    assert "--camera names one camera: several are called like their folders" in capsys.readouterr().err
+
+
+def test_a_folder_without_images_names_those_of_its_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "left").mkdir()
+    shutil.copy(PHOTOGRAPH, tmp_path / "left")
+    assert main(["detect", "field", str(tmp_path), "--target", "ssl-b", "--auto", "-o", str(tmp_path / "x.json")]) == 2
+    assert "there are no images in this folder, but in its left" in capsys.readouterr().err

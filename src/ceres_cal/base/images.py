@@ -28,9 +28,12 @@ def image_files(given: Images) -> list[Path]:
 def _files(name: str) -> Iterable[Path]:
     path = Path(name)
     if path.is_dir():
-        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
+        inside = _inside(path)
         if not inside:
-            raise InputError(f"{name}: there are no images in this folder")
+            folders = ", ".join(folder.name for folder in folders_of_cameras([name]))
+            raise InputError(
+                f"{name}: there are no images in this folder{f', but in its {folders}' if folders else ''}"
+            )
         return inside
     if path.exists():
         return [path]
@@ -38,6 +41,18 @@ def _files(name: str) -> Iterable[Path]:
     if not matches:
         raise InputError(f"{name}: no such file")
     return map(Path, matches)
+
+
+def _inside(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
+
+
+def folders_of_cameras(given: Sequence[str]) -> list[Path]:
+    """The folders with images of the one folder that is given, where it has none itself: one for each camera."""
+    path = Path(given[0])
+    if len(given) != 1 or not path.is_dir() or _inside(path):
+        return []
+    return sorted(folder for folder in path.iterdir() if folder.is_dir() and _inside(folder))
 
 
 def images_and_videos(given: Images) -> tuple[list[Path], list[Path]]:

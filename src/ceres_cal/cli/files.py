@@ -62,7 +62,7 @@ def require_shown(
     target: str | None,
     board: str | None,
     priors: Sequence[str],
-    camera: str = "camera",
+    cameras: Sequence[str] = ("camera",),
     lens: str = "auto",
 ) -> Target | None:
     """The field that photographs are to show; InputError, before any is searched, where what is said of it, of the
@@ -78,7 +78,7 @@ def require_shown(
     if board is not None:
         finder_of(checkerboard(*parse_board(board)))
     field = None if target is None else read_target(target, "field")
-    for prior in parse_priors(priors, {"station": [camera], "camera": [camera]}, Options(lens=lens)):
+    for prior in parse_priors(priors, {"station": cameras, "camera": cameras}, Options(lens=lens)):
         bounds: list[Range] = []
         if field is not None and prior.owner == "station":
             bounds = [place_range(field.places, least, "a tenth of the picture")] * len(prior.value)
@@ -245,21 +245,19 @@ def report_photographs(
         detected_in: photographs that the observations were just detected in: a report shows them without being asked.
 
     Raises:
-        InputError: none of the images is called like a frame.
+        InputError: none of the images is called like a frame, or two that may be the same one.
     """
     images = image_files(args.images) if args.images else list(detected_in)
     if not images or args.report is None:
         return None
     from ceres_cal.report import FramePhotographs
-    from ceres_cal.report.pictures.frames import photographs_by_frame
+    from ceres_cal.report.pictures.frames import photographs_of
 
-    paths = photographs_by_frame(images)
-    frames = dict.fromkeys(view.frame for view in observations.views)
-    known = {frame: paths[frame] for frame in frames if frame in paths}
+    known = photographs_of(images, observations)
     if not known:
         raise InputError(
-            f"none of the {len(paths)} images is called like a frame of the observations, such as "
-            f"{next(iter(frames))!r}: --images takes the photographs that were observed"
+            f"none of the {len(images)} images is called like a frame of the observations, such as "
+            f"{observations.views[0].frame!r}: --images takes the photographs that were observed"
         )
     return FramePhotographs(known, before)
 

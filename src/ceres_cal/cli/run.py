@@ -5,17 +5,20 @@ from __future__ import annotations
 import shlex
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.images import IMAGE_ENDINGS, images_and_videos
+from ceres_cal.base.images import IMAGE_ENDINGS, folders_of_cameras, images_and_videos
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
 from ceres_cal.cli.files import attempted, require_shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
+
+if TYPE_CHECKING:
+    from ceres_cal.formats import ExportFormat
 
 _SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
 _MOST_NAMES = 3
@@ -25,11 +28,17 @@ _BLANK = Section("", [""])
 class RunArguments(QuietArguments):
     """What there is, and what is to come of it."""
 
-    images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, a folder of them, or a video")
+    images: tuple[str, ...] = argument(
+        "IMAGE",
+        "photographs of one camera, a folder of them, or a video; or a folder with one such folder for each camera",
+    )
     output: Path = arguments.output_option("everything that is made", metavar="FOLDER")
     target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
     facing: tuple[str, ...] = option(
-        "which way round it is, likewise", "NAME=SIDE", repeatable=True, beside=("target",)
+        "which way round it is, likewise; of several cameras CAMERA.NAME=SIDE",
+        "NAME=SIDE",
+        repeatable=True,
+        beside=("target",),
     )
     not_painted: str = arguments.not_painted_option("lines that this field does not have", beside=("target",))
     board: str | None = option(
@@ -58,45 +67,78 @@ class _Step(Frozen, eq=True):
     "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
     "photographs/ --target ssl-b --facing LeftGoalLine=top --prior height_m=4.02:20mm --to opencv -o camera/",
     "boards.mp4 --board 9x6x25mm -o camera/",
+    "cameras/ --target ssl-b --facing left.LeftGoalLine=left --facing right.LeftGoalLine=left -o field/",
 )
 def _run(args: RunArguments) -> Document:
     from ceres_cal.base.files import make_folder
     from ceres_cal.formats import export_format
 
-    _require_fitting(args)
-    endings = {name: (export_format(name).endings or ("",))[0] for name in args.to}  # or says which there are
-    make_folder(args.output)
-    images = _photographs(args)
-    steps = [*_observed(args, images)]
-    calibrated = _calibrated(args, [step.data for step in steps if "output" in step.data])
+    cameras = _cameras(args)
+    _require_fitting(args, cameras)
+    forms = [export_format(name) for name in args.to]  # or says which there are
+    for one in (args, *cameras):
+        make_folder(one.output)
+    images = [_photographs(one) for one in cameras]
+    steps = list[_Step]()
+    for one, own in zip(cameras, images, strict=True):
+        try:
+            steps += _observed(one, own)
+        except InputError as error:  # reads: "..., such as --facing left.LeftGoalLine=left, ..."
+            if len(cameras) == 1:
+                raise
+            raise InputError(str(error).replace("--facing ", f"--facing {one.camera}.")) from None
+    calibrated = _calibrated(args, cameras, [step.data for step in steps if "output" in step.data])
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
         steps.append(_attempted(args, "advise", [str(args.output / "calibration.json")], most=2))
     asked = [calibrated]
     if level != "no":
-        asked += [_exported(args, name, f"{args.output / name}{ending}") for name, ending in endings.items()]
+        asked += [step for form in forms for step in _exported(args, cameras, form)]
     steps += asked[1:]
-    data = {"images": len(images), "verdict": calibrated.data["verdict"]}
+    data = {"images": sum(map(len, images)), "verdict": calibrated.data["verdict"]}
     data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
     made = level != "no" and not any(step.exit_code for step in asked)
-    sections = Section(data=data), *_sections(args, images, steps, level)
+    sections = Section(data=data), *_sections(args, data["images"], steps, level)
     return Document(sections, 0 if made else 1, data["verdict"]["headline"])
 
 
-def _require_fitting(args: RunArguments) -> None:
+def _cameras(args: RunArguments) -> list[RunArguments]:
+    """What is asked for of each camera: of the one that there is, or of one for each folder of the folder."""
+    folders = folders_of_cameras(args.images)
+    if not folders:
+        return [args]
+    if args.camera != RunArguments.camera:
+        raise InputError("--camera names one camera: several are called like their folders")
+    prefixes = {folder: f"{folder.name}." for folder in folders}
+    of_all = [side for side in args.facing if not side.startswith(tuple(prefixes.values()))]
+    return [
+        replace(
+            args,
+            images=(str(folder),),
+            output=args.output / folder.name,
+            facing=(*of_all, *(side.removeprefix(own) for side in args.facing if side.startswith(own))),
+            camera=folder.name,
+        )
+        for folder, own in prefixes.items()
+    ]
+
+
+def _require_fitting(args: RunArguments, cameras: Sequence[RunArguments]) -> None:
     """Raise InputError, before any photograph is read, for names, sizes and units that no later step would take."""
     from ceres_cal.functions import lines_to_find
 
     if args.target is None and args.board is None:
         raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
     COMMANDS["calibrate"].parse(["observations.json", "--lens", args.lens])
-    images, _ = images_and_videos(args.images)
-    field = require_shown(images, args.target, args.board, args.prior, args.camera, args.lens)
-    if field is not None:
-        lengths = arguments.parse_estimates(args.estimate, {"field": field})
-        sides = arguments.parse_facing(args.facing)
-        lines_to_find(field, sides, arguments.parse_names(args.not_painted), lengths)
+    names = [one.camera for one in cameras]
+    for one in cameras:
+        images, _ = images_and_videos(one.images)
+        field = require_shown(images, args.target, args.board, args.prior, names, args.lens)
+        if field is not None:
+            lengths = arguments.parse_estimates(args.estimate, {"field": field})
+            sides = arguments.parse_facing(one.facing)
+            lines_to_find(field, sides, arguments.parse_names(args.not_painted), lengths)
 
 
 # ---- the steps ------------------------------------------------------------------------------------------------------
@@ -159,28 +201,37 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
         yield _step(args, "detect field", asked, most=1)
 
 
-def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step:
+def _calibrated(args: RunArguments, cameras: Sequence[RunArguments], detected: Sequence[dict[str, Any]]) -> _Step:
     observations = [data["output"] for data in detected]
     priors = arguments.repeated("--prior", args.prior)
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    folders = [str(args.output / video.stem) for video in images_and_videos(args.images)[1]]
-    shown = [name for name in (*args.images, *folders) if Path(name).is_dir() or Path(name).suffix in IMAGE_ENDINGS]
+    folders = [str(one.output / video.stem) for one in cameras for video in images_and_videos(one.images)[1]]
+    given = [name for one in cameras for name in one.images]
+    shown = [name for name in (*given, *folders) if Path(name).is_dir() or Path(name).suffix in IMAGE_ENDINGS]
     images = arguments.repeated("--images", shown)
     asked = [*observations, "--lens", args.lens, *priors, *goal, *images]
     return _step(args, "calibrate", asked, titles=_SHOWN)
 
 
-def _exported(args: RunArguments, form: str, goal: str) -> _Step:
-    return _attempted(args, "export", [str(args.output / "calibration.json"), "--to", form, "-o", goal])
+def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: ExportFormat) -> Iterator[_Step]:
+    """One file, or one for each camera where the format does not hold so many."""
+    ending = (form.endings or ("",))[0]
+    asked = [str(args.output / "calibration.json"), "--to", form.name]
+    if form.holds(len(cameras)):
+        yield _attempted(args, "export", [*asked, "-o", f"{args.output / form.name}{ending}"])
+        return
+    for one in cameras:
+        goal = ["--station", one.camera, "-o", f"{one.output / form.name}{ending}"]
+        yield _attempted(args, "export", [*asked, *goal])
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------
 
 
-def _sections(args: RunArguments, images: Sequence[Path], steps: Sequence[_Step], level: str) -> Iterator[Section]:
+def _sections(args: RunArguments, images: int, steps: Sequence[_Step], level: str) -> Iterator[Section]:
     more = ", ..." if len(args.images) > _MOST_NAMES else ""
     named = ", ".join(args.images[:_MOST_NAMES])
-    yield Section("read", [f"{plural(len(images), 'photograph')} in {named}{more}"])
+    yield Section("read", [f"{plural(images, 'photograph')} in {named}{more}"])
     for number, step in enumerate(steps, start=1):
         yield _BLANK
         yield Section(f"step {number}", [_short(step.command)])

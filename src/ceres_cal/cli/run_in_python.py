@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.images import Images, image_files
+from ceres_cal.base.images import Images
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli.command import COMMANDS
@@ -32,12 +32,14 @@ def run(
     to: Sequence[str] = (),
     frames: int = 30,
 ) -> Calibration:
-    """Calibrate a camera from photographs or a video in one call, as `ceres-cal run` does.
+    """Calibrate one camera or several from photographs or videos in one call, as `ceres-cal run` does.
 
     Args:
-        images: photographs of one camera, a folder of them, or a video. output: folder for everything that is made.
+        images: photographs of one camera, a folder of them, or a video; or a folder with one such folder for each
+            camera. output: folder for everything that is made.
         target: the field, such as `ssl_field("B")` or "ssl-b". board: a checkerboard, such as "9x6x25mm".
-        facing: which way round the field is, such as {"LeftGoalLine": "top"}. not_painted: lines that it lacks.
+        facing: which way round the field is, such as {"LeftGoalLine": "top"}, of several cameras
+            {"left.LeftGoalLine": "top"}. not_painted: lines that it lacks.
         lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to solve for.
         to: formats to export to. frames: how many photographs to take out of a video.
 
@@ -45,7 +47,7 @@ def run(
         InputError: an argument does not fit, or no photograph shows the target. SolutionError: no usable camera.
     """
     given = RunArguments(
-        images=tuple(map(str, image_files(images))),
+        images=(str(images),) if isinstance(images, str | PathLike) else tuple(map(str, images)),
         output=Path(output),
         target=json.dumps(target.spec) if isinstance(target, Target) else target,
         facing=tuple(f"{name}={side}" for name, side in (facing or {}).items()),

@@ -156,6 +156,6 @@ def _at_focal_length_1(camera: Any) -> list[float]:
 
 
 FORMATS = (
-    ExportFormat("colmap", "COLMAP's text model: cameras, rig, frame, images", (), _export, several_stations=True),
+    ExportFormat("colmap", "COLMAP's text model: cameras, rig, frame, images", (), _export, most_stations=None),
     ImportFormat("colmap", "a folder with COLMAP's model", (), lambda content: not content, _read),
 )

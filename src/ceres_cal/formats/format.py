@@ -100,15 +100,19 @@ class ExportFormat(Struct, frozen=True):
         endings: that its file may have, the usual one first; none where it is a folder of files.
         export: makes it; raises InputError where the calibration cannot be said in the format. Its options are what it
             takes by keyword: each Annotated[type, help], with a default; on the command line --error-mm for error_mm.
-        several_stations: whether a file holds any number of stations. edits: whether an existing file is edited.
+        most_stations: that a file holds, None of any number. edits: whether an existing file is edited.
     """
 
     name: str
     description: str
     endings: tuple[str, ...]
     export: Callable[..., Exported]
-    several_stations: bool = False
+    most_stations: int | None = 1
     edits: bool = False
+
+    def holds(self, stations: int) -> bool:
+        """Whether a file holds so many stations."""
+        return self.most_stations is None or stations <= self.most_stations
 
     @property
     def options(self) -> dict[str, tuple[Any, str]]:

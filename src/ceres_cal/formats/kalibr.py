@@ -120,6 +120,6 @@ def _distort(model: str, own: Array, bent: str, coefficients: Array) -> Callable
 
 _ABOUT = ("kalibr", "Kalibr's camchain", (".yaml", ".yml"))
 FORMATS = (
-    ExportFormat(*_ABOUT, _export, several_stations=True),
+    ExportFormat(*_ABOUT, _export, most_stations=None),
     ImportFormat(*_ABOUT, lambda content: b"camera_model" in content, _read),
 )

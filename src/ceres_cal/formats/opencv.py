@@ -41,8 +41,6 @@ _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height
 def _export(request: ExportRequest) -> Exported:
     import cv2
 
-    if len(request.stations) > 2:
-        raise InputError(f"OpenCV's files hold one camera or two, not {len(request.stations)}: name the stations")
     cameras, losses = as_foreign(request, opencv_models)
     entries = _mono(cameras[0], losses[0]) if len(cameras) == 1 else _stereo(cameras)
     storage = cv2.FileStorage(request.ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -225,6 +223,6 @@ def _recognises(content: bytes) -> bool:
 
 _WRITTEN = "OpenCV's FileStorage of one camera, or of two as stereo"
 FORMATS = (
-    ExportFormat("opencv", _WRITTEN, _ENDINGS, _export, several_stations=True),
+    ExportFormat("opencv", _WRITTEN, _ENDINGS, _export, most_stations=2),
     ImportFormat("opencv", "OpenCV's FileStorage", _ENDINGS, _recognises, _read),
 )

@@ -142,15 +142,15 @@ def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat
 
 
 def _stations(calibration: Calibration, form: ExportFormat, names: Sequence[str] | None) -> tuple[str, ...]:
-    if names is None:
-        if not form.several_stations:
-            calibration.station()  # it complains where there are several
-        return tuple(calibration.stations)
-    for name in names:
+    if names is None and form.most_stations == 1:
+        calibration.station()  # it complains where there are several
+    chosen = tuple(calibration.stations) if names is None else tuple(names)
+    for name in chosen:
         calibration.station(name)
-    if len(names) != 1 and not form.several_stations:
-        raise InputError(f"a file of format {form.name} holds one station, not {len(names)}: name one")
-    return tuple(names)
+    if not form.holds(len(chosen)):
+        most = "one station" if form.most_stations == 1 else f"{form.most_stations} stations at most"
+        raise InputError(f"a file of format {form.name} holds {most}, not {len(chosen)}: say which")
+    return chosen
 
 
 def _ending(form: ExportFormat, path: Path) -> str:

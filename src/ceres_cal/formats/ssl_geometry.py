@@ -122,8 +122,8 @@ _PACKET, _GEOMETRY_YML = "the league's geometry message", "vision-processor's ge
 _EDITED = "; a file that is there is edited"
 _WRITTEN = f"{_PACKET} (SSL_GeometryData, protobuf){_EDITED}"
 FORMATS = (
-    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export_packet, several_stations=True, edits=True),
-    ExportFormat(_YAML_NAME, _GEOMETRY_YML + _EDITED, _YAML, _export_yaml, several_stations=True, edits=True),
+    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export_packet, most_stations=None, edits=True),
+    ExportFormat(_YAML_NAME, _GEOMETRY_YML + _EDITED, _YAML, _export_yaml, most_stations=None, edits=True),
     ImportFormat(_NAME, _PACKET, _ENDINGS, _recognises_packet, _read),
     ImportFormat(_YAML_NAME, _GEOMETRY_YML, _YAML, lambda content: b"field_length" in content, _read),
 )

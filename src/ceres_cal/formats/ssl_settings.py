@@ -243,6 +243,6 @@ def _shape(group: Mapping[str, _Var]) -> dict[str, Any]:
 _NAME, _FILE, _ENDINGS = "ssl-vision-xml", "ssl-vision's robocup-ssl.xml", (".xml",)
 _WRITTEN = f"{_FILE}, edited in place"
 FORMATS = (
-    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export, several_stations=True, edits=True),
+    ExportFormat(_NAME, _WRITTEN, _ENDINGS, _export, most_stations=None, edits=True),
     ImportFormat(_NAME, _FILE, _ENDINGS, lambda content: b"<VarXML" in content, _read),
 )

@@ -29,8 +29,8 @@ def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter
         InputError: an image cannot be read, or has not the size of its camera.
     """
     every = frames_of(material.observations)
-    frames = [frame for frame in every if frame.name in photographs.paths]
-    without = [frame.name for frame in every if frame.name not in photographs.paths]
+    frames = [frame for frame in every if (frame.name, frame.station) in photographs.paths]
+    without = [frame.name for frame in every if frame not in frames]
     chosen = _chosen(material, frames)
     notes = [Text(_READING)]
     if without:
@@ -66,7 +66,7 @@ def _rms_px(material: Material, frame: Frame) -> float:
 
 def _picture(material: Material, photographs: FramePhotographs, frame: Frame, number: int) -> PhotoFigure:
     widest_px, most_bytes = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
-    calibration, path = material.calibration, photographs.paths[frame.name]
+    calibration, path = material.calibration, photographs.paths[frame.name, frame.station]
     model = model_of(calibration, frame)
     owner = calibration.estimate.stations[frame.station].camera
     photograph = read_photograph(path, model.image_size, owner)

@@ -37,14 +37,14 @@ class ClosedForm(Struct, frozen=True, eq=False):
 
 
 class FramePhotographs(Struct, frozen=True, eq=False):
-    """Photographs by the names of their frames, and the calibration to compare with.
+    """Photographs by the names of their frames and stations, and the calibration to compare with.
 
     Attributes:
-        paths: frame -> image file. before: an earlier calibration, drawn in cyan; None for the closed form, where there
-            is one.
+        paths: frame, station -> image file. before: an earlier calibration, drawn in cyan; None for the closed form,
+            where there is one.
     """
 
-    paths: Mapping[str, Path]
+    paths: Mapping[tuple[str, str], Path]
     before: Calibration | None = None
 
 

@@ -69,17 +69,27 @@ def frame_by_name(calibration: Calibration, station: str, name: str) -> Frame:
     return Frame(name, station, tuple(shown))
 
 
-def photographs_by_frame(images: Iterable[Path]) -> dict[str, Path]:
-    """Image files by their stem, which is their frame's name.
+def photographs_of(images: Iterable[Path], observations: Observations) -> dict[tuple[str, str], Path]:
+    """The image file of each frame and station that is called like the frame. Where folders are called like stations or
+    cameras, each has its own.
 
     Raises:
-        InputError: two images of one stem.
+        InputError: two images for one frame of a station.
     """
-    by_frame: dict[str, Path] = {}
-    for path in images:
-        if by_frame.setdefault(frame_of(path), path) != path:
-            raise InputError(f"{path}: has the same name as {by_frame[frame_of(path)]}: give the images of one folder")
-    return by_frame
+    known, every = dict[tuple[str, str], Path](), list(images)
+    owners = {view.station: {view.station, view.camera} for view in observations.views}
+    for view in observations.views:
+        for path in (one for one in every if frame_of(one) == view.frame):
+            named = set(path.parent.parts).intersection(*[set().union(*owners.values())])
+            if named and not named & owners[view.station]:
+                continue
+            if known.setdefault((view.frame, view.station), path) != path:
+                other = known[view.frame, view.station]
+                raise InputError(
+                    f"{path}: has the same name as {other}: give the images of one folder, or of one for each camera "
+                    "that is called like it"
+                )
+    return known
 
 
 def model_of(calibration: Calibration, frame: Frame, height_m: float = 0.0) -> Model:
