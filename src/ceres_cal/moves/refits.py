@@ -96,7 +96,7 @@ def refit(
             raise
         raise SolutionError(f"{stated[0]}; or else {error}") from None
     _require_known(plan, result)
-    result, explanation = _with_other_lenses(plan, result), _explained(plan, result)
+    result, explanation = _as_known(plan, _with_other_lenses(plan, result)), _explained(plan, result)
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
     if calibration.digest == observations.digest:
         seen = calibration.refitted.digests if calibration.refitted else ()
@@ -210,21 +210,52 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     sights = gather_sights(plan.sights.observations.part(*result.inlier_masks(plan.sights.observations)))
     problem, layout = refit_problem(plan, "pose-only", result.estimate)
     followed = result.posterior.followed  # where a valley says what phi may be
-    free = {name: own[own == 0] if name not in followed else own[:0] for name, own in layout.free.items()}
+    unfollowed = plan.moved_cameras - set(followed)
+    free = {name: own[own == 0] if name in unfollowed else own[:0] for name, own in layout.free.items()}
     layout, weighting = replace(layout, stations=plan.moved, free=free), Weighting(*result.fit.scales)
     problem = replace(problem, sights=sights, layout=layout, priors=(), weighting=weighting)
     # Each with the numbers it had, the chosen one as well: what the new observations add is not what they differ by.
-    seen, weights = [], []
-    for lens, weight in zip(known.lenses, (1.0, *known.lens_weights), strict=True):
-        cameras = {name: lens.cameras[name] for name in plan.moved_cameras}
-        # quiet: a lens that sees the new observations from nowhere is none
-        found = solved_soon(problem, replace(result.estimate, cameras={**result.cameras, **cameras}))
-        if found is not None:
-            seen.append(found.estimate)
-            weights.append(weight)
+    stays = plan.stays & result.stations.keys()
+    starts = [
+        replace(
+            result.estimate,
+            cameras={name: lens.cameras[name] for name in result.cameras},
+            stations={**result.estimate.stations, **{name: lens.stations[name] for name in stays}},
+        )
+        for lens in known.lenses
+    ]
+    # quiet: a lens that sees the new observations from nowhere says nothing of what moved
+    found = [solved_soon(problem, start) for start in starts]
+    here = {name: result.cameras[name] for name in plan.moved_cameras}
+    seen = [
+        replace(start, cameras={**start.cameras, **here}) if end is None else end.estimate
+        for start, end in zip(starts, found, strict=True)
+    ]
     reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in plan.moved_cameras}
-    lenses = OtherLenses(seen[0], tuple(seen[1:]), tuple(weights[1:]), reach_px)
+    lenses = OtherLenses(seen[0], tuple(seen[1:]), known.lens_weights, reach_px)
     return replace(result, posterior=with_other_lenses(result.posterior, result.estimate, lenses))
+
+
+def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
+    """With cameras that were not observed as they were, and all that was known of them: one normal distribution was
+    their prior, and that is wider.
+    """
+    kept = [name for name in result.cameras if name not in plan.stations.values()]
+    if result.posterior is None or not kept:
+        return result
+    before, known = plan.calibration.estimate, plan.calibration.uncertainty.posterior
+    stations = {name: before.stations[name] for name in plan.stays if before.stations[name].camera in kept}
+    estimate = replace(
+        result.estimate,
+        cameras={**result.cameras, **{name: before.cameras[name] for name in kept}},
+        stations={**result.estimate.stations, **stations},
+    )
+    mixtures = dict(result.posterior.mixtures)
+    for name in kept:
+        owners = {("camera", name), *(("station", one) for one, its in stations.items() if its.camera == name)}
+        own = known.mixture(name).marginal([key for key in result.posterior.keys if key[:2] in owners])
+        mixtures[name] = own if result.posterior.lenses else replace(own, lenses={})
+    return replace(result, estimate=estimate, posterior=replace(result.posterior, mixtures=mixtures))
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:

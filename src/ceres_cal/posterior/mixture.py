@@ -111,6 +111,13 @@ class Mixture(Frozen):
         numbers = {"weights": weights, "steps": self.steps[own], "at": self.at[own]}
         return replace(self, **numbers, chains=chains, lenses={})
 
+    def marginal(self, keys: Sequence[Key]) -> Mixture:
+        """What some of the numbers may be, in their order here."""
+        wanted = set(keys)
+        at = [number for number, key in enumerate(self.keys) if key in wanted]
+        each = tuple(one.marginal([key for key in one.keys if key in wanted]) for one in self.information)
+        return replace(self, keys=tuple(self.keys[number] for number in at), steps=self.steps[:, at], information=each)
+
     @cached_property
     def variances(self) -> Array:
         """(C, K) within each component; 0 of what is held there, infinite where unknown."""

@@ -32,9 +32,9 @@ class Posterior(Frozen):
             equations have it, with the second moments of what else may be true. A refit and a check take `normal`.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
-        mixtures: camera -> what it and its stations may be, where its phi was followed along its profile; "" -> what
-            everything else may be, where that is no one normal distribution. Standard deviations, bounds and maps are
-            read off these.
+        mixtures: camera -> what it and its stations may be, where its phi was followed along its profile, or a refit
+            left it as it was; "" -> what everything else may be, where that is no one normal distribution. Standard
+            deviations, bounds and maps are read off these.
         lenses: the estimate with the chosen lens and those with others that predict as well, from the same
             observations: what components of the mixtures that are another lens show.
         stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
@@ -198,10 +198,8 @@ class Posterior(Frozen):
 
     @property
     def _read(self) -> Iterator[Mixture]:
-        """Mixtures, those of cameras whose phi was followed last."""
-        if "" in self.mixtures:
-            yield self.mixtures[""]
-        yield from (self.mixtures[name] for name in self.followed)
+        """Mixtures, those of single cameras last."""
+        yield from (self.mixtures[name] for name in sorted(self.mixtures, key=bool))
 
     @cached_property
     def factors(self) -> Array:

@@ -88,14 +88,14 @@ def _numbers(estimate: Estimate, first: str, second: str) -> Array:
 def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], grid: FieldGrid) -> FieldMap:
     """Predicted disagreement of two stations about places that both see, over a grid; `station` names both.
 
-    What they have in common (one field, one camera, shared boards) is taken into account, but for cameras whose phi is
-    followed along its profile: those count as independent.
+    What they have in common (one field, one camera, shared boards) is taken into account, but for cameras of which is
+    known more than a normal distribution says, as where phi is followed: those count as independent.
 
     Raises:
         InputError: see `maps.station_keys`.
     """
     both = " - ".join(pair)
-    if {estimate.stations[s].camera for s in pair if s in estimate.stations} & set(posterior.followed):
+    if {estimate.stations[s].camera for s in pair if s in estimate.stations} & posterior.mixtures.keys():
         a, b = (field_map(estimate, posterior, station, grid) for station in pair)
         sd_mm, radius_mm = np.hypot(a.sd_mm, b.sd_mm), np.hypot(a.radius_95_mm, b.radius_95_mm)
         return replace(a, station=both, sd_mm=sd_mm, radius_95_mm=radius_mm)
