@@ -18,7 +18,7 @@ from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.saddles import REACH, Saddles, is_begun_dark, measure_saddles
+from ceres_cal.detect.saddles import REACH, Saddles, is_begun_dark, measure_saddles, steps_px
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
@@ -205,8 +205,7 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
     if not found and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
         from ceres_cal.detect.partly import part_of_board
 
-        part = part_of_board(image, seed, columns, rows)
-        return _placing(part)
+        return _placing(part_of_board(image, seed, columns, rows))
     if not found:
         return f"no chessboard of {columns} x {rows} inner corners found"
     seen, saddles = max(found, key=lambda one: np.count_nonzero(np.isfinite(one[1].contrast)))
@@ -217,13 +216,11 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
 
 def _subpixel(image: Image8, grid: Array) -> Array:
     """OpenCV's sub-pixel corners, in a window that holds no other corner."""
-    steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1, 2) for axis in (0, 1)])
-    half = int(np.clip(np.min(np.linalg.norm(steps, axis=1)) / 3.0, 2, _SUBPIX_HALF_WINDOW_PX))
+    half = int(np.clip(np.min(steps_px(grid)) / 3.0, 2, _SUBPIX_HALF_WINDOW_PX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     corners = grid.reshape(-1, 1, 2).astype(np.float32)
-    return np.asarray(cv2.cornerSubPix(image, corners, (half, half), (-1, -1), criteria), dtype=float).reshape(
-        grid.shape
-    )
+    refined = cv2.cornerSubPix(image, corners, (half, half), (-1, -1), criteria)
+    return np.asarray(refined, dtype=float).reshape(grid.shape)
 
 
 def right_handed(grid: Array) -> Array:
@@ -292,20 +289,14 @@ def _places_in(image: Image8, scaled: Image8, corners: AnyArray) -> Array:
     return np.asarray((corners.reshape(-1, 2).astype(float) + 0.5) * ratio - 0.5)
 
 
-def _scales(shape: tuple[int, ...]) -> Iterator[float]:
+def _scales(shape: tuple[int, ...]) -> list[float]:
     height, width = shape
     # OpenCV turns the picture by 45 degrees, into a square that a long one hardly fills.
     pixels = max(height * width, (height + width) ** 2 // _LONG)
-    every = _scales_of(pixels)
-    yield from (scale for scale in every if scale * min(shape) >= _LEAST_SIDE_PX)
-
-
-def _scales_of(pixels: int) -> Iterator[float]:
-    if pixels > _LARGE_PX:
-        yield float(np.sqrt(_LARGE_PX / pixels))
-    yield min(1.0, float(np.sqrt(_MOST_PX / pixels)))
-    if pixels <= _SMALL_PX:
-        yield 2.0
+    first = [(_LARGE_PX / pixels) ** 0.5] if pixels > _LARGE_PX else []
+    last = [2.0] if pixels <= _SMALL_PX else []
+    every = (*first, min(1.0, (_MOST_PX / pixels) ** 0.5), *last)
+    return [scale for scale in every if scale * min(shape) >= _LEAST_SIDE_PX]
 
 
 def _measured_charuco(
@@ -316,12 +307,10 @@ def _measured_charuco(
         return "no ChArUco corners found"
     grid = np.full((rows * columns, 2), np.nan)
     grid[ids.ravel()] = corners.reshape(-1, 2)
-    seen = _enough(grid.reshape(rows, columns, 2))
-    if isinstance(seen, str):
-        return seen
     # The disc around a corner must end before the markers on both sides of it begin.
     reach = min(REACH, float(np.sqrt(2.0)) * margin)
-    return _enough(measure_saddles(image, seen, reach).grid)
+    seen = _enough(grid.reshape(rows, columns, 2))
+    return seen if isinstance(seen, str) else _enough(measure_saddles(image, seen, reach).grid)
 
 
 def _placing(found: Array | str) -> Array | str:

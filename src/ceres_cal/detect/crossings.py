@@ -49,12 +49,9 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
     on_curve_m = 1e-6
     used = np.zeros(len(lines.course), dtype=bool)
     features, pixels, sigmas = [], [], []
-    seen = [
-        (int(number), target.curves[target.curve_names[number]])
-        for number in np.unique(lines.course.curve[lines.found])
-    ]
+    shapes, seen = list(target.curves.values()), np.unique(lines.course.curve[lines.found]).tolist()
     for number, point in enumerate(target.point_array):
-        curves = [curve for curve, shape in seen if distance_to_curve(shape, point[None])[0] < on_curve_m]
+        curves = [curve for curve in seen if distance_to_curve(shapes[curve], point[None])[0] < on_curve_m]
         branches = [b for curve in curves if (b := _branch(target, camera, lines, curve, point, used)) is not None]
         met = _met(branches)
         if met is None:

@@ -256,16 +256,13 @@ def _neighbours(values: Array, curve: Indices32) -> Array:
 
 def _medians(values: Array, curve: Indices32) -> Array:
     """(N,) the median of each place's neighbours, its own value where there are none."""
-    around = np.column_stack([_neighbours(values, curve), values])
-    around[np.all(np.isnan(around), axis=1), 0] = 0.0
-    return medians_known(around)
+    return medians_known(np.column_stack([_neighbours(values, curve), values]))
 
 
 def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
     """Of the places found, those that lie where their neighbours say; a place without any is not believed."""
     around = _neighbours(np.where(found, offset, np.nan), course.curve)
     alone = np.count_nonzero(np.isfinite(around), axis=1) < 2
-    around[np.all(np.isnan(around), axis=1), 0] = 0.0
     middle = medians_known(around)
     # Paint that wanders is still paint: what its neighbours do among themselves, it may do too.
     wander = medians_known(np.abs(around - middle[:, None])) / 0.6745

@@ -90,9 +90,8 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
     whole = Windows(windows.values[inside], windows.distance[inside], inside[inside])
     fits = fit_profiles(windows, edge, fit_shape(whole, edge[inside], EdgeShape(1.0)).blur_px, 0.5 * half_px)
     offsets = np.where(fits.heights[:, 0] > 0.0, fits.offset_px, np.nan).reshape(4, count)
-    sides = [
-        _side(2.0 * share - 1.0, *side) for side in zip(offsets, fits.sigma_px.reshape(4, count), lengths, strict=True)
-    ]
+    every = zip(offsets, fits.sigma_px.reshape(4, count), lengths, strict=True)
+    sides = [_side(2.0 * share - 1.0, *side) for side in every]
     return None if any(side is None for side in sides) else np.array(sides)
 
 

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Image, Mask, medians_known
-from ceres_cal.detect.saddles import Saddles, fit_saddles, is_begun_dark, measure_saddles
+from ceres_cal.detect.saddles import Saddles, fit_saddles, is_begun_dark, measure_saddles, steps_px
 
 # Of the contrast, root mean square: where the board ends dark squares meet the margin, which no saddle describes.
 _MISFIT = 0.25
@@ -31,7 +31,7 @@ def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array |
         seed: (h, w, 2) px, right-handed: some neighbouring corners of the board, about where they are.
     """
     grown = _grown(image, seed, max(columns, rows))
-    if np.isnan(_steps(grown.grid)).all():
+    if np.isnan(steps_px(grown.grid)).all():
         return f"no chessboard of {columns} x {rows} inner corners found, but squares without neighbours"
     places = list(_places(grown, image.shape, columns, rows))
     if len({missing for missing, _ in places}) != 1:
@@ -91,22 +91,14 @@ def _foreseen(grid: Array) -> Array:
     lines = [[_shifted(grid, axis, step * k) for k in (1, 2, 3)] for axis in (0, 1) for step in (1, -1)]
     bent = np.array([3.0 * first - 3.0 * second + third for first, second, third in lines])
     straight = np.array([2.0 * first - second for first, second, _ in lines])
-    return np.where(np.all(np.isnan(bent), axis=0), _mean(straight), _mean(bent))
-
-
-def _mean(guesses: Array) -> Array:
-    """Over the first axis, of what is known; NaN where nothing is."""
-    known = ~np.isnan(guesses)
-    count = np.sum(known, axis=0)
-    return np.asarray(np.where(count > 0, np.nansum(guesses, axis=0) / np.maximum(count, 1), np.nan))
+    known = np.where(np.all(np.isnan(bent), axis=0), straight, bent)
+    return np.asarray(np.ma.masked_invalid(known).mean(axis=0).filled(np.nan))
 
 
 def _shifted(values: Array, axis: int, by: int) -> Array:
     """The values of the neighbours `by` places before; NaN beyond the ends."""
-    moved = np.full(values.shape, np.nan)
-    here, there = [slice(None)] * values.ndim, [slice(None)] * values.ndim
-    here[axis], there[axis] = (slice(by, None), slice(None, -by)) if by > 0 else (slice(None, by), slice(-by, None))
-    moved[tuple(here)] = values[tuple(there)]
+    moved = np.roll(values, by, axis)
+    moved.swapaxes(0, axis)[slice(by) if by > 0 else slice(by, None)] = np.nan
     return moved
 
 
@@ -150,11 +142,5 @@ def _places(seen: Saddles, shape: tuple[int, ...], columns: int, rows: int) -> I
 def _ends(grid: Array, shape: tuple[int, ...], axis: int, end: int) -> bool:
     """Whether the next line of corners on a side would be well in the picture: there is none, so the board ends."""
     wider = np.pad(grid, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-    clear_px = _CLEAR * float(medians_known(_steps(grid)))
+    clear_px = _CLEAR * float(medians_known(steps_px(grid)))
     return bool(np.any(_inside(np.take(_foreseen(wider), end, axis=axis), shape, clear_px)))
-
-
-def _steps(grid: Array) -> Array:
-    """(K,) px between neighbouring corners, NaN where one is not seen."""
-    steps: Array = np.linalg.norm(np.concatenate([np.diff(grid, axis=n).reshape(-1, 2) for n in (0, 1)]), axis=1)
-    return steps

@@ -95,10 +95,8 @@ def cut_windows(
     """
     height, width = image.shape
     level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])  # the curve is rather level: columns cross it
-    along = np.where(level, places[:, 0], places[:, 1])
-    across = np.where(level, places[:, 1], places[:, 0])
-    n_along = np.where(level, normals[:, 0], normals[:, 1])
-    n_across = np.where(level, normals[:, 1], normals[:, 0])
+    along, across = np.where(level, places.T, places.T[::-1])
+    n_along, n_across = np.where(level, normals.T, normals.T[::-1])
     u = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1)  # (N, U)
     middle = np.round(across[:, None] - (u - along[:, None]) * (n_along / n_across)[:, None])
     reach = int(np.ceil(1.2 * half_length_px))  # a slanted line is longer along the column
@@ -150,16 +148,15 @@ def fit_profiles(
     freedom = windows.values.shape[1] - columns.shape[1]
     misfit = np.maximum(_misfit(squares, normal, right, solution), 0.0)
     noise = np.sqrt(misfit / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
-    sigma = noise * np.sqrt(np.maximum(_last_of_inverse(normal + known), 0.0))
+    sigma = noise * np.sqrt(np.maximum(np.linalg.inv(normal + known + _ridge(normal + known))[:, -1, -1], 0.0))
     good = windows.inside & (np.abs(step) < 0.05) & (np.abs(offset) <= reach_px) & np.isfinite(sigma) & (sigma > 0.0)
     return Profiles(np.where(good, offset, np.nan), np.where(good, sigma, np.inf), heights, noise)
 
 
 def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Array:
     """(N,) squared residuals of any solution of the normal equations, or of none of them."""
-    return np.asarray(
-        squares - np.sum(solution * (2.0 * right - np.matmul(normal, solution[:, :, None])[:, :, 0]), axis=1)
-    )
+    explained = np.matmul(normal, solution[:, :, None])[:, :, 0]
+    return np.asarray(squares - np.sum(solution * (2.0 * right - explained), axis=1))
 
 
 def fit_shape(
@@ -287,9 +284,3 @@ def _ridge(normal: Array) -> Array:
 
 def _solve(normal: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(normal + _ridge(normal), right[:, :, None])[:, :, 0])
-
-
-def _last_of_inverse(normal: Array) -> Array:
-    unit = np.zeros(normal.shape[1])
-    unit[-1] = 1.0
-    return _solve(normal, np.broadcast_to(unit, normal.shape[:2]))[:, -1]

@@ -25,6 +25,7 @@ from ceres_cal.scene.targets import Target, rings
 
 TARGET_NAME = "rings"
 RAYS = 360
+_ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS  # (RAYS,) in which they go out from the centre
 _STEP_PX = 0.5
 # Share of the rays on which a ring must be seen (of those that reach it inside the image). Nothing changes from half
 # to double.
@@ -106,12 +107,10 @@ class _Track(Frozen):
         return np.asarray(_waves(angle) @ self.series)
 
 
-def _waves(angle: Array) -> Array:
+def _waves(angle: Array, harmonics: int = _HARMONICS) -> Array:
     """(N, 1 + 2 harmonics) 1, cos, cos 2, ..., sin, sin 2, ..."""
-    orders = np.arange(1, _HARMONICS + 1) * angle[:, None]
-    return np.column_stack(
-        [np.ones(len(angle)), *np.hsplit(np.cos(orders), _HARMONICS), *np.hsplit(np.sin(orders), _HARMONICS)]
-    )
+    orders = np.arange(1, harmonics + 1) * angle[:, None]
+    return np.column_stack([np.ones(len(angle)), np.cos(orders), np.sin(orders)])
 
 
 def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
@@ -120,19 +119,18 @@ def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
     One more than `most` is an error.
     """
     least_spacing_px = 3.0
-    angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
-    slope, reach = _slopes(grey, centre, angle)
+    slope, reach = _slopes(grey, centre)
     limit = 0.25 * float(np.quantile(np.abs(slope[np.isfinite(slope)]), 0.995))
     tracks: list[_Track] = []
     while True:
-        inner = tracks[-1].radius(angle) + 1.5 if tracks else np.full(RAYS, 2.0)
+        inner = tracks[-1].radius(_ANGLES) + 1.5 if tracks else np.full(RAYS, 2.0)
         before = _next_edges(slope, inner, limit, None if not tracks else not tracks[-1].rises)
-        track = _smooth(before, angle, reach)
+        track = _smooth(before, reach)
         if track is None:
             break
         if len(tracks) == most:
             raise InputError(f"more than {most} rings found, for {most} radii: give the radius of every edge")
-        if tracks and np.median(track.radius(angle) - tracks[-1].radius(angle)) < least_spacing_px:
+        if tracks and np.median(track.radius(_ANGLES) - tracks[-1].radius(_ANGLES)) < least_spacing_px:
             break
         tracks.append(track)
     if len(tracks) < min(3, most):
@@ -140,12 +138,12 @@ def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
     return tracks
 
 
-def _slopes(grey: Array32, centre: Array, angle: Array) -> tuple[Array, Array]:
+def _slopes(grey: Array32, centre: Array) -> tuple[Array, Array]:
     """(RAYS, N) change of the light along each ray, NaN outside the image, and (RAYS,) how far it stays inside, px."""
     height, width = grey.shape
     steps = np.arange(0.0, float(np.hypot(height, width)), _STEP_PX)
-    x = centre[0] + np.cos(angle)[:, None] * steps
-    y = centre[1] + np.sin(angle)[:, None] * steps
+    x = centre[0] + np.cos(_ANGLES)[:, None] * steps
+    y = centre[1] + np.sin(_ANGLES)[:, None] * steps
     soft = cv2.GaussianBlur(grey, (0, 0), 0.8)
     light = cv2.remap(
         soft, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
@@ -174,7 +172,7 @@ def _next_edges(slope: Array, inner: Array, limit: float, rises: bool | None) ->
     return np.where(peak.any(axis=1), first * _STEP_PX, np.nan), rises
 
 
-def _smooth(edges: tuple[Array, bool], angle: Array, reach: Array) -> _Track | None:
+def _smooth(edges: tuple[Array, bool], reach: Array) -> _Track | None:
     """The smooth course of most of the edges; None where too few rays have one."""
     radius, rises = edges
     seen = np.isfinite(radius)
@@ -182,7 +180,7 @@ def _smooth(edges: tuple[Array, bool], angle: Array, reach: Array) -> _Track | N
         return None
     usual = float(np.median(radius[seen]))
     used = seen & (np.abs(radius - usual) < 0.15 * usual + 2.0)
-    waves, series = _waves(angle), np.zeros(1 + 2 * _HARMONICS)
+    waves, series = _waves(_ANGLES), np.zeros(1 + 2 * _HARMONICS)
     pull = np.diag([0.0] + [1e-2] * (2 * _HARMONICS)) * RAYS  # stretches without an edge must not swing
     for limit in (6.0, 3.0, 2.0, 2.0, 2.0):
         if np.count_nonzero(used) < 8:
@@ -201,8 +199,7 @@ def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], ex
         return
     means = np.array([track.series[0] for track in tracks])
     following = means[-1] + (means[-1] - means[-2])
-    angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
-    place = centre + following * np.column_stack([np.cos(angle), np.sin(angle)])
+    place = centre + following * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
     inside = np.all((place > 5.0) & (place < np.array(grey.shape[::-1]) - 6.0), axis=1)
     if np.mean(inside) > 0.5:
         raise InputError(
@@ -223,17 +220,16 @@ class _Edges(Rows):
 
 
 def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[_Edges, float]:
-    angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
-    radii = np.array([track.radius(angle) for track in tracks])
+    radii = np.array([track.radius(_ANGLES) for track in tracks])
     # A window ends before the next edge begins, and neighbouring windows of a ring do not overlap.
     gap = np.min(np.diff(np.vstack([np.zeros(RAYS), radii, 2.0 * radii[-1] - radii[-2]]), axis=0), axis=1)
     parts, blurs = [], []
     for number, (track, mean) in enumerate(zip(tracks, radii, strict=True)):
         every = max(1, int(np.ceil((2 * _HALF_WIDTH_PX + 2) * RAYS / (2.0 * np.pi * float(mean.min())))))
         half = min(_HALF_LENGTH_PX, 0.5 * float(min(gap[number], gap[number + 1])) - 0.5)
-        measured = _measured_ring(grey, centre, track, angle[::every], max(half, 2.0))
+        measured = _measured_ring(grey, centre, track, _ANGLES[::every], max(half, 2.0))
         blurs.append(measured[2])
-        parts.append((np.full(len(angle[::every]), number, np.int32), *measured[:2]))
+        parts.append((np.full(len(_ANGLES[::every]), number, np.int32), *measured[:2]))
     ring, pixels, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
     radius = np.linalg.norm(pixels - centre, axis=1)
     kept, factor = _usual(ring, radius, sigma, np.arctan2(*(pixels - centre).T[::-1]))
@@ -267,13 +263,11 @@ def _usual(ring: Indices32, radius: Array, sigma: Array, angle: Array) -> tuple[
     kept, pulls = np.isfinite(radius), [np.zeros(0)]
     for number in range(int(ring.max()) + 1):
         rows = np.flatnonzero(kept & (ring == number))
-        columns = 1 + 2 * min(_HARMONICS, max((len(rows) - 4) // 4, 0))
-        order = [0, *(i for k in range((columns - 1) // 2) for i in (1 + k, 1 + _HARMONICS + k))]
-        used = rows
+        waves = _waves(angle[rows], min(_HARMONICS, max((len(rows) - 4) // 4, 0)))
+        columns, used = waves.shape[1], rows
         for _ in range(4):
             if len(used) <= columns:
                 break
-            waves = _waves(angle[rows])[:, order]
             inside = np.isin(rows, used)
             series = np.linalg.lstsq(waves[inside] / sigma[used, None], radius[used] / sigma[used], rcond=None)[0]
             pull = (radius[rows] - waves @ series) / sigma[rows]
@@ -303,11 +297,7 @@ def _polynomial(edges: _Edges, centre: Array, radii_m: Array) -> tuple[Array, fl
     angle, share = np.arctan2(*(edges.pixels - centre).T[::-1]), edges.radius / unit
     once = np.power.outer(share, np.arange(6))
     twice = np.power.outer(share, np.arange(1, 5))
-    turning = [
-        wave[:, None] * powers
-        for n, powers in ((1, once), (2, twice))
-        for wave in (np.cos(n * angle), np.sin(n * angle))
-    ]
+    turning = [wave(n * angle)[:, None] * powers for n, powers in ((1, once), (2, twice)) for wave in (np.cos, np.sin)]
     basis = np.column_stack([np.power.outer(share, [1, 2, 3]), *turning])
     solution = np.linalg.lstsq(basis, ring, rcond=None)[0]
     polynomial = solution[:3] / unit ** np.array([1.0, 2.0, 3.0])

@@ -108,8 +108,7 @@ def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH
 
 def _around(image: AnyArray, grid: Array) -> tuple[Array, AnyArray]:
     """The part of a picture that discs around a grid can reach, and x and y of its first pixel."""
-    steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1) for axis in (0, 1)])
-    margin = np.max(np.abs(steps[np.isfinite(steps)]), initial=_RADIUS_PX[1]) + _RADIUS_PX[1]
+    margin = np.fmax.reduce(steps_px(grid), initial=_RADIUS_PX[1]) + _RADIUS_PX[1]
     known = grid[np.isfinite(grid).all(axis=-1)]
     if not len(known):
         return np.zeros(2), image.astype(np.float32)
@@ -119,6 +118,12 @@ def _around(image: AnyArray, grid: Array) -> tuple[Array, AnyArray]:
         ends.clip(0.0, np.array(image.shape[::-1]) - 1.0).astype(int).tolist() for ends in (low, high)
     )
     return np.array([x, y], dtype=float), image[y : below + 1, x : right + 1].astype(np.float32)
+
+
+def steps_px(grid: Array) -> Array:
+    """(K,) px between neighbouring corners, NaN where one is not seen."""
+    steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1, 2) for axis in (0, 1)])
+    return np.asarray(np.linalg.norm(steps, axis=1))
 
 
 def _smoothed(level: AnyArray) -> AnyArray:

@@ -88,8 +88,8 @@ def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
     places, normals = course.pixels + offset_px[:, None] * course.normals, course.normals
     nearest = np.argmax(np.abs(normals @ _ACROSS.T), axis=1)
     level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])
-    along, across = (np.where(level, places[:, axis], places[:, 1 - axis]) for axis in (0, 1))
-    n_along, n_across = (np.where(level, normals[:, axis], normals[:, 1 - axis]) for axis in (0, 1))
+    along, across = np.where(level, places.T, places.T[::-1])
+    n_along, n_across = np.where(level, normals.T, normals.T[::-1])
     u = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1)
     du = u - along[:, None]
     bent = 0.5 * course.curvature[:, None] * (du / n_across[:, None]) ** 2
@@ -97,8 +97,8 @@ def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
     x, y = np.where(level[:, None], (u, v), (v, u))
     wave = _ACROSS[nearest]
     crossed, share = wave[:, :1] * x + wave[:, 1:] * y, np.sum(wave * normals, axis=1)
-    turns = [np.zeros(len(course), dtype=complex) for _, every in _CYCLES for _ in every]
-    waves = ((np.isin(nearest, own), cycles) for own, every in _CYCLES for cycles in every)
-    for turn, (rows, cycles) in zip(turns, waves, strict=True):
-        turn[rows] = share[rows] * np.mean(np.exp(2j * np.pi * cycles * crossed[rows]), axis=1)
-    return np.column_stack(turns)
+    waves = [(np.isin(nearest, own), cycles) for own, every in _CYCLES for cycles in every]
+    turns = np.zeros((len(course), len(waves)), dtype=complex)
+    for number, (rows, cycles) in enumerate(waves):
+        turns[rows, number] = share[rows] * np.mean(np.exp(2j * np.pi * cycles * crossed[rows]), axis=1)
+    return turns

@@ -79,9 +79,7 @@ def find_strokes(grey: Array32) -> Strokes:
     """Every stroke of a photograph, of paint up to some 12 px wide, each at the scale at which it is brightest."""
     by_scale = []
     for scale in _SCALES:
-        plane = (
-            grey if scale == 1 else cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
-        )
+        plane = cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
         strokes = _strokes(_ridge_points(np.asarray(plane, np.float32)))
         by_scale.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
     size = (int(grey.shape[1]), int(grey.shape[0]))
@@ -143,8 +141,8 @@ def _ridge_points(grey: Array32) -> _Ridge:
     a, b, c = xx[rows, columns], xy[rows, columns], bend[rows, columns]
     angle = 0.5 * np.arctan2(2.0 * b, a - yy[rows, columns]) + 0.5 * np.pi  # of the direction that bends most downwards
     nx, ny = np.cos(angle), np.sin(angle)
-    gx = 0.5 * (soft[rows, np.minimum(columns + 1, soft.shape[1] - 1)] - soft[rows, np.maximum(columns - 1, 0)])
-    gy = 0.5 * (soft[np.minimum(rows + 1, soft.shape[0] - 1), columns] - soft[np.maximum(rows - 1, 0), columns])
+    gx = 0.5 * (soft[rows, columns + 1] - soft[rows, columns - 1])
+    gy = 0.5 * (soft[rows + 1, columns] - soft[rows - 1, columns])
     step = -(gx * nx + gy * ny) / c
     top = np.maximum(np.abs(step * nx), np.abs(step * ny)) <= 0.6
     mask = np.zeros(grey.shape, np.uint8)

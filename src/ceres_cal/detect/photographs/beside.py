@@ -42,9 +42,8 @@ def among_others(
     course = predict(target, camera, curves, spacing_px, 2.0)
     best, least = None, np.inf
     for nearest, chosen in _choices(_lines_beside(grey, course, _REACH * 0.5 * float(np.hypot(*camera.image_size)))):
-        rows, offset = (
-            np.concatenate(one) for one in zip(*((line.rows, line.offset_px) for line in chosen), strict=True)
-        )
+        rows = np.concatenate([line.rows for line in chosen])
+        offset = np.concatenate([line.offset_px for line in chosen])
         places = course.pixels[rows] + offset[:, None] * course.normals[rows]
         sigma = np.full(len(rows), sigma_px)
         seen = observations_of(target, camera.image_size, course.curve[rows], places, sigma)

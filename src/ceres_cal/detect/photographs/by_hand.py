@@ -9,7 +9,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import answer_or_reason
 from ceres_cal.base.frozen import replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.detect.photographs.clicks import FEWEST, Clicks, starts_from_clicks, unknown_optics
 from ceres_cal.detect.photographs.refit import ROBUST, PointHints, refit_camera
 from ceres_cal.problem.parameters import intrinsic_names
@@ -41,11 +41,10 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
     across = size if round(turn / (0.5 * np.pi)) % 2 == 0 else size[::-1]
     phi = USUAL_PHI * 0.5 * float(np.hypot(*image_size))
     above = phi * float(np.max(across / (filled * np.array(image_size))))
-    cos, sin = np.cos(turn), np.sin(turn)
-    rotation = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])
+    rotation = np.diag([1.0, -1.0, -1.0]) @ rotation_exp([0.0, 0.0, -turn])
     position = np.array([*(0.5 * (low + high)), above])
     middle = 0.5 * (width - 1.0), 0.5 * (height - 1.0)
-    return Camera(image_size, phi, middle, Radial((0.0,) * 4, (2, 3, 4, 5)), 1.0, Pose(rotation, -rotation @ position))
+    return Camera(image_size, phi, middle, Radial((0.0,) * 4, (2, 3, 4, 5)), 1.0, Pose.looking(position, rotation))
 
 
 def solved(shown: PointHints, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
@@ -187,12 +186,10 @@ def _turned(shown: PointHints, base: Camera) -> Camera:
     factor = np.vdot(away, b - b.mean()) / max(float(np.vdot(away, away).real), 1e-12) if len(a) > 1 else 1.0
     if not abs(factor) > 1e-3:
         return base
-    turn, scale = np.angle(factor), abs(factor)
-    cos, sin = np.cos(turn), np.sin(turn)
-    about = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    about = rotation_exp([0.0, 0.0, float(np.angle(factor))])
     pose = base.cam_from_world
     translation = about @ pose.translation
-    translation[2] /= scale
+    translation[2] /= abs(factor)
     shift = b.mean() - factor * a.mean()
     translation[:2] += np.array([shift.real, shift.imag]) * translation[2] / base.phi
     return replace(base, cam_from_world=Pose(about @ pose.rotation, translation))

@@ -77,10 +77,8 @@ def agreeing_with_facing(
 
 def nearest_to_before(cameras: Sequence[Camera], before: Camera) -> list[int]:
     """Numbers of the cameras that are turned least from the one before, and of those turned little more."""
-    angles = [
-        float(np.linalg.norm(rotation_log(one.cam_from_world.rotation @ before.cam_from_world.rotation.T)))
-        for one in cameras
-    ]
+    back = before.cam_from_world.rotation.T
+    angles = [float(np.linalg.norm(rotation_log(one.cam_from_world.rotation @ back))) for one in cameras]
     limit = min(angles) + np.deg2rad(_NEARER_DEG)
     return [number for number, angle in enumerate(angles) if angle <= limit]
 

@@ -42,6 +42,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
 TARGET_NAME = "field"
+Start = Camera | Clicks | Auto
 # Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
 _ABOUT = 0.15
 # Of a field from its origin: the largest ones end at 150 m, the smallest in millimetres reaches 750.
@@ -95,7 +96,7 @@ class FieldOptions(Frozen, eq=True):
 def detect_field(
     images: Sequence[Path],
     target: Target,
-    start: Camera | Clicks | Auto,
+    start: Start,
     curves: Collection[str] | None = None,
     options: FieldOptions | None = None,
     progress: ImageProgress | None = None,
@@ -120,14 +121,20 @@ def detect_field(
         NothingShownError: no image shows the field.
     """
     options = options or FieldOptions()
+    refused = options.refused or (lambda path, result: None)
     painted = require_findable(target, curves, options.lengths)
     paths, drawn = [Path(path) for path in images], drawn_as_stated({TARGET_NAME: target}, options.lengths)[TARGET_NAME]
     results: dict[str, SearchResult] = {}
     places: list[SearchResult] = []  # one for each that a camera stood at, where the last picture was taken first
     elsewhere = isinstance(start, Auto)  # whether it is looked for at another place, too: once in vain is enough
 
-    def looked_for(path: Path, grey: Array32, starts: Sequence[Camera | Clicks | Auto | SearchResult]) -> SearchResult:
-        return _looked_for(_without(grey, options.left_out, path), drawn, painted, starts, (path, options))
+    def looked_for(path: Path, grey: Array32, starts: Sequence[Start | SearchResult]) -> SearchResult:
+        with naming(path):
+            try:
+                return _looked_for(_without(grey, options.left_out), drawn, painted, starts, options)
+            except SeveralWaysError as error:
+                refused(path, SearchResult(None, str(error), seen=error.seen))
+                raise
 
     for number, path in enumerate(paths, start=1):
         grey = read_light(path)
@@ -150,12 +157,21 @@ def detect_field(
         results = results if isinstance(together, CalibrationError) else together
     results = _of_one_place(results)
     for name, result in results.items():
-        if result.followed is None and options.refused is not None:
-            options.refused(Path(name), result)
+        if result.followed is None:
+            refused(Path(name), result)
+    return _detections(results, target, options)
+
+
+def _detections(results: Mapping[str, SearchResult], target: Target, options: FieldOptions) -> FieldDetections:
+    """What those images tell that show the field.
+
+    Raises:
+        NothingShownError: none does.
+    """
     followed = {path: result.followed for path, result in results.items() if result.followed is not None}
     missed = tuple((path, result.reason) for path, result in results.items() if result.followed is None)
     if not followed:
-        raise NothingShownError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}", missed)
+        raise NothingShownError(f"no field in any of {len(results)} images; {missed[0][0]}: {missed[0][1]}", missed)
     parts = [_observations(frame_of(path), one, target, options) for path, one in followed.items()]
     searched = {path: result for path, result in results.items() if result.followed is not None and result.ways}
     every = combine(parts)
@@ -258,13 +274,13 @@ def require_findable(
     return painted
 
 
-def _without(grey: Array32, left_out: Mask | None, path: Path) -> Array32:
+def _without(grey: Array32, left_out: Mask | None) -> Array32:
     """A photograph in which what is left out looks like what is around it."""
     if left_out is None:
         return grey
     if left_out.shape != grey.shape:
         size = f"{left_out.shape[1]} x {left_out.shape[0]}"
-        raise InputError(f"{path}: {grey.shape[1]} x {grey.shape[0]} px, but the mask has {size}: draw it on this one")
+        raise InputError(f"{grey.shape[1]} x {grey.shape[0]} px, but the mask has {size}: draw it on this one")
     return filled(grey, left_out)
 
 
@@ -272,21 +288,20 @@ def _looked_for(
     grey: Array32,
     target: Target,
     painted: tuple[str, ...],
-    starts: Sequence[Camera | Clicks | Auto | SearchResult],
-    where: tuple[Path, FieldOptions],
+    starts: Sequence[Start | SearchResult],
+    options: FieldOptions,
 ) -> SearchResult:
     """The field, by lines that are lighter or darker than the floor, from the first start that leads to it.
 
     Args:
-        starts: what pictures before showed, or the one that was given. where: the image's path, and what observations
-            are to be.
+        starts: what pictures before showed, or the one that was given.
     """
     tried: list[SearchResult] = []
     for start in starts:
         at = start.followed if isinstance(start, SearchResult) else start
         before = [(start.darker, None)] if isinstance(start, SearchResult) else None
         for dark, strokes in before or _signs(grey, is_near=isinstance(start, Camera)):
-            one = _looked_from(negative(grey) if dark else grey, target, painted, at, where, strokes)
+            one = _looked_from(negative(grey) if dark else grey, target, painted, at, options, strokes)
             tried.append(replace(one, darker=dark))
             if one.followed is not None:
                 return tried[-1]
@@ -297,24 +312,17 @@ def _looked_from(
     grey: Array32,
     target: Target,
     painted: tuple[str, ...],
-    start: Camera | Clicks | Auto | Followed | None,
-    where: tuple[Path, FieldOptions],
+    start: Start | Followed | None,
+    options: FieldOptions,
     strokes: Strokes | None,
 ) -> SearchResult:
     """The field from where another image showed it, or from the start that was given, or from none."""
-    path, options = where
     lengths = _tracked(options.lengths)
     if isinstance(start, Auto):
-        with naming(path):
-            try:
-                return search(grey, target, painted, replace(start, lengths=lengths), strokes)
-            except SeveralWaysError as error:
-                if options.refused is not None:
-                    options.refused(path, SearchResult(None, str(error), seen=error.seen))
-                raise
+        return search(grey, target, painted, replace(start, lengths=lengths), strokes)
     assert start is not None  # an image that showed it
     target = start.target if isinstance(start, Followed) else target
-    starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
+    starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), lengths)
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
     if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
         return SearchResult(followed)
@@ -335,14 +343,13 @@ def _is_worn(grey: Array32, followed: Followed) -> bool:
 
 
 def _starts(
-    start: Camera | Clicks | Followed, target: Target, size: tuple[int, int], given: tuple[Path, tuple[Prior, ...]]
+    start: Camera | Clicks | Followed, target: Target, size: tuple[int, int], lengths: tuple[Prior, ...]
 ) -> tuple[list[Camera], FreeIntrinsics]:
     """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to.
 
     Args:
-        given: the image's path, and what is known of lengths.
+        lengths: what is known of them.
     """
-    path, lengths = given
     if isinstance(start, Clicks):
         return starts_from_clicks(start, target, size, lengths)
     camera = start.camera if isinstance(start, Followed) else start
@@ -351,7 +358,7 @@ def _starts(
         other = f"but the camera has {width} x {height}: start from a calibration of this camera"
         if isinstance(start, Followed):
             other = "unlike the images before: give it on its own"
-        raise InputError(f"{path}: {size[0]} x {size[1]} px, {other}")
+        raise InputError(f"{size[0]} x {size[1]} px, {other}")
     return [camera], FreeIntrinsics(priors=lengths)
 
 

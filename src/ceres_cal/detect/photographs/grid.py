@@ -90,11 +90,10 @@ def grid_of(target: Target, curves: Collection[str]) -> LineGrid:
 
 def offsets_of(target: Target, curves: Collection[str], turn: Array) -> tuple[Array, Array]:
     """What a grid calls `along` and `across`, of these curves alone."""
-    across, along = (
-        np.unique([*_offsets(_segments(target, curves), turn, axis), *tangents])
-        for axis, tangents in enumerate(_tangents(target, curves, turn))
-    )
-    return along, across
+    lines = _segments(target, curves)
+    arcs = [curve for name, curve in target.curves.items() if name in curves and isinstance(curve, Arc)]
+    both = [np.unique([*_offsets(lines, turn, axis), *_tangents(arcs, turn[:, axis])]) for axis in (1, 0)]
+    return both[0], both[1]
 
 
 def _segments(target: Target, curves: Collection[str]) -> list[Segment]:
@@ -110,22 +109,17 @@ def _way(line: Segment) -> Array:
 def _offsets(lines: Sequence[Segment], turn: Array, axis: int) -> Array:
     """The grid coordinates x (axis 0) or y that lines keep, of those that keep it and are long enough to be seen."""
     kept = [line for line in lines if abs(_way(line) @ turn[:, axis]) < _AXIS]
-    offsets, which = np.unique(
-        np.round([line.start[:2] @ turn[:, axis] for line in kept], _DIGITS), return_inverse=True
-    )
+    places = np.round([line.start[:2] @ turn[:, axis] for line in kept], _DIGITS)
+    offsets, which = np.unique(places, return_inverse=True)
     lengths = np.bincount(which, [line.length_m for line in kept], len(offsets))
     return np.asarray(offsets[lengths > _SHORT * sum(line.length_m for line in lines)])
 
 
-def _tangents(target: Target, curves: Collection[str], turn: Array) -> tuple[Array, ...]:
-    """Grid coordinates, first x, then y, of the lines across and along that touch the painted arcs."""
-    arcs = [c for name, c in target.curves.items() if name in curves and isinstance(c, Arc)]
-    return tuple(np.round([p for arc in arcs for p in _touched(arc, turn[:, axis])], _DIGITS) for axis in (0, 1))
-
-
-def _touched(arc: Arc, way: Array) -> list[float]:
+def _tangents(arcs: Sequence[Arc], way: Array) -> Array:
     """Offsets along `way` (2,) of the lines across it that touch an arc somewhere along it."""
-    angles = np.arctan2(way[1], way[0]) + np.array([0.0, np.pi])
-    within = np.mod(angles - arc.from_rad, 2.0 * np.pi) < arc.to_rad - arc.from_rad
-    offsets = way @ arc.centre[:2] + arc.radius_m * np.array([1.0, -1.0])
-    return [float(one) for one in offsets[within]]
+    offsets: list[Array] = [np.empty(0)]
+    for arc in arcs:
+        angles = np.arctan2(way[1], way[0]) + np.array([0.0, np.pi])
+        within = np.mod(angles - arc.from_rad, 2.0 * np.pi) < arc.to_rad - arc.from_rad
+        offsets.append((way @ arc.centre[:2] + arc.radius_m * np.array([1.0, -1.0]))[within])
+    return np.concatenate(offsets).round(_DIGITS)

@@ -73,9 +73,8 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
     told, as_drawn = coincidence(search, followed), followed.built.names and not followed.built.dimensions
     enough = _EXPLAINED, _OF_ALL if followed.absent else _OF_ALL_IF_WHOLE
-    if told < (_IF_AS_DRAWN if as_drawn else _NO_CHANCE) and np.any(
-        np.less((share, of_all), _IF_ANY if told < _BY_ANY else enough)
-    ):
+    needed = _IF_ANY if told < _BY_ANY else enough
+    if told < (_IF_AS_DRAWN if as_drawn else _NO_CHANCE) and np.any(np.less((share, of_all), needed)):
         share = min(share, of_all)
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
@@ -161,7 +160,7 @@ def coincidence(search: FieldSearch, followed: Followed) -> float:
     Of each straight line: in how many of the places beside it, all over the field, there are as many strokes as on it.
     Where others run everywhere, as on striped floors, it tells nothing; and a camera lays some lines on any others.
     """
-    share, as_many, near_px = np.linspace(0.0, 1.0, 300), 0.8, 2.0
+    tried, as_many, near_px = 300, 0.8, 2.0
     parallel, turn, target = _parallel(search, followed), search.grid.turn, followed.target
     chances = [1.0] * _LAID
     for name in followed.curves:
@@ -170,16 +169,11 @@ def coincidence(search: FieldSearch, followed: Followed) -> float:
             continue
         ends = np.array([curve.start[:2], curve.end[:2]]) @ turn
         axis = int(np.argmax(np.ptp(ends, axis=0)))
-        middle = parallel.middle[:, axis]
+        middle, (low, high) = parallel.middle[:, axis], np.sort(ends[:, axis])
         with np.errstate(invalid="ignore"):
-            rows = (
-                (parallel.along, parallel.across)[axis]
-                & (middle > ends[:, axis].min())
-                & (middle < ends[:, axis].max())
-            )
-        places = np.append(
-            ends[0, 1 - axis], parallel.outline[0, 1 - axis] + np.ptp(parallel.outline[:, 1 - axis]) * share
-        )
+            rows = (parallel.along, parallel.across)[axis] & (middle > low) & (middle < high)
+        first, last = parallel.outline[:, 1 - axis]
+        places = np.append(ends[0, 1 - axis], np.linspace(first, last, tried))
         near = np.abs(parallel.middle[rows, 1 - axis] - places[:, None]) < near_px * parallel.pixel_m[rows]
         covered = near @ (search.stroke_map.strokes.length_px * parallel.pixel_m)[rows]
         chances.append(float(np.mean(covered >= as_many * covered[0])))

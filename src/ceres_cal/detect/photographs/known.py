@@ -10,8 +10,8 @@ from ceres_cal.base.errors import ImageProgress, InputError, NothingShownError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.shown import brief
 from ceres_cal.calibration import Calibration
-from ceres_cal.detect.boards import detect_boards
-from ceres_cal.detect.photographs.field import FieldOptions, detect_field
+from ceres_cal.detect.boards import BoardDetections, detect_boards
+from ceres_cal.detect.photographs.field import FieldDetections, FieldOptions, detect_field
 from ceres_cal.detect.photographs.follow import FAR_PX
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements, require_posterior
 from ceres_cal.moves.checks import check, not_found
@@ -80,7 +80,7 @@ def detect_known(
     """
     paths, posed = [Path(path) for path in images], calibration.station(station)
     name = station or next(iter(calibration.stations))
-    names = calibration.estimate.stations[name].camera, name
+    options = FieldOptions(calibration.estimate.stations[name].camera, name)
     wanted = {
         what: target
         for what, target in calibration.targets.items()
@@ -99,9 +99,11 @@ def detect_known(
     reasons: dict[str, list[str]] = {str(path): [] for path in paths}
     for turn, (what, target) in enumerate(wanted.items()):
         report = partial(_count_on, progress, turn, len(wanted))
+        painted = [curve for curve in target.curves if curve not in not_painted]
         try:
-            detected, missed = _searched(paths, target, posed, names, not_painted, report)
-            parts.append(_renamed(detected, what))
+            found = _searched(paths, target, posed, painted, options, report)
+            parts.append(_renamed(found.observations, what))
+            missed = found.missed
         except NothingShownError as error:  # reads: "..." beside each photograph that shows nothing
             missed = error.missed
         shown[what] = len(paths) - len(missed)
@@ -112,21 +114,12 @@ def detect_known(
 
 
 def _searched(
-    paths: Sequence[Path],
-    target: Target,
-    posed: Camera,
-    names: tuple[str, str],
-    not_painted: Collection[str],
-    report: ImageProgress,
-) -> tuple[Observations, tuple[tuple[str, str], ...]]:
-    """What images show of one target, and path and reason of those that do not show it."""
-    camera, station = names
-    if not is_painted(target):
-        corners = detect_boards(paths, target, camera, station, progress=report)
-        return corners.observations, corners.missed
-    painted = [curve for curve in target.curves if curve not in not_painted]
-    lines = detect_field(paths, target, posed, painted, FieldOptions(camera, station), report)
-    return lines.observations, lines.missed
+    paths: list[Path], target: Target, posed: Camera, painted: list[str], options: FieldOptions, report: ImageProgress
+) -> FieldDetections | BoardDetections:
+    """What images show of one target."""
+    if is_painted(target):
+        return detect_field(paths, target, posed, painted, options, report)
+    return detect_boards(paths, target, options.camera, options.station, progress=report)
 
 
 def check_photographs(

@@ -120,11 +120,9 @@ def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
     along = np.diff(floor, axis=1)[:, 0]
     slope = np.abs(along / np.linalg.norm(along, axis=1, keepdims=True))
     middle = floor.mean(axis=1)
-    x, y = (
-        _peaks(middle[rows, axis], weights[rows], float(weights.sum()))
-        for axis, rows in enumerate((slope[:, 0] < _PARALLEL, slope[:, 1] < _PARALLEL))
-    )
-    return FloorLines(x, y)
+    across = (slope < _PARALLEL).T
+    parts = zip(middle.T, across, strict=True)
+    return FloorLines(*(_peaks(places[rows], weights[rows], float(weights.sum())) for places, rows in parts))
 
 
 def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[Match]:
@@ -221,9 +219,7 @@ def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: 
     tells_px = 40.0  # of a line, as much as one place on it tells
     floor = (places.grid.T[:, None] - hypotheses.T[1:, :, None]) / hypotheses[:, 0, None]
     offsets = np.moveaxis(upright.offsets(np.moveaxis(floor, 0, -1)), -1, 0)
-    x, y = (
-        np.float32(c) + np.float32(stroke_map.unit_px) * one for c, one in zip(stroke_map.centre, offsets, strict=True)
-    )
+    x, y = stroke_map.centre.astype(np.float32)[:, None, None] + np.float32(stroke_map.unit_px) * offsets
     width, height = stroke_map.image_size
     with np.errstate(invalid="ignore"):
         inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)

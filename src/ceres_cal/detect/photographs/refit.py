@@ -50,9 +50,8 @@ class PointHints(Frozen):
         """Points by name and places with their curve, each x, y and sigma in px; without what the target has not."""
         points = {name: place for name, place in points.items() if name in target.point_index}
         places = [place for place in places if place[0] in target.curve_index]
-        at, on = (
-            np.array(rows, dtype=float).reshape(-1, 3) for rows in (list(points.values()), [p[1:] for p in places])
-        )
+        at = np.array(list(points.values()), dtype=float).reshape(-1, 3)
+        on = np.array([place[1:] for place in places], dtype=float).reshape(-1, 3)
         index = np.array([target.point_index[name] for name in points], dtype=np.int32)
         curve = np.array([target.curve_index[place[0]] for place in places], dtype=np.int32)
         return cls(target, index, at[:, :2], at[:, 2], curve, on[:, :2], on[:, 2])
