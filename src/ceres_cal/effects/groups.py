@@ -157,7 +157,7 @@ def group_normals(problem: Problem, estimate: Estimate, groups: Sights, alone: S
         steps, at = steps_of(own.keys[0], poses[numbers[0]], estimate, columns)
         if own.keys[0].placement in alone:
             steps, at = steps[:, : len(steps) - 6], at[: len(steps) - 6]
-            whole, before = _posed(whole), whole[:, :-7, :-7]
+            whole, before = posed(whole), whole[:, :-7, :-7]
         else:
             before = steps.T @ whole[:, :-1, :-1] @ steps
         sizes[at] += np.einsum("gkk->k", before)
@@ -195,7 +195,7 @@ def _drop_rounding(columns: Mapping[Owner, Indices], sizes: Array, products: Arr
             sizes[lost], products[:, lost], products[:, :, lost] = 0.0, 0.0, 0.0
 
 
-def _posed(normals: Array) -> Array:
+def posed(normals: Array) -> Array:
     """(G, K - 6, K - 6) what normal equations (G, K, K) leave where each pose is at its best."""
     pose, rest = slice(-7, -1), np.r_[: normals.shape[1] - 7, normals.shape[1] - 1]
     inverse = known_inverses(normals[:, pose, pose], np.full(6, np.inf))

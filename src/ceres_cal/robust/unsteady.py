@@ -27,7 +27,8 @@ from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
 from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RepeatedAmounts, shifts_by
-from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model, without_shared
+from ceres_cal.effects.groups import posed
+from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
 from ceres_cal.effects.table.lens import lens_changes
 from ceres_cal.observations import Observations
 from ceres_cal.problem.information import Key
@@ -120,8 +121,8 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
     """
     estimate = end.estimate
 
-    def model_of(some: Problem, there: Estimate = estimate, *, of_poses: bool = False) -> Linearised:
-        return _model(there, end.residuals, end.weights_of, before, some, of_poses=of_poses)
+    def seen(some: Problem, there: Estimate = estimate) -> tuple[Equations, Weights]:
+        return _equations(there, end.residuals, end.weights_of, before, some)
 
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
@@ -130,14 +131,16 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
         if len(boards) < _FEWEST:
             continue
         some = problem.of_sights(np.array(boards[:: -(-len(boards) // _ENOUGH)]))
-        if before is not None or _seem_displaced(model_of(*some.built_as(estimate), of_poses=True)):
-            model = model_of(some)
+        if before is not None or _seem_displaced(*seen(*some.built_as(estimate))):
+            model = make_linear_model(some, estimate, *seen(some))
             if before is None and any(lens_changes(Case(some, estimate, model))):
                 continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` tells that
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own:
                 sizes[camera], noise = own, max(left, noise)
-    return _predicted(model_of(problem), problem, estimate, sizes, noise) if sizes else None
+    if not sizes:
+        return None
+    return _predicted(make_linear_model(problem, estimate, *seen(problem)), problem, estimate, sizes, noise)
 
 
 def without_unsteadiness(
@@ -149,25 +152,20 @@ def without_unsteadiness(
         return problem
     there = residuals(problem.sights, estimate)
     weights_of = partial(equation_weights, problem.weighting, there=there, taking_part=taking_part)
-    model = _model(estimate, there, weights_of, None, problem)
+    model = make_linear_model(problem, estimate, *_equations(estimate, there, weights_of, None, problem))
     return _predicted(model, problem, estimate, sizes, 1.0).taken_off(problem)
 
 
-def _model(
+def _equations(
     estimate: Estimate,
     there: Residuals,
     weights_of: Callable[[Equations], Weights],
     before: Unsteady | None,
     problem: Problem,
-    *,
-    of_poses: bool = False,
-) -> Linearised:
+) -> tuple[Equations, Weights]:
     """Of a problem's sights, with the residuals `before` anything was taken off; views that were taken out as a whole
     speak again, for they may be those that are displaced most. What takes part counts whole: a robust weight is that of
     an observation whose view is displaced.
-
-    Args:
-        of_poses: whether nothing else is free, which takes half the time.
     """
     equations = write_equations(problem.sights, estimate, there)
     if before is not None:
@@ -175,10 +173,7 @@ def _model(
     weights = weights_of(equations)
     silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0
     used = weights.used | silent[equations.sight]
-    weights = Weights(weights.inverse_sigma, used, np.ones_like(weights.robust))
-    if of_poses:
-        return without_shared(problem, estimate, equations, weights, ())[0]
-    return make_linear_model(problem, estimate, equations, weights)
+    return equations, Weights(weights.inverse_sigma, used, np.ones_like(weights.robust))
 
 
 def _modes(equations: Equations, *, smooth: bool = True) -> Array:
@@ -200,27 +195,22 @@ def _modes(equations: Equations, *, smooth: bool = True) -> Array:
     return np.hstack(modes)
 
 
-def _seem_displaced(model: Linearised) -> bool:
-    """Whether views may be displaced, at a glance: half of all squares go with their read-out, or their principal
-    points seem to move by themselves, by moments: their scores have the variance T + T^2 sigma^2. Beside what else
-    displaces views they move by less.
+def _seem_displaced(equations: Equations, weights: Weights) -> bool:
+    """Whether views may be displaced, at a glance, nothing but poses free: half of all squares go with their read-out,
+    or their principal points seem to move by themselves, by moments: their scores have the variance T + T^2 sigma^2.
+    Beside what else displaces views they move by less.
     """
-    whole_told, scores = _of_views(model, _modes(model.equations, smooth=False))
+    columns = np.column_stack([_modes(equations, smooth=False), equations.pose, equations.residual])
+    columns *= (weights.inverse_sigma * weights.used)[:, None]
+    left = posed(np.array([columns[start:stop].T @ columns[start:stop] for start, stop in pairwise(equations.bounds)]))
+    whole_told, scores, squares = left[:, :-1, :-1], left[:, :-1, -1], left[:, -1, -1]
     read_out = np.linalg.pinv(whole_told[:, 2:, 2:], _TOLD, hermitian=True)
     taken = np.sum(scores[:, 2:] * np.einsum("vij,vj->vi", read_out, scores[:, 2:]))
     told, score = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2)[:, :2], 1e-300), scores[:, :2]
     mean = np.sum(score, axis=0) / np.sum(told, axis=0)
     moved = float(np.sum((score - told * mean) ** 2 / told - 1.0))
     moves = moved > (0.75 * _LEAST_PX) ** 2 * float(np.sum(told))
-    return bool(2.0 * taken > np.sum(model.placed_score**2)) or moves
-
-
-def _of_views(model: Linearised, columns: Array) -> tuple[Array, Array]:
-    """What each view says by itself of coefficients, columns (E, Q), px per px: information (V, Q, Q), score (V, Q)."""
-    beyond = np.where(model.used[:, None], model.beyond_private(columns * model.weight[:, None]), 0.0)
-    both, bounds = np.column_stack([beyond, model.placed_score]), model.equations.bounds
-    sums = np.array([beyond[start:stop].T @ both[start:stop] for start, stop in pairwise(bounds)])
-    return sums[:, :, :-1], sums[:, :, -1]
+    return bool(2.0 * taken > np.sum(squares)) or moves
 
 
 def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
