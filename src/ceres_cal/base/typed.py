@@ -162,7 +162,7 @@ def numbers_in(values: Any, name: str) -> Array:
 def size_in(values: Any, name: str = "image_size") -> tuple[int, int]:
     """Width and height of an image; InputError naming the argument for anything else."""
     given = numbers_in(values, name)
-    if given.shape != (2,) or not (np.all(given >= 1.0) and np.all(given == np.round(given))):
+    if given.shape != (2,) or not all(side >= 1.0 and side.is_integer() for side in given.tolist()):
         raise InputError(f"{name} must be (width, height) in px, two positive whole numbers, not {values!r}")
     return int(given[0]), int(given[1])
 

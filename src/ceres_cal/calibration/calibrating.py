@@ -153,9 +153,10 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
     from ceres_cal.calibration.lens_choice import choose_lens
     from ceres_cal.calibration.lens_forms import papers
 
-    start = initialise(sights, papers(options))
+    simple = papers(options)
+    start = initialise(sights, simple)
     if options.closed_form_only:
-        return _of_lens(task, start, sights, papers(options))
+        return _of_lens(task, start, sights, simple)
 
     def seen_with(one: Chosen) -> Explained:
         named = replace(one.options, priors=options.priors).with_first_power(len(sights))  # compared without priors
@@ -163,7 +164,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         return explained(task, one.start, problem, one.built)
 
     chosen = choose_lens(sights.observations, options, start)
-    seen, chosen = chosen.first_solved(seen_with, papers(options), start)
+    seen, chosen = chosen.first_solved(seen_with, simple, start)
     too_few = chosen.choice.share < 1.0 and seen.leaves_alike
     if too_few or (seen.as_built and not chosen.built.every):
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
@@ -173,7 +174,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         built = Built(seen.as_built, seen.end.estimate.structure)
         chosen = choose_lens(sights.observations, options, anew, built, by_most=too_few)
         if chosen.choice.chosen != before.choice.chosen:
-            seen, chosen = chosen.first_solved(seen_with, papers(options), start)
+            seen, chosen = chosen.first_solved(seen_with, simple, start)
     said = []
     while chosen.among is not None and (other := chosen.among.instead(*seen.outlier_masks)):
         # reads: "another lens explains observations that were taken out, ..."
@@ -188,7 +189,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
     def known_with(one: Chosen) -> Calibration:
         return known_of(seen if one is last else seen_with(one))
 
-    calibration, chosen = last.first_solved(known_with, papers(options), start)
+    calibration, chosen = last.first_solved(known_with, simple, start)
     if calibration.posterior is not None and chosen.among is not None:
         others = chosen.among.others
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)

@@ -202,12 +202,10 @@ def choose_lens(
         by_most: whether most of the observations are asked, not some of them, which left what goes together.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
-    by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
+    priors = (*map(_loosely, options.priors), *_about_guesses(observations, options, start))
+    by_themselves = replace(options, priors=priors)
     if observations.priors:
         observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
-    by_themselves = replace(
-        by_themselves, priors=(*by_themselves.priors, *_about_guesses(observations, options, start))
-    )
 
     def compared() -> Chosen:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built, by_most=by_most)

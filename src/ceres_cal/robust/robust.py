@@ -208,9 +208,7 @@ class _RowRounds(Rounds[RobustSolution]):
         weighting = Weighting(visible.point_scale, visible.curve_scale, "cauchy", loss_scale=1.0)
         problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
         estimate = with_placements_at_best(problem, estimate)
-        state = self._judged(Solution(estimate, np.nan, False, "", ()), there, 0)
-        self._scales = visible_from(self._problem.observations, state.residuals).scales
-        return state
+        return self._judged(Solution(estimate, np.nan, False, "", ()), there, 0)
 
     def refined(self, state: RobustSolution) -> RobustSolution:
         """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""

@@ -186,7 +186,7 @@ def _modes(equations: Equations, *, smooth: bool = True) -> Array:
     half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
     x, y = ((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T
     read_out = equations.pose * y[:, None]
-    read_out /= np.sqrt(np.maximum(np.mean(read_out**2, axis=0), 1e-300))
+    read_out /= np.sqrt(np.maximum(np.einsum("ei,ei->i", read_out, read_out) / len(y), 1e-300))
     modes = [equations.intrinsics[:, _CENTRE], read_out]
     if smooth:
         third = 1.0 / 3.0  # the mean of x^2

@@ -77,8 +77,9 @@ class Camera(Frozen, eq=True):
         cx, cy = (float(c) for c in numbers_in(self.principal_point, "principal_point"))
         if max(width, height) > LARGEST_PX:
             raise InputError(f"image_size must be at most {LARGEST_PX} px, not {self.image_size}")
-        numbers = (self.phi, self.aspect, cx, cy, self.skew, *self.lens.values, *self.cam_from_world.translation)
-        if not np.all(np.abs(numbers) < LARGEST) or self.phi <= 0.0 or self.aspect <= 0.0:
+        held = (*self.lens.values, *self.cam_from_world.translation.tolist())
+        numbers = (self.phi, self.aspect, cx, cy, self.skew, *held)
+        if not all(abs(number) < LARGEST for number in numbers) or self.phi <= 0.0 or self.aspect <= 0.0:
             raise InputError(
                 f"intrinsics must be finite and below {LARGEST:g}, phi and aspect positive: phi {self.phi}, "
                 f"aspect {self.aspect}, principal point {(cx, cy)}, {self.lens.coefficients}, "
