@@ -38,8 +38,9 @@ def test_they_import_no_masked_arrays() -> None:
     assert done.stdout.split() == ["False"]
 
 
-def test_nor_does_a_calibration(tmp_path: Path) -> None:
-    command = ["calibrate", str(SAMPLE), "-o", str(tmp_path / "calibration.json"), "--quiet"]
+@pytest.mark.parametrize("lens", ["auto", "spline"])
+def test_nor_does_a_calibration(tmp_path: Path, lens: str) -> None:
+    command = ["calibrate", str(SAMPLE), "--lens", lens, "-o", str(tmp_path / "calibration.json"), "--quiet"]
     code = f"import sys; from ceres_cal.cli import main; main({command}); print('numpy.ma' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split()[-1] == "False"

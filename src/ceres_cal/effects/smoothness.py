@@ -62,7 +62,7 @@ def _by_sizes(
     sizes = [int(np.count_nonzero(form)) if is_diagonal(form) else 0 for form in forms]
     largest = int(np.argmax(sizes))
     turned = np.flatnonzero(np.diagonal(forms[largest]) if sizes[largest] else np.zeros(len(slope)))
-    rest = np.setdiff1d(np.arange(len(slope)), turned)
+    rest = np.delete(np.arange(len(slope)), turned)
     unit = 1.0 / np.sqrt(np.diagonal(forms[largest])[turned])
     values, vectors = np.linalg.eigh(normal[np.ix_(turned, turned)] * unit[:, None] * unit)
     turn = vectors * unit[:, None]
