@@ -79,14 +79,7 @@ def _run(args: RunArguments) -> Document:
     for one in (args, *cameras):
         make_folder(one.output)
     images = [_photographs(one) for one in cameras]
-    steps = list[_Step]()
-    for one, own in zip(cameras, images, strict=True):
-        try:
-            steps += _observed(one, own)
-        except InputError as error:  # reads: "..., such as --facing left.LeftGoalLine=left, ..."
-            if len(cameras) == 1:
-                raise
-            raise InputError(str(error).replace("--facing ", f"--facing {one.camera}.")) from None
+    steps = [step for one, own in zip(cameras, images, strict=True) for step in _named(one, own, len(cameras) > 1)]
     calibrated = _calibrated(args, cameras, [step.data for step in steps if "output" in step.data])
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
@@ -174,6 +167,16 @@ def _photographs(args: RunArguments) -> list[Path]:
     images, videos = images_and_videos(args.images)
     with progress_bar(args.silent) as bar:
         return [*images, *frames_of_videos(videos, args.frames, args.output, bar.update)]
+
+
+def _named(args: RunArguments, images: list[Path], is_one_of_several: bool) -> list[_Step]:
+    """What a camera observed; an error says of which camera."""
+    try:
+        return list(_observed(args, images))
+    except InputError as error:  # reads: "..., such as --facing left.LeftGoalLine=left, ..."
+        if not is_one_of_several:
+            raise
+        raise InputError(str(error).replace("--facing ", f"--facing {args.camera}.")) from None
 
 
 def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:

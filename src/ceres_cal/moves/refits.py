@@ -231,7 +231,7 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
         replace(start, cameras={**start.cameras, **here}) if end is None else end.estimate
         for start, end in zip(starts, found, strict=True)
     ]
-    reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in plan.moved_cameras}
+    reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in sights.cameras}
     lenses = OtherLenses(seen[0], tuple(seen[1:]), known.lens_weights, reach_px)
     return replace(result, posterior=with_other_lenses(result.posterior, result.estimate, lenses))
 
