@@ -2,18 +2,21 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from ceres_cal import detect_board, run
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.run import _short
 from ceres_cal.detect.video import sharpest_frames
+from ceres_cal.scene.targets import checkerboard
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "ssl_field"
 PHOTOGRAPH = str(SAMPLE / "photographs" / "0001.jpg")
@@ -143,6 +146,12 @@ def test_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert (out / made).exists(), said
     assert main([*asked, "--camera", "left"]) == 2
     assert "--camera names one camera: several are called like their folders" in capsys.readouterr().err
+
+
+def test_no_photograph_at_all(tmp_path: Path) -> None:
+    for call in (partial(run, [], tmp_path, target="ssl-b"), partial(detect_board, [], checkerboard(9, 6, 0.025))):
+        with pytest.raises(InputError, match="no photograph is given: name files, folders, or videos"):
+            call()
 
 
 def test_a_folder_without_images_names_those_of_its_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,9 +19,11 @@ def image_files(given: Images) -> list[Path]:
     """The files that are named; those of folders, and of patterns, in the order of their names.
 
     Raises:
-        InputError: there is no such file, or no image in a folder.
+        InputError: there is no such file, no image in a folder, or nothing at all.
     """
     each = [given] if isinstance(given, str | PathLike) else given
+    if not each:
+        raise InputError("no photograph is given: name files, folders, or videos")
     return [path for name in each for path in _files(str(name))]
 
 
@@ -49,10 +51,9 @@ def _inside(folder: Path) -> list[Path]:
 
 def folders_of_cameras(given: Sequence[str]) -> list[Path]:
     """The folders with images of the one folder that is given, where it has none itself: one for each camera."""
-    path = Path(given[0])
-    if len(given) != 1 or not path.is_dir() or _inside(path):
-        return []
-    return sorted(folder for folder in path.iterdir() if folder.is_dir() and _inside(folder))
+    alone = [Path(name) for name in given if len(given) == 1]
+    inside = (folder for path in alone if path.is_dir() and not _inside(path) for folder in path.iterdir())
+    return sorted(folder for folder in inside if folder.is_dir() and _inside(folder))
 
 
 def images_and_videos(given: Images) -> tuple[list[Path], list[Path]]:
