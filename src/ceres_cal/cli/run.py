@@ -79,7 +79,7 @@ def _run(args: RunArguments) -> Document:
     for one in (args, *cameras):
         make_folder(one.output)
     images = [_photographs(one) for one in cameras]
-    steps = [step for one, own in zip(cameras, images, strict=True) for step in _named(one, own, len(cameras) > 1)]
+    steps = [step for one, own in zip(cameras, images, strict=True) for step in _seen_by(one, own, len(cameras) > 1)]
     calibrated = _calibrated(args, cameras, [step.data for step in steps if "output" in step.data])
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
@@ -169,8 +169,8 @@ def _photographs(args: RunArguments) -> list[Path]:
         return [*images, *frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 
-def _named(args: RunArguments, images: list[Path], is_one_of_several: bool) -> list[_Step]:
-    """What a camera observed; an error says of which camera."""
+def _seen_by(args: RunArguments, images: list[Path], is_one_of_several: bool) -> list[_Step]:
+    """What a camera observed; of several an error says which one is to be turned."""
     try:
         return list(_observed(args, images))
     except InputError as error:  # reads: "..., such as --facing left.LeftGoalLine=left, ..."

@@ -87,6 +87,8 @@ FLOOR_OFF = SizePrior(0.8, (0.0005,))
 """Of how much higher or lower a floor's edges are than its middle, and of how far a field's are out of square, over
 half of its longer side: 2 mm of a field of 9 m. Four of five are flat and square.
 """
+AS_STATED = SizePrior(0.0, (1.0,))
+"""Of what is stated with the observations, in the standard deviation that is stated: it is there, and as large."""
 SMOOTH_ERRORS = SizePrior(0.8, tuple(np.geomspace(0.01, 3.0, 14).tolist()))
 """Of what displaces a view smoothly, in px; as rare as errors that go together, see DEPENDENCE."""
 LENS_LEAVES = SizePrior(0.8, tuple(np.geomspace(0.01, 1.0, 11).tolist()))

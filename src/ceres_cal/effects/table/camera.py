@@ -14,7 +14,7 @@ from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
-from ceres_cal.effects.evidence import SizePrior
+from ceres_cal.effects.evidence import AS_STATED
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.quantities import pixel_slopes
 
@@ -197,7 +197,7 @@ def _of_coma(evidence: Evidence) -> Words:
 EFFECTS = (
     replace(
         camera_effect("coma", _drawn_out, _of_coma),
-        prior=SizePrior(0.0, (1.0,)),
+        prior=AS_STATED,
         reach=lambda columns, number, case: _coma_px(case, columns.subjects[number]),
         concerns=lambda observations: any(prior.is_coma for prior in observations.priors),
     ),
