@@ -22,9 +22,10 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
-from ceres_cal.detect.photographs import Clicks, FieldDetections, FieldOptions, detect_field, follow, load_clicks
+from ceres_cal.detect.photographs import Clicks, FieldDetections, FieldOptions, detect_field, load_clicks
 from ceres_cal.detect.photographs.clicks import FORMAT, clicks_from_json
 from ceres_cal.detect.photographs.field import _signs
+from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial

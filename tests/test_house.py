@@ -96,7 +96,8 @@ def test_imports_go_downwards() -> None:
 def require_downwards(name: str) -> None:
     floor = FLOORS.get(room(name))
     assert floor is not None, f"{name} has no floor: give it a line in FLOORS (design: floor 0 knows nobody)"
-    for line, target in imports(MODULES[name]):
+    stub = MODULES[name].with_suffix(".pyi")  # what a package hands on, loaded when it is asked for
+    for line, target in (*imports(MODULES[name]), *(imports(stub) if stub.exists() else ())):
         if target.split(".")[0] != PACKAGE:
             continue
         where, below = f"{name}, line {line}", FLOORS.get(room(target))

@@ -44,8 +44,9 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.detect.photographs import Auto, follow
+from ceres_cal.detect.photographs import Auto
 from ceres_cal.detect.photographs.clicks import starts_from_clicks
+from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.diagnostics.advice import advise
 from ceres_cal.moves.checks import check

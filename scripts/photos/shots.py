@@ -24,7 +24,8 @@ from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light
-from ceres_cal.detect.photographs import Clicks, FieldDetections, detect_field, follow
+from ceres_cal.detect.photographs import Clicks, FieldDetections, detect_field
+from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance

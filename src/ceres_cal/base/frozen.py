@@ -4,12 +4,15 @@ properties, names of a package, rows of tables.
 
 from __future__ import annotations
 
+import re
+import sys
 from collections import UserDict
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, fields
 from dataclasses import field as field
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast, dataclass_transform
 
 from ceres_cal.base.errors import InputError
@@ -137,15 +140,23 @@ class Rows(Frozen):
 _Row = TypeVar("_Row")
 
 
-def names_of(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package: name -> module, below the package, that defines it."""
+def names_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package: what its stub `__init__.pyi` imports, names and modules in
+    it, is loaded when it is first asked for.
+    """
+    stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
+    homes = {name: home for home, name in re.findall(r"^from (\S+) import \w+ as (\w+)$", stub, re.MULTILINE)}
 
     def of_name(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}{did_you_mean(name, homes)}")
-        return getattr(import_module(f"{package}.{homes[name]}"), name)
+        home = homes[name]
+        return import_module(f"{package}.{name}") if home == package else getattr(import_module(home), name)
 
-    return of_name
+    def names() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *homes})
+
+    return of_name, names, [name for name, home in homes.items() if home != package]
 
 
 class LazyTable(UserDict[str, _Row]):

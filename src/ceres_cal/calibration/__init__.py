@@ -1,10 +1,5 @@
 """The result of a calibration, how it came about, and its file."""
 
-from ceres_cal.calibration.calibration import Calibration as Calibration
-from ceres_cal.calibration.file import FORMAT as FORMAT
-from ceres_cal.calibration.file import CalibrationFile as CalibrationFile
-from ceres_cal.calibration.file import Fit as Fit
-from ceres_cal.calibration.file import LensChoice as LensChoice
-from ceres_cal.calibration.file import Refitted as Refitted
-from ceres_cal.calibration.file import TriedLens as TriedLens
-from ceres_cal.calibration.file import package_versions as package_versions
+from ceres_cal.base.frozen import names_of
+
+__getattr__, __dir__, __all__ = names_of(__name__)

@@ -1,1 +1,5 @@
 """Observations out of images, with OpenCV."""
+
+from ceres_cal.base.frozen import names_of
+
+__getattr__, __dir__, __all__ = names_of(__name__)

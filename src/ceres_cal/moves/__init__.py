@@ -1,1 +1,5 @@
 """Calibrations and new observations: refit, check, score, audit and compare."""
+
+from ceres_cal.base.frozen import names_of
+
+__getattr__, __dir__, __all__ = names_of(__name__)

@@ -1,1 +1,5 @@
 """The paper's closed forms, which only initialise."""
+
+from ceres_cal.base.frozen import names_of
+
+__getattr__, __dir__, __all__ = names_of(__name__)

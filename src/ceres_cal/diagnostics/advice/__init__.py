@@ -1,7 +1,5 @@
 """What to measure next: each candidate with what it would take off a station's map, from the posterior."""
 
-from ceres_cal.diagnostics.advice.candidates import Ground, Measurement
-from ceres_cal.diagnostics.advice.outlook import Errors, Outlook
-from ceres_cal.diagnostics.advice.ranking import Advice, Promise, advise, promised
+from ceres_cal.base.frozen import names_of
 
-__all__ = ["Advice", "Errors", "Ground", "Measurement", "Outlook", "Promise", "advise", "promised"]
+__getattr__, __dir__, __all__ = names_of(__name__)

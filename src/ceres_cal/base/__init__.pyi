@@ -1,0 +1,14 @@
+from ceres_cal.base import archives as archives
+from ceres_cal.base import arrays as arrays
+from ceres_cal.base import errors as errors
+from ceres_cal.base import executing as executing
+from ceres_cal.base import files as files
+from ceres_cal.base import frozen as frozen
+from ceres_cal.base import images as images
+from ceres_cal.base import least_squares as least_squares
+from ceres_cal.base import shown as shown
+from ceres_cal.base import tails as tails
+from ceres_cal.base import threads as threads
+from ceres_cal.base import transforms as transforms
+from ceres_cal.base import typed as typed
+from ceres_cal.base import words as words

@@ -1,0 +1,9 @@
+from ceres_cal.moves import agreement as agreement
+from ceres_cal.moves import audits as audits
+from ceres_cal.moves import checks as checks
+from ceres_cal.moves import comparisons as comparisons
+from ceres_cal.moves import explanations as explanations
+from ceres_cal.moves import poses as poses
+from ceres_cal.moves import refit_plan as refit_plan
+from ceres_cal.moves import refits as refits
+from ceres_cal.moves import scores as scores
