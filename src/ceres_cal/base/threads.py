@@ -66,12 +66,13 @@ def share_cores(processes: int) -> None:
 
 
 @contextmanager
-def single_threaded_blas() -> Iterator[None]:
-    """While it lasts BLAS works in the calling thread alone, in the whole process.
+def for_small_matrices() -> Iterator[None]:
+    """While it lasts BLAS works in the calling thread alone, in the whole process; freed memory stays at hand.
 
-    Our matrices are small: OpenBLAS's other threads bring nothing, but spin for milliseconds after each call, on the
-    cores that our own parts need.
+    OpenBLAS's other threads bring nothing to matrices as small as ours, but spin for milliseconds after each call, on
+    the cores that our own parts need.
     """
+    _keep_freed_memory()
     with _controller().limit(limits=1, user_api="blas"):
         yield
 
@@ -139,14 +140,14 @@ def kept_signals() -> Iterator[None]:
         signal.signal(signal.SIGTERM, handler)
 
 
-def keep_freed_memory() -> None:
+@cache
+def _keep_freed_memory() -> None:
     """From now on freed memory stays at hand for what comes next, 64 MiB of it, where the C library is glibc.
 
-    It does by itself, but not where a process was told otherwise, as Dask's workers are: there each array is had from
-    the system anew, which is a third of the time of sums over many rows.
+    Else arrays are had from the system anew, again and again: a third of the time of sums over many rows in Dask's
+    workers, an eighth of the calibration of a thousand frames.
     """
-    # Of glibc's mallopt: what it comes to by itself, at most, once a process has freed something large.
-    trim, mapped = (-1, 1 << 26), (-3, 1 << 25)
+    trim, mapped = (-1, 1 << 26), (-3, 1 << 25)  # of glibc's mallopt
     import ctypes
 
     library = ctypes.CDLL(None)

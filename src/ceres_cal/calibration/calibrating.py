@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import numerical
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
 from ceres_cal.base.frozen import replace
-from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
+from ceres_cal.base.threads import at_most, for_small_matrices, meanwhile
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
@@ -70,7 +70,7 @@ def calibrate(
     options = options or Options()
     require_possible_numbers(observations, options)
     observations, options = free_dimensions(observations, options)
-    with single_threaded_blas(), at_most(options.threads):
+    with for_small_matrices(), at_most(options.threads):
         try:
             return _measured(observations, options, progress, client)
         except (DegenerateError, SolutionError) as error:
@@ -102,7 +102,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     structure = make_structure(observations.targets, options.tolerances, options.dimensions)
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
-    with single_threaded_blas(), at_most(options.threads):
+    with for_small_matrices(), at_most(options.threads):
         return _of_lens(Task(knows=knows), start, sights, options).redrawn()
 
 

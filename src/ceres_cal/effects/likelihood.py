@@ -14,9 +14,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.frozen import Frozen
+from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.effects.strands import ASIDE, StrandFamily, decay
 from ceres_cal.kernels import strands_left
 from ceres_cal.observations import joined
+from ceres_cal.problem.costs import NORMAL_NS
 
 # To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %.
 _SHARES = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.995])
@@ -48,10 +50,15 @@ def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: 
         may_be_smooth: whether errors without edges are looked for, too.
         squared: sum of the squared shared columns over all rows, of which the families show some.
     """
-    parts = [_of_shares(families[0], (0, False, 0.0), np.zeros(1), squared)]
+    places = [(0, False, 0.0)]
     for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
-        parts += [_of_shares(family, (number, smooth, length), _SHARES, squared) for length in _lengths(family)]
-    return joined(parts)
+        places += [(number, smooth, length) for length in _lengths(family)]
+
+    def part(first: int, last: int) -> Likelihoods:
+        return joined([_of_shares(families[place[0]], place, squared) for place in places[first:last]])
+
+    rows = len(places) * len(_SHARES) * max(family.filled.size for family in families)
+    return joined(run_parts(part, parts_of(len(places), rows, NORMAL_NS)))
 
 
 def _lengths(family: StrandFamily) -> list[float]:
@@ -65,12 +72,13 @@ def _lengths(family: StrandFamily) -> list[float]:
     return list(lengths.tolist())
 
 
-def _of_shares(family: StrandFamily, place: tuple[int, bool, float], shares: Array, squared: float) -> Likelihoods:
-    """The restricted likelihood at one place for some shares (A,).
+def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: float) -> Likelihoods:
+    """The restricted likelihood at one place for all shares.
 
     Args:
-        place: number of the family, whether errors have no edges, length; 0 of none.
+        place: number of the family, whether errors have no edges, length; 0 of none, which has no share.
     """
+    shares = _SHARES if place[2] else np.zeros(1)
     fewest_freedom = 3.0  # degrees of freedom that a variance is given at least
     size, count, many = family.columns.shape[2] - 7, int(np.count_nonzero(family.filled)), len(shares)
     values, vectors = np.linalg.eigh(decay(family.distance, place[2] or 1.0, place[1]))

@@ -18,7 +18,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.threads import at_most, available, keep_freed_memory, single_threaded_blas
+from ceres_cal.base.threads import at_most, available, for_small_matrices
 from ceres_cal.base.transforms import Poses
 from ceres_cal.observations.sights import Owner, SightKey
 from ceres_cal.problem.costs import CachedCost, CostValue, Run
@@ -147,7 +147,6 @@ class OnWorkers:
 
 def _kept(group: Sequence[Share]) -> Sequence[Share]:
     """What a worker keeps."""
-    keep_freed_memory()
     return group
 
 
@@ -159,7 +158,7 @@ async def _answered(
     groups = [dask_worker.data[key] for key in keys.values()]
 
     def all_of_them() -> list[_A]:
-        with single_threaded_blas():
+        with for_small_matrices():
             return asked_of(groups, answer, request, 1)
 
     here = dask_worker.address

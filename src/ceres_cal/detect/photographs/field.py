@@ -21,7 +21,7 @@ from ceres_cal.base.errors import (
 )
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.shown import brief
-from ceres_cal.base.threads import single_threaded_blas
+from ceres_cal.base.threads import for_small_matrices
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_colour, read_light
@@ -92,7 +92,7 @@ class FieldOptions(Frozen, eq=True):
     refused: Callable[[Path, SearchResult], None] | None = None
 
 
-@single_threaded_blas()
+@for_small_matrices()
 def detect_field(
     images: Sequence[Path],
     target: Target,

@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.base.executing import each
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.shown import brief, text_of
-from ceres_cal.base.threads import single_threaded_blas
+from ceres_cal.base.threads import for_small_matrices
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.calibration import Calibration, Fit
@@ -85,7 +85,7 @@ class Advice(Frozen):
 
 @checked
 @numerical("the advice")
-@single_threaded_blas()
+@for_small_matrices()
 def advise(
     calibration: Calibration,
     station: str | None = None,
