@@ -24,8 +24,8 @@ from ceres_cal.calibration import Calibration as Calibration
 from ceres_cal.calibration.calibrating import calibrate as calibrate
 from ceres_cal.cli.run_in_python import run as run
 from ceres_cal.diagnostics.advice import advise as advise
-from ceres_cal.diagnostics.diagnose import Diagnosis as Diagnosis
-from ceres_cal.diagnostics.diagnose import diagnose as diagnose
+from ceres_cal.diagnostics.diagnosis import Diagnosis as Diagnosis
+from ceres_cal.diagnostics.diagnosis import diagnose as diagnose
 from ceres_cal.formats import export as export
 from ceres_cal.formats import import_calibration as import_calibration
 from ceres_cal.formats import import_observations as import_observations

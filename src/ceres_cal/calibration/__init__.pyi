@@ -1,4 +1,3 @@
-from ceres_cal.calibration import calibrating as calibrating
 from ceres_cal.calibration.calibration import Calibration as Calibration
 from ceres_cal.calibration.file import FORMAT as FORMAT
 from ceres_cal.calibration.file import CalibrationFile as CalibrationFile

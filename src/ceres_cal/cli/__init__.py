@@ -4,4 +4,6 @@ Only argparse is imported at the top of the commands' modules, so that help and 
 only the one whose command is typed.
 """
 
-from ceres_cal.cli.terminal import main as main
+from ceres_cal.base.frozen import names_of
+
+__getattr__, __dir__, __all__ = names_of(__name__)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import diagnostics, observations, scene
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, command, option
 from ceres_cal.cli.files import read_calibration, station_of
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section, wrapped
-
-if TYPE_CHECKING:
-    from ceres_cal.diagnostics.advice import Advice, Measurement, Promise
 
 
 @command(
@@ -41,14 +39,12 @@ def _run(
     enough = good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
-    from ceres_cal.diagnostics.advice import advise
-    from ceres_cal.scene.targets import checkerboard
 
     known = read_calibration(calibration)
     name = station_of(calibration, station, known)
     with naming(calibration), progress_bar(args.silent) as bar:
-        shown = None if board is None else checkerboard(*board)
-        advice = advise(known, name, arguments.metres(height_mm), enough, shown, bar.update)
+        shown = None if board is None else scene.checkerboard(*board)
+        advice = diagnostics.advise(known, name, arguments.metres(height_mm), enough, shown, bar.update)
     weak = [direction.words for direction in known.uncertainty.weak_directions]
     return Document(tuple(_sections(advice, weak)))
 
@@ -56,7 +52,7 @@ def _run(
 # ---- what is said ---------------------------------------------------------------------------------------------------
 
 
-def _sections(advice: Advice, weak: list[str]) -> Iterator[Section]:
+def _sections(advice: diagnostics.Advice, weak: list[str]) -> Iterator[Section]:
     x, y = advice.worst_place_m
     before, height, verdict = advice.before, f"{1e3 * advice.height_m:.0f} mm", list(_verdict(advice))
     where = f" at ({x:.1f}, {y:.1f} m)" if before.worst_mm < float("inf") else ""
@@ -78,7 +74,7 @@ def _sections(advice: Advice, weak: list[str]) -> Iterator[Section]:
     yield Section("", lines, data)
 
 
-def _verdict(advice: Advice) -> Iterator[str]:
+def _verdict(advice: diagnostics.Advice) -> Iterator[str]:
     before, best, enough = advice.before, advice.best, advice.good_enough_mm
     worst = f"the worst error at {1e3 * advice.height_m:.0f} mm"
     if best is None:
@@ -99,7 +95,7 @@ def _verdict(advice: Advice) -> Iterator[str]:
         yield f"that is still more than the {enough:g} mm asked for: do more than one of these"
 
 
-def _range(promise: Promise) -> str:
+def _range(promise: diagnostics.Promise) -> str:
     """What a promise that depends on phi may become; nothing where it hardly does."""
     if promise.rough:
         return " (roughly: phi stays open)"
@@ -113,7 +109,7 @@ def _mm(value: float) -> str:
     return f"{value:.1f} mm" if value >= 0.95 else f"{value:.2f} mm"
 
 
-def _promise_data(promise: Promise) -> dict[str, Any]:
+def _promise_data(promise: diagnostics.Promise) -> dict[str, Any]:
     return {
         **_measurement_data(promise.measurement),
         **vars(promise.after),
@@ -123,15 +119,13 @@ def _promise_data(promise: Promise) -> dict[str, Any]:
     }
 
 
-def _measurement_data(measurement: Measurement) -> dict[str, Any]:
+def _measurement_data(measurement: diagnostics.Measurement) -> dict[str, Any]:
     """The measurement as files of observations have its parts."""
-    from ceres_cal.observations import prior_to_json
-
     return {
         "kind": measurement.kind,
         "words": measurement.words,
         "steps": list(measurement.steps),
-        "priors": [prior_to_json(prior) for prior in measurement.priors],
+        "priors": [observations.prior_to_json(prior) for prior in measurement.priors],
         "targets": {name: target.spec for name, target in measurement.targets.items()},
         "tolerances": measurement.tolerances,
         "placements": {

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from ceres_cal import observations, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import did_you_mean, printable
 from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
@@ -16,7 +17,6 @@ from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
 if TYPE_CHECKING:
     from ceres_cal.observations import Prior
     from ceres_cal.problem.parameters import Options
-    from ceres_cal.scene.targets import Target
 
 _T = TypeVar("_T")
 PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
@@ -233,8 +233,6 @@ def parse_prior(spec: str, owners: Mapping[str, Collection[str]], quantities: Ma
     Args:
         owners: names of stations, and of cameras. quantities: those that may be named, of a station and of a camera.
     """
-    from ceres_cal.observations import prior_from_json
-
     where = f"--prior {spec!r}"
     left, equals, right = spec.rpartition("=")
     values, colon, sigmas = right.partition(":")
@@ -254,7 +252,7 @@ def parse_prior(spec: str, owners: Mapping[str, Collection[str]], quantities: Ma
     if name not in owners[owner]:
         raise InputError(f"{where}: name one {owner} before the dot: {', '.join(owners[owner])}")
     spread = {"sigma_m" if owner == "station" else "sigma": sigma[0] if len(sigma) == 1 else list(sigma)}
-    return prior_from_json({owner: name, quantity: list(parse(values, where)), **spread}, where)
+    return observations.prior_from_json({owner: name, quantity: list(parse(values, where)), **spread}, where)
 
 
 def parse_priors(specs: Sequence[str], owners: Mapping[str, Collection[str]], options: Options) -> list[Prior]:
@@ -263,7 +261,7 @@ def parse_priors(specs: Sequence[str], owners: Mapping[str, Collection[str]], op
     return [parse_prior(spec, owners, quantities) for spec in specs]
 
 
-def parse_estimates(specs: Sequence[str], targets: Mapping[str, Target]) -> tuple[Prior, ...]:
+def parse_estimates(specs: Sequence[str], targets: Mapping[str, scene.Target]) -> tuple[Prior, ...]:
     """What is known of dimensions of targets by `--estimate` arguments: [TARGET.]NAME[=VALUE[:SIGMA]],...
 
     Raises:
@@ -276,7 +274,7 @@ def parse_estimates(specs: Sequence[str], targets: Mapping[str, Target]) -> tupl
     return tuple(every)
 
 
-def _parsed(text: str, targets: Mapping[str, Target]) -> Prior:
+def _parsed(text: str, targets: Mapping[str, scene.Target]) -> Prior:
     from ceres_cal.observations import Prior
     from ceres_cal.problem.quantities import dimension_range
 

@@ -8,16 +8,14 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import base, cli, report
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import DASH, counted, mm, plural, printable
 from ceres_cal.cli.arguments import jobs_option, output_option
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
 from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile, Tiles
-
-if TYPE_CHECKING:
-    from ceres_cal.cli.jobs import Job, Outcome
 
 _COMMANDS = ("calibrate", "check", "refit")
 _READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
@@ -53,22 +51,18 @@ def _run(
     jobs: int = jobs_option("jobs", 0),
     reports: bool = switch("a report of each calibrate and refit, too"),
 ) -> Document:
-    from ceres_cal.base.executing import processes
-    from ceres_cal.base.files import make_folder, write_bytes
-    from ceres_cal.cli.jobs import run_jobs
-
     planned = plan_jobs(plan, output, options, reports=reports)
-    make_folder(output)
+    base.make_folder(output)
     outcomes, again = [], 0
-    with processes(jobs if len(planned) > 1 else 1) as executor:
-        for outcome, is_old in run_jobs(planned, work, output, executor):
+    with base.processes(jobs if len(planned) > 1 else 1) as executor:
+        for outcome, is_old in cli.run_jobs(planned, work, output, executor):
             outcomes.append(outcome)
             again += is_old
             if not args.silent:
                 print(_line(outcome, len(outcomes), len(planned), is_old), file=sys.stdout, flush=True)
     pages = {job.name: file.name for job in planned for file in job.outputs if file.suffix == ".html" and file.exists()}
     page = output / _SUMMARY
-    write_bytes(page, summary_page(printable(plan.resolve().name), outcomes, pages).encode())
+    base.write_bytes(page, summary_page(printable(plan.resolve().name), outcomes, pages).encode())
     worst = min(outcomes, key=lambda one: one.order).level
     return Document(_sections(str(page), outcomes, again), _EXIT_CODES.get(worst, 0))
 
@@ -76,7 +70,7 @@ def _run(
 # ---- jobs -----------------------------------------------------------------------------------------------------------
 
 
-def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False) -> list[Job]:
+def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False) -> list[cli.Job]:
     """The jobs of a plan, with all that `work` needs; what they write goes into the folder `to`.
 
     Args:
@@ -85,11 +79,9 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
     Raises:
         InputError: the plan cannot be read, or a row is wrong usage of its command; it says which.
     """
-    from ceres_cal.cli.jobs import read_plan, words_of
-
     base = plan if plan.is_dir() else plan.parent
-    of_all, jobs = words_of(options, "--options"), []
-    for row in read_plan(plan):
+    of_all, jobs = cli.words_of(options, "--options"), []
+    for row in cli.read_plan(plan):
         more = of_all if row.command == "calibrate" else []
         try:
             jobs.append(_job(row.name, row.command, [*row.arguments, *more], base, to, reports))
@@ -98,9 +90,7 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
     return jobs
 
 
-def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path, reports: bool) -> Job:
-    from ceres_cal.cli.jobs import Job
-
+def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path, reports: bool) -> cli.Job:
     if command not in _COMMANDS:
         raise InputError(f"there is no command {command!r} for a batch: {', '.join(_COMMANDS)}")
     if not _OWN.isdisjoint(argument.partition("=")[0] for argument in arguments):
@@ -109,7 +99,7 @@ def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path
     parsed = COMMANDS[command].parse([*arguments, *_written(outputs)])
     named = [str(one) for what in _READ for one in _every(getattr(parsed, what, None))]
     placed = tuple(str(base / one) if one in named else one for one in arguments)
-    return Job(name, command, placed, tuple(file for one in named for file in _files(base / one)), outputs)
+    return cli.Job(name, command, placed, tuple(file for one in named for file in _files(base / one)), outputs)
 
 
 def _every(value: Any) -> list[Any]:
@@ -127,7 +117,7 @@ def _files(path: Path) -> list[Path]:
     return [path] if path.exists() else [Path(one) for one in sorted(glob.glob(str(path)))] or [path]  # noqa: PTH207
 
 
-def work(job: Job) -> Outcome:
+def work(job: cli.Job) -> cli.Outcome:
     """Do one job, by its command.
 
     Raises:
@@ -137,10 +127,8 @@ def work(job: Job) -> Outcome:
     return _of_check(job, data) if job.command == "check" else _of_calibration(job, data)
 
 
-def _of_calibration(job: Job, data: Mapping[str, Any]) -> Outcome:
+def _of_calibration(job: cli.Job, data: Mapping[str, Any]) -> cli.Outcome:
     import numpy as np
-
-    from ceres_cal.cli.jobs import Outcome
 
     verdict, known = data["verdict"], data["uncertainty"] or {"maps": {}}
     radii = [float(np.nanmax(one["radius_95_mm"], initial=0.0)) for maps in known["maps"].values() for one in maps]
@@ -150,30 +138,28 @@ def _of_calibration(job: Job, data: Mapping[str, Any]) -> Outcome:
     unmade = [f"no {what}: {why}" for what, why in data.get("not_made", {}).items()]
     level = "care" if unmade and verdict["level"] == "good" else verdict["level"]
     told = (*unmade, *reasons)[:_MOST_REASONS]
-    return Outcome(job.name, job.command, level, verdict["headline"], told, worst)
+    return cli.Outcome(job.name, job.command, level, verdict["headline"], told, worst)
 
 
-def _of_check(job: Job, data: Mapping[str, Any]) -> Outcome:
-    from ceres_cal.cli.jobs import Outcome
-
+def _of_check(job: cli.Job, data: Mapping[str, Any]) -> cli.Outcome:
     stations = data["stations"]
     said = [f"{name} {one['words']}" for name, one in stations.items() if not one["holds"]]
     moved = [one["moved_mm"] for one in stations.values() if math.isfinite(one["moved_mm"])]
     line = said[0] if said else f"{', '.join(stations)}: as calibrated"
     level, worst = "good" if data["holds"] else "no", max(moved) if moved else None
-    return Outcome(job.name, job.command, level, line, tuple(said[1:][:_MOST_REASONS]), worst)
+    return cli.Outcome(job.name, job.command, level, line, tuple(said[1:][:_MOST_REASONS]), worst)
 
 
 # ---- what is said ---------------------------------------------------------------------------------------------------
 
 
-def _line(outcome: Outcome, number: int, total: int, is_old: bool) -> str:
+def _line(outcome: cli.Outcome, number: int, total: int, is_old: bool) -> str:
     width = len(str(total))
     before = " (from before)" if is_old else ""
     return f"{outcome.level:10}{number:{width}} of {total}  {outcome.job}: {outcome.line}{before}"
 
 
-def _sections(page: str, outcomes: Sequence[Outcome], again: int) -> tuple[Section, ...]:
+def _sections(page: str, outcomes: Sequence[cli.Outcome], again: int) -> tuple[Section, ...]:
     count = Counter(one.level for one in outcomes)
     levels = ", ".join(f"{count[level]} {level}" for level in ("good", "care", "no", "failed") if count[level])
     before = f"; {again} from before" if again else ""
@@ -188,22 +174,20 @@ def _sections(page: str, outcomes: Sequence[Outcome], again: int) -> tuple[Secti
 # ---- the page: what needs attention first ----------------------------------------------------------------------------
 
 
-def summary_page(title: str, outcomes: Sequence[Outcome], links: dict[str, str]) -> str:
+def summary_page(title: str, outcomes: Sequence[cli.Outcome], links: dict[str, str]) -> str:
     """The page.
 
     Args:
         links: a job's name -> file beside the page to look at.
     """
     most_cards = 40
-    from ceres_cal.cli.jobs import LEVELS
-    from ceres_cal.report.page import page
 
     ranked = sorted(outcomes, key=lambda one: one.order)
     attention = [one for one in ranked if one.level != "good"]
     count = Counter(one.level for one in outcomes)
     level = _LEVELS.get(ranked[0].level, ranked[0].level)
     how = f"{counted(len(attention), 'job')} of {len(ranked)} to look at" if attention else "Nothing to look at"
-    tiles = Tiles(tuple(Tile(_WORDS[name], str(count[name]), "", "", _LEVELS.get(name, name)) for name in LEVELS))
+    tiles = Tiles(tuple(Tile(_WORDS[name], str(count[name]), "", "", _LEVELS.get(name, name)) for name in cli.LEVELS))
     chapters = [Chapter("verdict", f"{how}.", (tiles,), level)]
     if attention:
         cards: list[Piece] = [_card(one, links.get(one.job, "")) for one in attention[:most_cards]]
@@ -216,10 +200,12 @@ def summary_page(title: str, outcomes: Sequence[Outcome], links: dict[str, str])
     )
     table = Table(("job", "command", "level", "worst", "what it says"), rows, stacked=True, most=len(rows))
     chapters.append(Chapter("jobs", "All jobs", (table,)))
-    return page(title, counted(len(ranked), "job"), chapters, "Written by ceres-cal batch.", "Batch summary")
+    return report.page.page(
+        title, counted(len(ranked), "job"), chapters, "Written by ceres-cal batch.", "Batch summary"
+    )
 
 
-def _card(one: Outcome, link: str) -> Card:
+def _card(one: cli.Outcome, link: str) -> Card:
     facts = [one.command, one.level] + ([] if one.worst_mm is None else [f"worst {mm(one.worst_mm)}"])
     reasons = " ".join(one.reasons)
     return Card(_LEVELS.get(one.level, one.level), f"{one.job}: {one.line}", reasons, tuple(facts), link)

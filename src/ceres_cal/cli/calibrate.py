@@ -9,6 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ceres_cal import diagnostics, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import replace
 from ceres_cal.cli import arguments, files
@@ -29,11 +30,9 @@ _CAMERA, _SOLVE = "the camera", "the solve"
 
 def _lens_kind(name: str) -> str:
     """A kind of lens that is in the table; the default needs none, nor do help and wrong usage."""
-    if name != _AUTO:
-        from ceres_cal.scene.lens import LENSES
-
-        if name not in LENSES:
-            raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {', '.join(map(repr, (*LENSES, _AUTO)))})")
+    if name != _AUTO and name not in scene.LENSES:
+        known = ", ".join(map(repr, (*scene.LENSES, _AUTO)))
+        raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {known})")
     return name
 
 
@@ -138,13 +137,12 @@ def _run(args: CalibrateArguments) -> Document:
     options = _options(args, observations, fixed=fixed, powers=powers)
     with progress_bar(args.silent) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
-        from ceres_cal.diagnostics.labels import mended, renamings
 
         workers = {} if client is None else {"client": client}
         calibration = calibrate(observations, options, _solve_progress(bar), **workers)
-        wrong = tuple(renamings(observations, calibration)) if calibration.rounds else ()
+        wrong = tuple(diagnostics.renamings(observations, calibration)) if calibration.rounds else ()
         if wrong and args.mend_labels:
-            observations = mended(observations, wrong)
+            observations = diagnostics.mended(observations, wrong)
             calibration = calibrate(observations, options, _solve_progress(bar), **workers)
     told = (f"{one.words}: {'renamed' if args.mend_labels else 'is it (--mend-labels)?'}" for one in wrong)
     calibration = replace(calibration, warnings=(*calibration.warnings, *told))
@@ -186,9 +184,8 @@ def _solve_progress(bar: ProgressBar) -> SolveProgress:
 def _powers(args: CalibrateArguments) -> tuple[int, ...]:
     if args.powers is None:
         return ()
-    from ceres_cal.scene.lens import LENSES
 
-    choosing = [kind for kind, lens in LENSES.items() if lens.trial_powers]
+    choosing = [kind for kind, lens in scene.LENSES.items() if lens.trial_powers]
     if args.lens not in (None, *choosing):
         raise InputError(f"--powers is for the {' or '.join(choosing)} lens, not for {args.lens}: leave it out")
     try:

@@ -192,7 +192,6 @@ def _escaped(text: str) -> str:
 
 def _of_forms(forms: Iterable[Any]) -> Mapping[str, list[str]]:
     """Every option of some formats, with what it means to each of them."""
-
     every: dict[str, list[str]] = {}
     for form in forms:
         for name, (_, text) in form.options.items():

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from ceres_cal import detect, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import images_and_videos
 from ceres_cal.cli.arguments import frames_option, length, number, parse_length, parse_lengths
@@ -14,11 +15,6 @@ from ceres_cal.cli.files import read_target, require_observations_output, save
 from ceres_cal.cli.photographs import DetectArguments, detected, missed_section
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
-
-if TYPE_CHECKING:
-    from ceres_cal.detect.boards import BoardDetections
-    from ceres_cal.detect.rings import RingsDetection
-    from ceres_cal.scene.targets import Target
 
 
 class BoardArguments(QuietArguments, DetectArguments):
@@ -93,9 +89,7 @@ def _run_board(args: BoardArguments) -> Document:
 _OF_A_BOARD = ("columns", "rows", "square", "april_grid", "gap", "circles", "diameter")
 
 
-def _board(args: BoardArguments) -> Target:
-    from ceres_cal.scene.targets import april_grid, checkerboard, circle_grid
-
+def _board(args: BoardArguments) -> scene.Target:
     if args.target is not None:
         if given := [flag(name) for name in _OF_A_BOARD if getattr(args, name) is not None]:
             raise InputError(f"--target says what the board is: leave out {' and '.join(given)}")
@@ -105,16 +99,16 @@ def _board(args: BoardArguments) -> Target:
     if sum(size is not None for size in (args.square, args.circles, args.april_grid)) != 1:
         raise InputError("--square M, --circles M or --april-grid M, by the kind of board: give one of them")
     if args.square is not None:
-        return checkerboard(args.columns, args.rows, args.square)
+        return scene.checkerboard(args.columns, args.rows, args.square)
     if args.charuco is not None:
         raise InputError("--charuco is for a board of squares: give --square M")
     if args.april_grid is not None:
-        return april_grid(args.columns, args.rows, args.april_grid, args.gap or 0.0)
+        return scene.april_grid(args.columns, args.rows, args.april_grid, args.gap or 0.0)
     distance, diameter = args.circles or 0.0, args.diameter or 0.0
-    return circle_grid(args.columns, args.rows, distance, diameter, asymmetric=args.asymmetric)
+    return scene.circle_grid(args.columns, args.rows, distance, diameter, asymmetric=args.asymmetric)
 
 
-def _document(detections: BoardDetections, output: Path) -> Document:
+def _document(detections: detect.BoardDetections, output: Path) -> Document:
     corners, found, missed = len(detections.observations.points), detections.found, detections.missed
     said = f"{len(found)} of {len(found) + len(missed)} images show the board, {corners} corners in all"
     return Document(
@@ -153,14 +147,13 @@ def _run(
     ),
 ) -> Document:
     require_observations_output(args.output, [image])
-    from ceres_cal.detect.rings import detect_rings
 
-    detection = detected(args.timeout, partial(detect_rings, image, radii, args.camera, args.station))
+    detection = detected(args.timeout, partial(detect.detect_rings, image, radii, args.camera, args.station))
     save(args.output, detection.observations)
     return _rings_document(detection, image, len(radii), args.output)
 
 
-def _rings_document(detection: RingsDetection, image: str, asked: int, output: Path) -> Document:
+def _rings_document(detection: detect.RingsDetection, image: str, asked: int, output: Path) -> Document:
     a1, a2, a3 = detection.polynomial.tolist()
     (x, y), edges, lens = detection.centre.tolist(), len(detection.observations.curves), {"a2": a2 / a1, "a3": a3 / a1}
     lines = [

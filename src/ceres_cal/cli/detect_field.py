@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal import calibration, detect, report, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import images_and_videos
 from ceres_cal.base.words import plural
@@ -18,9 +19,6 @@ from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.detect.photographs import Clicks, FieldDetections, SearchResult
-    from ceres_cal.scene.camera import Camera
-    from ceres_cal.scene.targets import Target
 
 _CORNER = "TopLeftCorner=102,88"
 
@@ -132,18 +130,18 @@ def _run(args: FieldArguments) -> Document:
     return Document(tuple(_sections(detections, merged, args.output)))
 
 
-def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResult], None] | None:
+def _drawing(picture: Path | None, target: scene.Target) -> Callable[[Path, detect.SearchResult], None] | None:
     """Draws what was seen in the first photograph that is refused."""
     if picture is None:
         return None
-    from ceres_cal.detect.images import encoded, read_colour
-    from ceres_cal.report.pictures.overlay import draw_seen
 
     drawn: list[Path] = []
 
-    def draw(path: Path, result: SearchResult) -> None:
+    def draw(path: Path, result: detect.SearchResult) -> None:
         if not drawn:
-            files.save(picture, encoded(draw_seen(read_colour(path), result.seen, target), ".png", 90))
+            files.save(
+                picture, detect.encoded(report.draw_seen(detect.read_colour(path), result.seen, target), ".png", 90)
+            )
             drawn.append(path)
 
     return draw
@@ -160,20 +158,17 @@ def _require_fitting(args: FieldArguments) -> None:
 # ---- where to start -------------------------------------------------------------------------------------------------
 
 
-def _start(path: Path, *, auto: bool) -> Calibration | Clicks:
-    from ceres_cal.calibration import FORMAT, Calibration
-    from ceres_cal.detect.photographs import load_clicks
+def _start(path: Path, *, auto: bool) -> Calibration | detect.Clicks:
+    from ceres_cal.calibration import Calibration
 
-    if files.json_object(path).get("format") == FORMAT:
+    if files.json_object(path).get("format") == calibration.FORMAT:
         return Calibration.load(path)
     if auto:
         raise InputError(f"{path}: --auto takes a calibration as start, no corners: leave out --auto, or the file")
-    return load_clicks(path)
+    return detect.load_clicks(path)
 
 
-def _corners(specs: Sequence[str]) -> Clicks:
-    from ceres_cal.detect.photographs import Clicks
-
+def _corners(specs: Sequence[str]) -> detect.Clicks:
     form = f"NAME=X,Y, such as {_CORNER}"
 
     def pixel(text: str, where: str) -> tuple[float, float]:
@@ -182,13 +177,13 @@ def _corners(specs: Sequence[str]) -> Clicks:
             raise InputError(f"{where}: write {form}")
         return numbers[0], numbers[1]
 
-    return Clicks(arguments.named_values("--corner", form, pixel, specs))
+    return detect.Clicks(arguments.named_values("--corner", form, pixel, specs))
 
 
 # ---- the answer -----------------------------------------------------------------------------------------------------
 
 
-def _sections(detections: FieldDetections, merged: dict[str, Any], output: Path) -> Iterator[Section]:
+def _sections(detections: detect.FieldDetections, merged: dict[str, Any], output: Path) -> Iterator[Section]:
     observations, images = detections.observations, [_image_data(path, detections) for path in detections.found]
     points, curves = len(observations.points), len(observations.curves)
     every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
@@ -207,7 +202,7 @@ def _sections(detections: FieldDetections, merged: dict[str, Any], output: Path)
     yield Section("", [f"written to {output}"], {"output": str(output)})
 
 
-def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
+def _image_data(path: str, detections: detect.FieldDetections) -> dict[str, Any]:
     lines = detections.found[path].lines
     sigmas = sorted(lines.sigma_px[lines.found])
     data = {
@@ -228,7 +223,7 @@ def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
     return data
 
 
-def _stretched(camera: Camera) -> bool:
+def _stretched(camera: scene.Camera) -> bool:
     """Whether its pixels are farther from square than those of cameras."""
     square = 0.005  # of fy / fx: those of cameras are nearer to 1
     return abs(camera.aspect - 1.0) > square

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ceres_cal import diagnostics, report
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
@@ -35,18 +36,15 @@ def _run(
     if held_out and new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
     from ceres_cal.calibration.calibrating import lens_by_held_out
-    from ceres_cal.diagnostics import diagnose
 
     solved, seen = files.read_calibration(calibration), files.read_observations(observations)
     photographs = files.report_photographs(args, seen)
-    diagnosis = diagnose(solved, seen, new_data=new_data, false_alarm_rate=false_alarms)
+    diagnosis = diagnostics.diagnose(solved, seen, new_data=new_data, false_alarm_rate=false_alarms)
     choice = lens_by_held_out(seen, solved.options) if held_out else None
     page, unmade = files.report_page(args, solved, seen, photographs, diagnosis, choice)
-    from ceres_cal.report.findings import diagnosis_sections
-    from ceres_cal.report.grounds import is_against
 
     # Wrong labels that were taken out do no harm, and a noise is estimated.
-    against = [finding for finding in diagnosis.findings if strict or is_against(finding)]
-    answer = tuple(diagnosis_sections(diagnosis, choice, solved.options))
+    against = [finding for finding in diagnosis.findings if strict or report.is_against(finding)]
+    answer = tuple(report.diagnosis_sections(diagnosis, choice, solved.options))
     sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))
     return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)

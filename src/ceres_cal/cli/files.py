@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ceres_cal import base, detect, diagnostics, observations, report, scene
 from ceres_cal.base.errors import CalibrationError, InputError, attempt
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import no_such
@@ -20,41 +21,34 @@ from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration, LensChoice
-    from ceres_cal.diagnostics import Diagnosis
     from ceres_cal.observations import Observations
     from ceres_cal.problem.quantities import Range
-    from ceres_cal.report import FramePhotographs
-    from ceres_cal.scene.targets import Target
 
 T = TypeVar("T")
 
 
-def spelled_target(text: str, where: str) -> Target | None:
+def spelled_target(text: str, where: str) -> scene.Target | None:
     """The target that somebody spelled out as `{"kind": ...}`; None for anything else, such as a name or a file."""
     if not text.lstrip().startswith("{"):
         return None
-    from ceres_cal.base.files import parse_json
-    from ceres_cal.scene.targets import target_from_spec
 
-    return target_from_spec(parse_json(text.encode(), where), where)
+    return scene.target_from_spec(base.parse_json(text.encode(), where), where)
 
 
-def read_target(text: str, name: str) -> Target:
+def read_target(text: str, name: str) -> scene.Target:
     """The target of `--target`: by its name, spelled out, or in a file, alone or as one of that name among several."""
-    from ceres_cal.scene.targets import target_from_spec, target_named, targets_by_name
-
     if (spelled := spelled_target(text, "--target")) is not None:
         return spelled
-    if (known := target_named(text)) is not None:
+    if (known := scene.target_named(text)) is not None:
         return known
     if not Path(text).exists():
-        raise InputError(f"--target: {no_such('target', text, targets_by_name())} (or a file)")
+        raise InputError(f"--target: {no_such('target', text, scene.targets_by_name())} (or a file)")
     content = json_object(Path(text))
     named = content.get("targets")
     spec = named.get(name) if isinstance(named, dict) else content
     if not isinstance(spec, dict):
         raise InputError(f"{text}: it holds no target named {name!r}")
-    return target_from_spec(spec, text)
+    return scene.target_from_spec(spec, text)
 
 
 def require_shown(
@@ -64,26 +58,23 @@ def require_shown(
     priors: Sequence[str],
     cameras: Sequence[str] = ("camera",),
     lens: str = "auto",
-) -> Target | None:
+) -> scene.Target | None:
     """The field that photographs are to show; InputError, before any is searched, where what is said of it, of the
     board or of the camera cannot be.
     """
-    from ceres_cal.detect.boards import finder_of
-    from ceres_cal.detect.images import read_colour
     from ceres_cal.problem.parameters import Options
     from ceres_cal.problem.quantities import camera_ranges, place_range
-    from ceres_cal.scene.targets import checkerboard
 
     least = 0.1  # of the picture's diagonal, that a field is large which can be found
     if board is not None:
-        finder_of(checkerboard(*parse_board(board)))
+        detect.finder_of(scene.checkerboard(*parse_board(board)))
     field = None if target is None else read_target(target, "field")
     for prior in parse_priors(priors, {"station": cameras, "camera": cameras}, Options(lens=lens)):
         bounds: list[Range] = []
         if field is not None and prior.owner == "station":
             bounds = [place_range(field.places, least, "a tenth of the picture")] * len(prior.value)
         elif images and prior.owner == "camera":
-            height, width = read_colour(images[0]).shape[:2]
+            height, width = detect.read_colour(images[0]).shape[:2]
             bounds = list(camera_ranges(prior.quantity, (width, height), None))
         for bound, value in zip(bounds, prior.value, strict=False):
             bound.require(value, f"the prior on {prior.quantity}")
@@ -92,9 +83,7 @@ def require_shown(
 
 def json_object(path: Path) -> Mapping[str, Any]:
     """What a file holds; InputError where it is no JSON object."""
-    from ceres_cal.base.files import parse_json, read_bytes
-
-    content = parse_json(read_bytes(path), str(path))
+    content = base.parse_json(base.read_bytes(path), str(path))
     if not isinstance(content, dict):
         raise InputError(f"{path}: it must hold one JSON object")
     return content
@@ -119,9 +108,9 @@ def read_calibration(path: Path) -> Calibration:
 
 def read_observations(paths: Iterable[str | Path]) -> Observations:
     """All files of observations as one."""
-    from ceres_cal.observations import Observations, combine
+    from ceres_cal.observations import Observations
 
-    return combine([Observations.load(path) for path in paths])
+    return observations.combine([Observations.load(path) for path in paths])
 
 
 def station_of(path: Path, station: str | None, calibration: Calibration) -> str:
@@ -193,27 +182,23 @@ def finishing() -> Iterator[None]:
 
 def save(path: Path, made: Any) -> None:
     """Write a result whole or not at all: bytes, names and values as JSON, or what saves itself."""
-    from ceres_cal.base.files import write_bytes, write_json
-
     with finishing():
         if isinstance(made, bytes):
-            write_bytes(path, made)
+            base.write_bytes(path, made)
         elif isinstance(made, Mapping):
-            write_json(path, made)
+            base.write_json(path, made)
         else:
             made.save(path)
 
 
 def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> Section:
     """Write the output by `save`, and the page of the report where there is one; the section names the files."""
-    from ceres_cal.base.files import write_bytes
-
     report = None if page is None else args.report
     with finishing():
         if args.output is not None:
             save(args.output)
         if page is not None and report is not None:
-            write_bytes(report, page.encode())
+            base.write_bytes(report, page.encode())
     paths = {"output": args.output, "report": report}
     named = {name: None if path is None else str(path) for name, path in paths.items()}
     return Section("written", [path for path in named.values() if path is not None], named)
@@ -238,7 +223,7 @@ def report_photographs(
     observations: Observations,
     before: Calibration | None = None,
     detected_in: Sequence[Path] = (),
-) -> FramePhotographs | None:
+) -> report.FramePhotographs | None:
     """The photographs of `--report PAGE --images FOLDER` that belong to the observations' frames; None without any.
 
     Args:
@@ -250,33 +235,30 @@ def report_photographs(
     images = image_files(args.images) if args.images else list(detected_in)
     if not images or args.report is None:
         return None
-    from ceres_cal.report import FramePhotographs
-    from ceres_cal.report.pictures.frames import photographs_of
 
-    known = photographs_of(images, observations)
+    known = report.photographs_of(images, observations)
     if not known:
         raise InputError(
             f"none of the {len(images)} images is called like a frame of the observations, such as "
             f"{observations.views[0].frame!r}: --images takes the photographs that were observed"
         )
-    return FramePhotographs(known, before)
+    return report.FramePhotographs(known, before)
 
 
 def report_page(
     args: ReportArguments,
     calibration: Calibration,
     observations: Observations,
-    photographs: FramePhotographs | None,
-    diagnosis: Diagnosis | None = None,
+    photographs: report.FramePhotographs | None,
+    diagnosis: diagnostics.Diagnosis | None = None,
     choice: LensChoice | None = None,
 ) -> tuple[str | None, Section]:
     """The page that --report asks for, or None; see `attempted`."""
     if args.report is None:
         return None, Section()
-    from ceres_cal.report import make_report
 
     with progress_bar(args.silent) as bar:
-        make = partial(make_report, calibration, observations, diagnosis, choice, photographs, bar.update)
+        make = partial(report.make_report, calibration, observations, diagnosis, choice, photographs, bar.update)
         return attempted("report", make)
 
 
@@ -284,17 +266,14 @@ def calibrated(
     args: ReportArguments,
     calibration: Calibration,
     observations: Observations,
-    photographs: FramePhotographs | None,
+    photographs: report.FramePhotographs | None,
     names: Sequence[str],
     *before: Section,
 ) -> Document:
     """What was calibrated from observations of these names, once it and its report are written; `before`: what is said
     first.
     """
-    from ceres_cal.report.quality import quality_of
-    from ceres_cal.report.summary import calibration_sections
-
     page, unmade = report_page(args, calibration, observations, photographs)
-    answer = calibration_sections(quality_of(calibration, observations), names)
+    answer = report.calibration_sections(report.quality_of(calibration, observations), names)
     written = write_results(args, calibration.save, page)
     return Document((*before, *answer, unmade, written), 1 if unmade.data else 0)

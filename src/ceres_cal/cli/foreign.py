@@ -6,8 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import base, formats, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import replace
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
@@ -15,29 +16,20 @@ from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, 
 from ceres_cal.cli.files import read_calibration, require_output, save
 from ceres_cal.report.document import Document, Section
 
-if TYPE_CHECKING:
-    from ceres_cal.formats import Exported, ExportFormat, Group, ImportFormat
-    from ceres_cal.scene.targets import Target
-
-
 # ---- export ---------------------------------------------------------------------------------------------------------
 
 
-def _export_forms() -> Mapping[str, ExportFormat]:
+def _export_forms() -> Mapping[str, formats.ExportFormat]:
     """The formats that are written, by name."""
-    from ceres_cal.formats import EXPORT_FORMATS
-
-    return EXPORT_FORMATS
+    return formats.EXPORT_FORMATS
 
 
-def _import_forms() -> Mapping[str, ImportFormat]:
+def _import_forms() -> Mapping[str, formats.ImportFormat]:
     """The formats that are read, by name."""
-    from ceres_cal.formats import IMPORT_FORMATS
-
-    return IMPORT_FORMATS
+    return formats.IMPORT_FORMATS
 
 
-def _listed(forms: Iterable[ExportFormat | ImportFormat]) -> str:
+def _listed(forms: Iterable[formats.ExportFormat | formats.ImportFormat]) -> str:
     """What there is to choose from."""
     return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
 
@@ -60,13 +52,11 @@ def export(
     options: Mapping[str, str] = options_of(lambda: _export_forms().values()),
 ) -> Document:
     """A calibration in another format."""
-    from ceres_cal.formats import export_format, prepare_export
-
-    form = export_format(to)
+    form = formats.export_format(to)
     if form.endings:
         require_output(output, [calibration])
     typed = _typed(options, [form])
-    exported = prepare_export(read_calibration(calibration), form.name, output, station or None, typed)
+    exported = formats.prepare_export(read_calibration(calibration), form.name, output, station or None, typed)
     exported.require_loss_mm(max_loss_mm)
     save(output, exported)
     about = {"format": form.name, "output": str(output), **exported.facts}
@@ -83,7 +73,9 @@ export_table = replace(
 )
 
 
-def _typed(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
+def _typed(
+    given: Mapping[str, str], forms: Sequence[formats.ExportFormat] | Sequence[formats.ImportFormat]
+) -> dict[str, Any]:
     """What was given of the formats' options, of the types that they have."""
     import msgspec
 
@@ -100,10 +92,8 @@ def _typed(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[Im
     return options
 
 
-def _losses(exported: Exported) -> Iterator[Section]:
+def _losses(exported: formats.Exported) -> Iterator[Section]:
     """What is lost, in px and mm, and what else to know."""
-    from ceres_cal.formats import loss_words
-
     every = exported.losses
     errors = [
         {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
@@ -113,7 +103,7 @@ def _losses(exported: Exported) -> Iterator[Section]:
     shown = [(loss.station, loss.image_px) for loss in every if loss.image_px is not None]
     errors_px = [{"station": name, "rms_px": rms, "worst_px": worst} for name, (rms, worst) in shown]
     yield Section(data={"errors": errors, "errors_px": errors_px, "warnings": list(exported.warnings)})
-    yield from (Section("off", [text]) for loss in every for text in loss_words(loss))
+    yield from (Section("off", [text]) for loss in every for text in formats.loss_words(loss))
     yield from (Section("warning", [text]) for text in exported.warnings)
 
 
@@ -150,11 +140,10 @@ def _import(
     output: Path = output_option("the calibration or the observations (.json; observations also .npz)"),
     options: Mapping[str, str] = import_options(),
 ) -> Document:
-    from ceres_cal.formats import read_foreign
     from ceres_cal.observations import Observations
 
     require_output(output, [file])
-    given = read_foreign(file, form, **typed_options(options, form))
+    given = formats.read_foreign(file, form, **typed_options(options, form))
     save(output, given)
     path, place = str(output), f"written to {output}"
     if isinstance(given, Observations):
@@ -178,10 +167,8 @@ class GroupArguments(Arguments):
     interface: str = option("of the own network card; default: the system's choice", "IP", "0.0.0.0")
 
 
-def _group(args: GroupArguments) -> Group:
-    from ceres_cal.formats import Group
-
-    return Group(args.address, args.port, args.interface)
+def _group(args: GroupArguments) -> formats.Group:
+    return formats.Group(args.address, args.port, args.interface)
 
 
 @command(
@@ -201,13 +188,10 @@ def _publish(
         "refuse what the message would get wrong by more on the field", "MM", read=length("mm")
     ),
 ) -> Document:
-    from ceres_cal.base.files import read_bytes
-    from ceres_cal.formats import publish, ssl_packet
-
-    before = None if geometry is None else read_bytes(geometry)
-    packet, exported = ssl_packet(read_calibration(calibration), station or None, camera_id, before)
+    before = None if geometry is None else base.read_bytes(geometry)
+    packet, exported = formats.ssl_packet(read_calibration(calibration), station or None, camera_id, before)
     exported.require_loss_mm(max_loss_mm)
-    sent = publish(packet, _group(args), 1 if once else None)
+    sent = formats.publish(packet, _group(args), 1 if once else None)
     words = f"{exported.words}, {len(packet)} bytes, {sent} times to {args.address}:{args.port}"
     lost = [
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
@@ -227,13 +211,11 @@ def _listen(
     output: Path = output_option("the field as a target (.json), or the whole geometry (.pb, .yml)"),
     seconds: float = option("how long to wait", "S", 10.0),
 ) -> Document:
-    from ceres_cal.formats import geometry_content, received_geometry
-
     require_output(output, [], "a field is", ".json", ".pb", ".yml", ".yaml")
-    heard = received_geometry(_group(args), seconds)
+    heard = formats.received_geometry(_group(args), seconds)
     if output.suffix == ".json":
         return _write_target(heard.field, output, heard.sender)
-    save(output, geometry_content(heard.geometry, output.suffix))
+    save(output, formats.geometry_content(heard.geometry, output.suffix))
     ids = [entry["camera_id"] for entry in heard.geometry.get("calib", [])]
     words = f"a field and cameras {ids} from {heard.sender}, written to {output}"
     data = {"output": str(output), "camera_ids": ids, "sender": heard.sender}
@@ -248,13 +230,11 @@ def _targets_import(
     file: Path = argument("FILE", "geometry.yml, a packet (.pb), or robocup-ssl.xml"),
     output: Path = output_option("the target (.json), as `detect field --target` takes it"),
 ) -> Document:
-    from ceres_cal.formats import read_ssl_target
-
     require_output(output, [file])
-    return _write_target(read_ssl_target(file), output)
+    return _write_target(formats.read_ssl_target(file), output)
 
 
-def _write_target(target: Target, path: Path, sender: str = "") -> Document:
+def _write_target(target: scene.Target, path: Path, sender: str = "") -> Document:
     save(path, target.spec)
     whence = f" from {sender}" if sender else ""
     counts = f"{len(target.points)} points and {len(target.curves)} curves"

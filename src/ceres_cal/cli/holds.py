@@ -10,7 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal import base, detect, formats, moves, report
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import HEIGHTS_M, at_height, fixed
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
@@ -27,10 +29,7 @@ from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
-    from ceres_cal.base.arrays import Array
     from ceres_cal.calibration import Calibration
-    from ceres_cal.detect.photographs import KnownDetections
-    from ceres_cal.moves.agreement import Agreement, Agreements
 
 
 def _share(text: str) -> float:
@@ -64,9 +63,7 @@ def _check(
     if images:
         answer, detections = _photographed(args, images, false_alarms, checks)
     else:
-        from ceres_cal.moves.checks import check
-
-        answer = check(read_calibration(args.calibration), read_observations(args.inputs), false_alarms, checks)
+        answer = moves.check(read_calibration(args.calibration), read_observations(args.inputs), false_alarms, checks)
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
     rate = f"({100.0 * false_alarms:g} % false alarms{often})"
     holds = f"{'yes' if answer.holds else 'no'} {rate}"
@@ -78,12 +75,10 @@ def _check(
 
 def _photographed(
     args: InputArguments, images: list[Path], false_alarms: float, checks: int
-) -> tuple[Agreements, KnownDetections]:
-    from ceres_cal.detect.photographs import check_photographs
-
+) -> tuple[moves.Agreements, detect.KnownDetections]:
     calibration, not_painted = read_calibration(args.calibration), arguments.parse_names(args.not_painted)
     with progress_bar(args.silent) as bar:
-        return check_photographs(
+        return detect.check_photographs(
             calibration,
             images,
             args.station,
@@ -94,7 +89,7 @@ def _photographed(
         )
 
 
-def _checked_station(one: Agreement) -> Section:
+def _checked_station(one: moves.Agreement) -> Section:
     lines, change, misfit = [f"{one.name} {one.words}"], one.change, one.misfit
     used, noise = misfit.points + misfit.curves, misfit.noise[0]
     data = {name: getattr(one, name) for name in ("holds", "probability", "statistic", "degrees", "words")}
@@ -144,16 +139,16 @@ def _score(
     ),
 ) -> Document:
     require_different(observations)
-    from ceres_cal.base.frozen import replace
-    from ceres_cal.moves.scores import score
 
     before = read_calibration(calibration)
     asked = {name: value for name, value in (("loss", loss), ("reject_sigma", reject_sigma)) if value is not None}
     options = replace(before.options, **asked)
-    return _scored(score(before, read_observations(observations), options=options, hold_stations=hold_stations), before)
+    return _scored(
+        moves.score(before, read_observations(observations), options=options, hold_stations=hold_stations), before
+    )
 
 
-def _scored(answer: Agreements, before: Calibration) -> Document:
+def _scored(answer: moves.Agreements, before: Calibration) -> Document:
     most_views = 3  # shown
     cameras = list(answer.values())
     views = sorted((view for one in cameras for view in one.views), key=lambda view: -view.misfit.all_rms_px)
@@ -178,11 +173,11 @@ def _scored(answer: Agreements, before: Calibration) -> Document:
     )
 
 
-def _misfit_data(one: Agreement) -> dict[str, Any]:
+def _misfit_data(one: moves.Agreement) -> dict[str, Any]:
     return {"name": one.name, **{name: value for name, value in vars(one.misfit).items() if name != "noise"}}
 
 
-def _left(one: Agreement) -> str:
+def _left(one: moves.Agreement) -> str:
     left = one.misfit
     kinds = [
         f"rms {rms:.4f} px over {count} {kind}"
@@ -211,14 +206,11 @@ def _audit(
     observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True),
     options: Mapping[str, str] = import_options(),
 ) -> Document:
-    from ceres_cal.base.files import read_bytes
     from ceres_cal.calibration import Calibration
-    from ceres_cal.formats import import_calibration
-    from ceres_cal.moves.audits import audit
 
-    ours = form is None and file.suffix == ".json" and b"ceres-cal/calibration" in read_bytes(file)[:4096]
-    given = Calibration.load(file) if ours else import_calibration(file, form, **typed_options(options, form))
-    stations = audit(given, read_observations(observations))
+    ours = form is None and file.suffix == ".json" and b"ceres-cal/calibration" in base.read_bytes(file)[:4096]
+    given = Calibration.load(file) if ours else formats.import_calibration(file, form, **typed_options(options, form))
+    stations = moves.audit(given, read_observations(observations))
     return Document(
         (
             Section(
@@ -233,12 +225,10 @@ def _audit(
     )
 
 
-def _audited_station(one: Agreement) -> Section:
-    from ceres_cal.moves.audits import excess_px
-
+def _audited_station(one: moves.Agreement) -> Section:
     assert one.solution is not None and one.change is not None
     camera, maps = one.solution.station(), one.change.maps
-    off_px, noise_px = excess_px(one)
+    off_px, noise_px = moves.excess_px(one)
     known_mm = {} if one.solution.posterior is None else {over.height_m: over.known_mm for over in maps}
     known = (
         f"{f'± {sd:.2g} mm' if math.isfinite(sd) else 'unknown'} at {1e3 * h:.0f} mm" for h, sd in known_mm.items()
@@ -277,29 +267,25 @@ def _compare(
         return _over_field(first, second, arguments.metres(height_mm), station, picture)
     if picture is not None or station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
-    from ceres_cal.moves.comparisons import compare_cameras
 
-    comparisons = compare_cameras(first, second, without_turn=without_turn)
+    comparisons = moves.compare_cameras(first, second, without_turn=without_turn)
     return Document(tuple(section for one in comparisons.values() for section in _compared_camera(one)))
 
 
 def _over_field(
     first: Calibration, second: Calibration, height_m: float, station: str | None, picture: Path | None
 ) -> Document:
-    from ceres_cal.moves.comparisons import compare
-
-    comparisons = compare(first, second, height_m, station)
+    comparisons = moves.compare(first, second, height_m, station)
     if picture is not None:
         if len(comparisons) > 1:
             names = " or ".join(comparisons)
             raise InputError(f"--picture shows one station: name it with --station {names}")
-        from ceres_cal.report.maps import comparison_svg
 
-        save(picture, comparison_svg(next(iter(comparisons.values())), first).encode())
+        save(picture, report.comparison_svg(next(iter(comparisons.values())), first).encode())
     return Document(tuple(section for one in comparisons.values() for section in _compared_station(one)))
 
 
-def _compared_station(one: Agreement) -> Iterator[Section]:
+def _compared_station(one: moves.Agreement) -> Iterator[Section]:
     assert one.change is not None
     change, (over,) = one.change, one.change.maps
     before, after = change.phi_px
@@ -314,7 +300,7 @@ def _compared_station(one: Agreement) -> Iterator[Section]:
     yield _table("mm at y \\ x", over.errors_mm[::-1], over.x_m, over.y_m[::-1], "{:.2f} m")
 
 
-def _compared_camera(one: Agreement) -> Iterator[Section]:
+def _compared_camera(one: moves.Agreement) -> Iterator[Section]:
     import numpy as np
 
     assert one.image is not None
@@ -332,19 +318,18 @@ def _compared_camera(one: Agreement) -> Iterator[Section]:
     yield _table("px at y \\ x", over.errors_px, over.x_px, over.y_px, "{:.0f} px")
 
 
-def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
+def _table(head: str, values: base.Array, x: base.Array, y: base.Array, place: str) -> Section:
     table_size = 9, 7
-    from ceres_cal.report.maps import grid_table
 
-    table = grid_table(head, values, x, y, place, table_size, partial(fixed, places=2))
+    table = report.grid_table(head, values, x, y, place, table_size, partial(fixed, places=2))
     return Section("", table.lines(), pieces=(table,))
 
 
-def _tested(one: Agreement) -> dict[str, Any]:
+def _tested(one: moves.Agreement) -> dict[str, Any]:
     return {"probability": one.probability, "explained_by_uncertainty": one.holds}
 
 
-def _explained(one: Agreement) -> str:
+def _explained(one: moves.Agreement) -> str:
     return {
         True: f"explained by their uncertainties (probability {one.probability:.2g})",
         False: f"more than their uncertainties explain (probability {one.probability:.1g})",

@@ -21,12 +21,12 @@ from typing import Any
 
 import msgspec
 
+from ceres_cal import observations
 from ceres_cal.base.errors import CalibrationError, InputError, answer_or_reason, attempt, note
 from ceres_cal.base.files import convert, parse_json, read_bytes
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.version import __version__
 from ceres_cal.base.words import printable
-from ceres_cal.observations import FORMAT
 
 RESULTS = "results.jsonl"
 LEVELS = ("failed", "no", "care", "good")
@@ -240,7 +240,7 @@ def _holds_observations(file: Path) -> bool:
     if file.suffix not in _OBSERVATIONS or not file.is_file():
         return False
     with file.open("rb") as stream:
-        return file.suffix == ".npz" or FORMAT.encode() in stream.read(first)
+        return file.suffix == ".npz" or observations.FORMAT.encode() in stream.read(first)
 
 
 def _of_table(path: Path) -> Iterator[Planned]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ceres_cal import start
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import argument, command, option
@@ -15,7 +16,6 @@ from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations
-    from ceres_cal.start.same_labels import Labels
 
 
 @command(
@@ -36,11 +36,10 @@ def _run(
     require_observations_output(output, observations)
     seen = read_observations(observations)
     from ceres_cal.observations.same_frame import with_same_frames
-    from ceres_cal.start.same_labels import with_same_labels
 
     if same_frame is not None:
         seen = with_same_frames(seen, same_frame)
-    labels = with_same_labels(seen)
+    labels = start.with_same_labels(seen)
     save(output, labels.observations)
     return Document((*_sections(labels, same_frame), Section("written", [str(output)], {"output": str(output)})))
 
@@ -53,9 +52,7 @@ def _moments(observations: Observations) -> Counter[int]:
     return Counter(len(seen) for seen in cameras.values())
 
 
-def _sections(labels: Labels, same_frame: str | None) -> Iterator[Section]:
-    from ceres_cal.start.same_labels import open_words
-
+def _sections(labels: start.Labels, same_frame: str | None) -> Iterator[Section]:
     by_count = sorted(_moments(labels.observations).items())
     rule = "of one name" if same_frame is None else f"by {same_frame!r}"
     seen = ", ".join(f"{number} seen by {plural(count, 'camera')}" for count, number in reversed(by_count))
@@ -65,4 +62,4 @@ def _sections(labels: Labels, same_frame: str | None) -> Iterator[Section]:
     turned = wrapped(f"turned, to be those of the first camera: {which}") if which else []
     yield Section("labels", turned, {"turned": labels.turned, "open": labels.open})
     for station in labels.open:
-        yield Section("warning", wrapped(open_words(station)))
+        yield Section("warning", wrapped(start.open_words(station)))

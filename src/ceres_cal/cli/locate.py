@@ -6,17 +6,14 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import base, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, height_option, metres, parse_number, station_option
 from ceres_cal.cli.command import Arguments, argument, command, option
 from ceres_cal.cli.files import read_calibration, station_of
 from ceres_cal.report.document import Document, Section
-
-if TYPE_CHECKING:
-    from ceres_cal.base.arrays import Array
-    from ceres_cal.scene.camera import Camera
 
 
 def _rows_argument(rows: str, example: str) -> Any:
@@ -46,12 +43,10 @@ def _locate(
 ) -> Document:
     import numpy as np
 
-    from ceres_cal.scene.camera import in_image
-
     pixels = _read_rows(rows, args.file, (2,))
     height = metres(height_mm)
     name, camera = _station(args)
-    inside = in_image(pixels, camera.image_size)
+    inside = scene.in_image(pixels, camera.image_size)
     points = np.where(inside[:, None], camera.locate(pixels, height), np.nan)  # beyond nothing was ever measured
     lost = {row: _why_not_located(camera, pixels[row], height) for row in _rows_without_answer(points)}
     data = {"station": name, "height_m": height, "pixels": pixels.tolist()}
@@ -70,7 +65,7 @@ def _project(
     return _answer({**data, "pixels": _or_null(pixels)}, pixels, lost)
 
 
-def _station(args: PlacesArguments) -> tuple[str, Camera]:
+def _station(args: PlacesArguments) -> tuple[str, scene.Camera]:
     calibration = read_calibration(args.calibration)
     name = station_of(args.calibration, args.station, calibration)
     return name, calibration.stations[name]
@@ -79,7 +74,7 @@ def _station(args: PlacesArguments) -> tuple[str, Camera]:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-def _read_rows(given: Sequence[str], file: str | None, sizes: tuple[int, ...]) -> Array:
+def _read_rows(given: Sequence[str], file: str | None, sizes: tuple[int, ...]) -> base.Array:
     """(N, largest size) numbers from the arguments, a file or standard input; a number left out is 0."""
     import numpy as np
 
@@ -96,9 +91,7 @@ def _texts(given: Sequence[str], file: str | None) -> Iterator[tuple[str, str]]:
     if file == "-" or tuple(given) == ("-",):
         yield from _lines(sys.stdin, "standard input")
     elif file is not None:
-        from ceres_cal.base.files import read_bytes
-
-        yield from _lines(read_bytes(file).decode("utf-8-sig", errors="replace").splitlines(), file)
+        yield from _lines(base.read_bytes(file).decode("utf-8-sig", errors="replace").splitlines(), file)
     else:
         yield from ((f"argument {text!r}", text) for text in _places(given))
 
@@ -128,34 +121,32 @@ def _numbers(text: str, sizes: tuple[int, ...], where: str) -> list[float]:
 # ---- answering ------------------------------------------------------------------------------------------------------
 
 
-def _rows_without_answer(values: Array) -> list[int]:
+def _rows_without_answer(values: base.Array) -> list[int]:
     import numpy as np
 
     return [int(row) for row in np.flatnonzero(np.isnan(values[:, 0]))]
 
 
-def _or_null(values: Array) -> list[list[float] | None]:
+def _or_null(values: base.Array) -> list[list[float] | None]:
     return [None if row[0] != row[0] else row for row in values.tolist()]
 
 
-def _why_not_located(camera: Camera, pixel: Array, height_m: float) -> str:
-    from ceres_cal.scene.camera import in_image
-
+def _why_not_located(camera: scene.Camera, pixel: base.Array, height_m: float) -> str:
     radius = camera.lens.monotone_radius(camera.phi)
     if camera.rays(pixel[None])[0, 0] != camera.rays(pixel[None])[0, 0]:
         return f"it lies past the {radius:.0f} px from the principal point where the lens has one answer"
-    if not in_image(pixel, camera.image_size):
+    if not scene.in_image(pixel, camera.image_size):
         return "it lies outside the image of {} x {} px: check its coordinates".format(*camera.image_size)
     return f"its ray does not meet the plane z = {height_m:g} m in front of the camera"
 
 
-def _why_not_projected(camera: Camera, point: Array) -> str:
+def _why_not_projected(camera: scene.Camera, point: base.Array) -> str:
     if camera.cam_from_world.transform(point)[2] <= 0.0:
         return "it lies behind the camera"
     return "it lies outside of what the lens can show"
 
 
-def _answer(data: dict[str, Any], values: Array, lost: dict[int, str]) -> Document:
+def _answer(data: dict[str, Any], values: base.Array, lost: dict[int, str]) -> Document:
     lines = [f"{x:.4f} {y:.4f}" for x, y in values.tolist()]
     for row, reason in lost.items():
         lines[row] = f"no answer: {reason}"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ceres_cal import cli, detect
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
@@ -14,10 +14,6 @@ from ceres_cal.cli.arguments import output_option, prior_option, whole
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import json_object, require_folder, require_shown
 from ceres_cal.report.document import Document, Section
-
-if TYPE_CHECKING:
-    from ceres_cal.cli.page.session import Session
-    from ceres_cal.cli.page.state import Sitting
 
 
 @command(
@@ -49,20 +45,16 @@ def _run(
     require_folder(output)
     sitting = _sitting(files, output, target or "")
     require_shown(sitting.photographs, None, None, prior)
-    from ceres_cal.cli.page.session import opened
-    from ceres_cal.cli.page.state import State
 
-    state = State(target=target or "", board=board or "", priors=prior)
-    session = opened(sitting, state)
+    state = cli.State(target=target or "", board=board or "", priors=prior)
+    session = cli.opened(sitting, state)
     _serve(session, port, browser)
     return Document(tuple(_sections(session)))
 
 
-def _serve(session: Session, port: int, browser: bool) -> None:
+def _serve(session: cli.Session, port: int, browser: bool) -> None:
     import asyncio
     import webbrowser
-
-    from ceres_cal.cli.page.server import serve
 
     def show(address: str) -> None:
         print(f"{address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
@@ -70,17 +62,15 @@ def _serve(session: Session, port: int, browser: bool) -> None:
             webbrowser.open(address)
 
     try:
-        asyncio.run(serve(session, port, show))
+        asyncio.run(cli.serve(session, port, show))
     except KeyboardInterrupt as end:  # quiet: Ctrl-C is how a page is ended, but SIGTERM is not
         if type(end) is not KeyboardInterrupt:
             raise
 
 
-def _sitting(files: Sequence[str], folder: Path, target: str) -> Sitting:
+def _sitting(files: Sequence[str], folder: Path, target: str) -> cli.Sitting:
     """What was named, each file once: nothing else is read later."""
     most_calibrations = 2
-    from ceres_cal.cli.page.state import Sitting
-    from ceres_cal.detect.images import read_colour
 
     named = image_files(files)
     calibrations = [path for path in named if path.suffix.lower() == ".json"]
@@ -94,14 +84,14 @@ def _sitting(files: Sequence[str], folder: Path, target: str) -> Sitting:
     names = [path.name for path in photographs]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"{twice}: two photographs have this name: give the images of one folder")
-    sizes = tuple((image.shape[1], image.shape[0]) for image in map(read_colour, photographs))
+    sizes = tuple((image.shape[1], image.shape[0]) for image in map(detect.read_colour, photographs))
     if different := next((n for n, size in enumerate(sizes) if size != sizes[0]), None):
         (a, b), (c, d) = sizes[different], sizes[0]
         raise InputError(f"{photographs[different]}: {a} x {b} px, and the first has {c} x {d}: one camera at a time")
-    return Sitting(photographs, sizes, folder, target, *calibrations)
+    return cli.Sitting(photographs, sizes, folder, target, *calibrations)
 
 
-def _sections(session: Session) -> Iterator[Section]:
+def _sections(session: cli.Session) -> Iterator[Section]:
     folder = session.sitting.folder
     yield Section("", [], {"folder": str(folder), "commands": list(session.written)})
     if not session.written:

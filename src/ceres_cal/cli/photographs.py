@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
+from ceres_cal import base, detect
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import plural
@@ -14,11 +15,6 @@ from ceres_cal.cli.command import Arguments, QuietArguments, argument
 from ceres_cal.cli.files import require_different, require_output, save
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
-
-if TYPE_CHECKING:
-    from ceres_cal.base.arrays import Image
-    from ceres_cal.detect.median import Merged
-    from ceres_cal.detect.photographs import KnownDetections
 
 _T = TypeVar("_T")
 _OBSERVATIONS = (".json", ".npz")
@@ -62,7 +58,7 @@ def photographs_in(args: InputArguments) -> list[Path]:
     return images
 
 
-def shown(detections: KnownDetections | None) -> Section:
+def shown(detections: detect.KnownDetections | None) -> Section:
     """What photographs showed; nothing where none were given."""
     if detections is None:
         return Section()
@@ -86,10 +82,9 @@ def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
     """What `detect` returns; InputError where it takes longer than --timeout."""
     if timeout is not None and not timeout > 0.0:
         raise InputError(f"--timeout must be above 0 seconds, not {timeout:g}")
-    from ceres_cal.base.threads import interruptibly
 
     try:
-        return interruptibly(detect, timeout)
+        return base.interruptibly(detect, timeout)
     except TimeoutError:
         raise InputError(
             f"--timeout: not done after {timeout:g} s, nothing was written: give fewer images, or more time"
@@ -114,26 +109,21 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
     """
     import numpy as np
 
-    from ceres_cal.detect.images import encoded
-    from ceres_cal.detect.median import merged
-
-    found: Merged = merged(_pictures(images, videos, bar))
+    found: detect.Merged = detect.merged(_pictures(images, videos, bar))
     levels = np.round(found.picture * (65535 // found.white)).astype(np.uint16)
-    save(path, encoded(np.asarray(levels), ".png", 100))
+    save(path, detect.encoded(np.asarray(levels), ".png", 100))
     left_out = [{"image": name, "reason": reason} for name, reason in found.left_out]
     return {"picture": str(path), "used": list(found.used), "left_out": left_out}
 
 
-def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, Image]]:
-    from ceres_cal.detect.images import read_colour
-    from ceres_cal.detect.median import MOST_PICTURES
-    from ceres_cal.detect.video import spread_frames
-
-    each = max(1, MOST_PICTURES // (len(videos) + bool(images)))  # of every video, and of the photographs together
+def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, base.Image]]:
+    each = max(
+        1, detect.MOST_PICTURES // (len(videos) + bool(images))
+    )  # of every video, and of the photographs together
     for path in images[:: -(-len(images) // each) or 1]:
-        yield str(path), read_colour(path)
-    for video in videos[:MOST_PICTURES]:
-        yield from spread_frames(video, each, bar.update)
+        yield str(path), detect.read_colour(path)
+    for video in videos[: detect.MOST_PICTURES]:
+        yield from detect.spread_frames(video, each, bar.update)
 
 
 def median_text(data: dict[str, Any]) -> str:

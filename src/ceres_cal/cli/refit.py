@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ceres_cal import detect, moves
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli import files
 from ceres_cal.cli.arguments import ReportArguments, output_option, parse_names, parse_prior, prior_option
@@ -15,7 +16,6 @@ from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.detect.photographs import KnownDetections
     from ceres_cal.observations import Observations, Prior
 
 
@@ -79,11 +79,8 @@ def _priors(args: RefitArguments, known: Calibration | Observations) -> tuple[Pr
     return tuple(parse_prior(spec, owners, {"station": ("height_m",)}) for spec in args.prior)
 
 
-def _photographed(args: RefitArguments, calibration: Calibration, images: list[Path]) -> KnownDetections:
-    from ceres_cal.detect.photographs import detect_known
-    from ceres_cal.moves.agreement import require_posterior
-
-    require_posterior(calibration)
+def _photographed(args: RefitArguments, calibration: Calibration, images: list[Path]) -> detect.KnownDetections:
+    moves.require_posterior(calibration)
     station = files.station_of(args.calibration, args.station, calibration)
     if strange := set(args.moved) - {station}:
         raise InputError(
@@ -91,4 +88,4 @@ def _photographed(args: RefitArguments, calibration: Calibration, images: list[P
         )
     not_painted = parse_names(args.not_painted)
     with progress_bar(args.silent) as bar:
-        return detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)
+        return detect.detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import shlex
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import base, detect, formats
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.images import IMAGE_ENDINGS, folders_of_cameras, images_and_videos
@@ -16,9 +17,6 @@ from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, o
 from ceres_cal.cli.files import attempted, require_shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
-
-if TYPE_CHECKING:
-    from ceres_cal.formats import ExportFormat
 
 _SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
 _MOST_NAMES = 3
@@ -70,14 +68,11 @@ class _Step(Frozen, eq=True):
     "cameras/ --target ssl-b --facing left.LeftGoalLine=left --facing right.LeftGoalLine=left -o field/",
 )
 def _run(args: RunArguments) -> Document:
-    from ceres_cal.base.files import make_folder
-    from ceres_cal.formats import export_format
-
     cameras = _cameras(args)
     _require_fitting(args, cameras)
-    forms = [export_format(name) for name in args.to]  # or says which there are
+    forms = [formats.export_format(name) for name in args.to]  # or says which there are
     for one in (args, *cameras):
-        make_folder(one.output)
+        base.make_folder(one.output)
     images = [_photographs(one) for one in cameras]
     steps = [step for one, own in zip(cameras, images, strict=True) for step in _seen_by(one, own, len(cameras) > 1)]
     calibrated = _calibrated(args, cameras, [step.data for step in steps if "output" in step.data])
@@ -162,11 +157,9 @@ def _attempted(args: RunArguments, name: str, arguments: Sequence[str], most: in
 
 def _photographs(args: RunArguments) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
-    from ceres_cal.detect.video import frames_of_videos
-
     images, videos = images_and_videos(args.images)
     with progress_bar(args.silent) as bar:
-        return [*images, *frames_of_videos(videos, args.frames, args.output, bar.update)]
+        return [*images, *detect.frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 
 def _seen_by(args: RunArguments, images: list[Path], is_one_of_several: bool) -> list[_Step]:
@@ -216,7 +209,7 @@ def _calibrated(args: RunArguments, cameras: Sequence[RunArguments], detected: S
     return _step(args, "calibrate", asked, titles=_SHOWN)
 
 
-def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: ExportFormat) -> Iterator[_Step]:
+def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: formats.ExportFormat) -> Iterator[_Step]:
     """One file, or one for each camera where the format does not hold so many."""
     ending = (form.endings or ("",))[0]
     asked = [str(args.output / "calibration.json"), "--to", form.name]

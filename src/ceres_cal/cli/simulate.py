@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import simulate
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option, whole
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import finishing, require_folder
 from ceres_cal.report.document import Document, Section
-
-if TYPE_CHECKING:
-    from ceres_cal.simulate import Simulation
 
 
 @command(
@@ -49,9 +47,7 @@ def _run(
     return Document((Section("", _lines(data), data),))
 
 
-def _data(simulation: Simulation, scene: str, folder: Path) -> dict[str, Any]:
-    from ceres_cal.simulate import OUTLIER, WRONG_LABEL
-
+def _data(simulation: simulate.Simulation, scene: str, folder: Path) -> dict[str, Any]:
     observations, truths = simulation.observations, (simulation.points, simulation.curves)
     return {
         "scene": scene,
@@ -61,8 +57,8 @@ def _data(simulation: Simulation, scene: str, folder: Path) -> dict[str, Any]:
         "views": len(observations.views),
         "points": len(observations.points),
         "curves": len(observations.curves),
-        "outliers": sum(len(truth.rows(OUTLIER)) for truth in truths),
-        "wrong_labels": sum(len(truth.rows(WRONG_LABEL)) for truth in truths),
+        "outliers": sum(len(truth.rows(simulate.OUTLIER)) for truth in truths),
+        "wrong_labels": sum(len(truth.rows(simulate.WRONG_LABEL)) for truth in truths),
     }
 
 

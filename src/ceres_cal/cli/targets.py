@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ceres_cal import base, observations, report, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import no_such
 from ceres_cal.cli.arguments import output_option, parse_board
@@ -13,19 +14,14 @@ from ceres_cal.cli.command import argument, command, option
 from ceres_cal.cli.files import require_output, save, spelled_target
 from ceres_cal.report.document import Document, Section
 
-if TYPE_CHECKING:
-    from ceres_cal.scene.targets import Curve, Target, TargetKind
-
 _BOARD = re.compile(r"\d+x\d+x.+")
 
 
 def _help() -> str:
-    from ceres_cal.scene.targets import TARGET_KINDS, targets_by_name
-
     return (
-        f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, of one "
-        "that is spelled out as in files ('{\"kind\": ...}'), or of the targets in a file of observations; without it "
-        "the kinds are listed"
+        f"list the features of a kind ({', '.join(scene.TARGET_KINDS)}), of {' or '.join(scene.targets_by_name())}, of "
+        "one that is spelled out as in files ('{\"kind\": ...}'), or of the targets in a file of observations; without "
+        "it the kinds are listed"
     )
 
 
@@ -40,26 +36,22 @@ def _run(
     target: str | None = argument("TARGET", _help, None),
     picture: Path | None = option("draw the target there, with the names of its lines", "SVG"),
 ) -> Document:
-    from ceres_cal.scene.targets import TARGET_KINDS
-
     require_output(picture, [], "pictures are", ".svg")
     if target is None:
         if picture is not None:
             raise InputError("--picture draws one target: name it, such as vss-3")
-        kinds = {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}
+        kinds = {name: _kind_data(kind) for name, kind in scene.TARGET_KINDS.items()}
         return Document((Section("", _kinds_text().splitlines(), {"kinds": kinds}),))
     targets = _targets(target)
     if picture is not None:
-        from ceres_cal.report.target_pictures import target_svg
-
         name, drawn = _only(targets, target, "--picture draws one of them")
-        save(picture, target_svg(drawn, name).encode())
+        save(picture, report.target_svg(drawn, name).encode())
     data = {"targets": {name: _target_data(target) for name, target in targets.items()}}
     text = "\n\n".join(_target_text(name, target) for name, target in targets.items())
     return Document((Section("", text.splitlines(), data),))
 
 
-def _only(targets: dict[str, Target], wanted: str, what_to_do: str) -> tuple[str, Target]:
+def _only(targets: dict[str, scene.Target], wanted: str, what_to_do: str) -> tuple[str, scene.Target]:
     if len(targets) > 1:
         raise InputError(f"{wanted}: it has several targets: {', '.join(targets)}: {what_to_do}")
     return next(iter(targets.items()))
@@ -78,43 +70,37 @@ def _print(
     require_output(output, [], "sheets are", ".pdf")
     import json
 
-    from ceres_cal.report.target_pictures import sheet_pdf
-
     _, board = _only(_targets(target), target, "give the description of one")
-    save(output, sheet_pdf(board, json.dumps(board.spec)))
+    save(output, report.sheet_pdf(board, json.dumps(board.spec)))
     return Document((Section("written", [str(output)], {"output": str(output), "spec": board.spec}),))
 
 
-def _targets(wanted: str) -> dict[str, Target]:
-    from ceres_cal.scene.targets import TARGET_KINDS, checkerboard, targets_by_name
-
-    if wanted in TARGET_KINDS:
-        return TARGET_KINDS[wanted].examples()
+def _targets(wanted: str) -> dict[str, scene.Target]:
+    if wanted in scene.TARGET_KINDS:
+        return scene.TARGET_KINDS[wanted].examples()
     if (spelled := spelled_target(wanted, "TARGET")) is not None:
         return {spelled.kind: spelled}
-    by_name = targets_by_name()
+    by_name = scene.targets_by_name()
     if wanted in by_name:
         return {wanted: by_name[wanted]}
     if _BOARD.fullmatch(wanted):
-        return {"board": checkerboard(*parse_board(wanted))}
+        return {"board": scene.checkerboard(*parse_board(wanted))}
     if wanted.endswith((".json", ".npz")) or Path(wanted).exists():
         return _targets_in(Path(wanted))
-    names = (*TARGET_KINDS, *by_name)
+    names = (*scene.TARGET_KINDS, *by_name)
     raise InputError(f"{no_such('target', wanted, names)} (or a board such as 9x6x25mm, or a file of observations)")
 
 
-def _targets_in(path: Path) -> dict[str, Target]:
+def _targets_in(path: Path) -> dict[str, scene.Target]:
     """The targets of a file of observations, even where its observations are at fault."""
-    from ceres_cal.base.files import read_json
-    from ceres_cal.observations import FORMAT, VERSION, Observations
-    from ceres_cal.scene.targets import targets_from_specs
+    from ceres_cal.observations import Observations
 
     if path.suffix == ".npz":
         return dict(Observations.load(path).targets)
-    specs = read_json(path, FORMAT, VERSION).get("targets")
+    specs = base.read_json(path, observations.FORMAT, observations.VERSION).get("targets")
     if not isinstance(specs, dict) or not specs:
         raise InputError(f"{path}: it holds no targets")
-    return targets_from_specs(specs, f"{path}: ")
+    return scene.targets_from_specs(specs, f"{path}: ")
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------
@@ -123,10 +109,8 @@ def _targets_in(path: Path) -> dict[str, Target]:
 def _kinds_text() -> str:
     import json
 
-    from ceres_cal.scene.targets import TARGET_KINDS
-
     blocks = []
-    for name, kind in TARGET_KINDS.items():
+    for name, kind in scene.TARGET_KINDS.items():
         lines = [f"{name}: {kind.what}", _item("parameters", kind.parameters), _item("features", kind.features)]
         for example, target in kind.examples().items():
             lines.append(_item("example", json.dumps(target.spec)))
@@ -144,7 +128,7 @@ def _item(title: str, text: str) -> str:
     return textwrap.fill(text, 100, initial_indent=f"  {title:12}", subsequent_indent=" " * 14, break_on_hyphens=False)
 
 
-def _target_text(name: str, target: Target) -> str:
+def _target_text(name: str, target: scene.Target) -> str:
     import json
 
     spec = {key: value for key, value in target.spec.items() if key not in _FEATURES}  # those follow
@@ -163,10 +147,8 @@ def _place(place: tuple[float, float, float]) -> str:
     return "  ".join(f"{number:8.4f}" for number in place)
 
 
-def _curve_text(curve: Curve) -> str:
-    from ceres_cal.scene.targets import Segment
-
-    if isinstance(curve, Segment):
+def _curve_text(curve: scene.Curve) -> str:
+    if isinstance(curve, scene.Segment):
         shape = f"segment  from {_place(curve.start)}  to {_place(curve.end)}"
     else:
         span = f"from {curve.from_rad:g} to {curve.to_rad:g} rad"
@@ -177,15 +159,13 @@ def _curve_text(curve: Curve) -> str:
 # ---- for scripts ----------------------------------------------------------------------------------------------------
 
 
-def _kind_data(kind: TargetKind) -> dict[str, Any]:
+def _kind_data(kind: scene.TargetKind) -> dict[str, Any]:
     examples = {name: target.spec for name, target in kind.examples().items()}
     return {"what": kind.what, "parameters": kind.parameters, "features": kind.features, "examples": examples}
 
 
-def _target_data(target: Target) -> dict[str, Any]:
+def _target_data(target: scene.Target) -> dict[str, Any]:
     """Its description, and all its features as a custom target's file has them."""
-    from ceres_cal.scene.targets import custom
-
-    features = {**custom(target.points, target.curves).spec}
+    features = {**scene.custom(target.points, target.curves).spec}
     del features["kind"]
     return {"spec": target.spec, **features}

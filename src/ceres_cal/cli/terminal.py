@@ -21,6 +21,7 @@ from select import select
 from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO, cast
 
+from ceres_cal import base, calibration
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError, noting
 from ceres_cal.base.words import did_you_mean, first_of
 from ceres_cal.cli.command import COMMANDS, Command
@@ -219,9 +220,7 @@ def print_answer(answer: Document, *, as_json: bool, quiet: bool = False) -> Non
     if quiet and not as_json:
         print(answer.one_line)
     elif as_json:
-        from ceres_cal.base.files import json_text
-
-        print(json_text(answer.data))
+        print(base.json_text(answer.data))
     else:
         text = answer.text()
         print(coloured(text) if in_colour(sys.stdout) else text)
@@ -303,9 +302,7 @@ def _run(arguments: list[str]) -> int:
         print(_overview(beginning))
         return 0
     if "--version" in arguments:
-        from ceres_cal.calibration import package_versions
-
-        print(", ".join(f"{name} {version}" for name, version in package_versions().items()))
+        print(", ".join(f"{name} {version}" for name, version in calibration.package_versions().items()))
         return 0
     command, rest = chosen(arguments)
     options = command.parse(rest)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ceres_cal import detect, posterior, report, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
 from ceres_cal.base.words import frame_of, no_such
@@ -18,8 +19,6 @@ from ceres_cal.report.document import Document, Section
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
     from ceres_cal.calibration import Calibration
-    from ceres_cal.report.pictures.straight import Straight
-    from ceres_cal.scene.camera import Camera
 
 _STRAIGHT = "straight images (default)"
 _TOP = "the field from above"
@@ -169,7 +168,7 @@ def _station(args: UndistortArguments, calibration: Calibration) -> str:
     return fitting[0]
 
 
-def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, str | None, Camera]:
+def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, str | None, scene.Camera]:
     """Names of the camera and of its station, where that is one, and the camera, posed in that case."""
     owners = {name: station.camera for name, station in calibration.estimate.stations.items()}
     wanted = set(calibration.cameras) if args.camera is None else {args.camera}
@@ -187,32 +186,27 @@ _PictureMaker = tuple[Callable[[Path], tuple["Image", dict[str, Any], str]], Map
 """How each picture is made: from a path to picture, facts and a line about it; facts on all, and what they are."""
 
 
-def _read(path: Path, camera: Camera, name: str) -> Image:
-    from ceres_cal.report.pictures.frames import read_photograph
-
-    return read_photograph(path, camera.image_size, name)
+def _read(path: Path, camera: scene.Camera, name: str) -> Image:
+    return report.read_photograph(path, camera.image_size, name)
 
 
 def _write(path: Path, picture: Image) -> None:
     jpeg_quality = 95
-    from ceres_cal.detect.images import encoded
-    from ceres_cal.report.pictures.overlay import in_8_bit_colour
 
-    content = encoded(in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, jpeg_quality)
+    content = detect.encoded(
+        report.in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, jpeg_quality
+    )
     save(path, content)
 
 
 def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.report.pictures.straight import straighten
-    from ceres_cal.scene.camera import camera_to_json
-
     name, station, camera = _camera(args, calibration)
-    straight = straighten(camera, whole=args.whole, size=args.size, phi=args.phi, angle_deg=args.angle)
+    straight = report.straighten(camera, whole=args.whole, size=args.size, phi=args.phi, angle_deg=args.angle)
     facts = {
         "camera": name,
         "station": station,
         "matrix": straight.camera.matrix.tolist(),
-        **camera_to_json(straight.camera),
+        **scene.camera_to_json(straight.camera),
         **({} if station is None else _pose(straight.camera)),
         "view_deg": list(straight.view_deg),
         "shown": straight.share,
@@ -226,7 +220,7 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     )
 
 
-def _straight_line(straight: Straight, whole: bool) -> str:
+def _straight_line(straight: report.Straight, whole: bool) -> str:
     (width, height), (across, down) = straight.camera.image_size, straight.view_deg
     ends = whole and straight.limit_deg is not None
     return (
@@ -236,7 +230,7 @@ def _straight_line(straight: Straight, whole: bool) -> str:
     )
 
 
-def _pose(camera: Camera) -> dict[str, Any]:
+def _pose(camera: scene.Camera) -> dict[str, Any]:
     pose = camera.cam_from_world
     return {
         "rotation": pose.rotation.tolist(),
@@ -250,14 +244,12 @@ def _black(size: tuple[int, int], count: int) -> str:
 
 
 def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.report.pictures.warp import make_grid, top_view
-
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     area = args.area or _field(calibration)
     mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
-    grid = make_grid(area, mm_per_px / 1000.0, arguments.metres(args.height_mm))
-    warp = top_view(camera, grid)
+    grid = report.make_grid(area, mm_per_px / 1000.0, arguments.metres(args.height_mm))
+    warp = report.top_view(camera, grid)
     x0, y0, x1, y1 = grid.area_m
     facts = {
         "camera": name,
@@ -278,10 +270,9 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
 
 def _field(calibration: Calibration) -> Area:
     margin_m = 0.3  # around the field in a top view
-    from ceres_cal.posterior.uncertainty import field_grid
 
     try:
-        x, y = field_grid(calibration.targets)
+        x, y = posterior.field_grid(calibration.targets)
     except InputError:
         raise InputError("the calibration has no field to be seen from above: say --area X0,Y0,X1,Y1") from None
     ends = (x[0] - margin_m, y[0] - margin_m, x[-1] + margin_m, y[-1] + margin_m)
@@ -290,35 +281,32 @@ def _field(calibration: Calibration) -> Area:
 
 
 def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
-    from ceres_cal.report.pictures.overlay import Layer, draw_overlay
-
     station, height = _station(args, calibration), arguments.metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     before = None if args.before is None else read_calibration(args.before)
     observations = None if args.observations is None else read_observations([args.observations])
-    known = {} if observations is None else {f.name: f for f in frames_of(observations) if f.station == station}
+    known = {} if observations is None else {f.name: f for f in report.frames_of(observations) if f.station == station}
 
-    def layers(frame: Frame) -> Iterator[Layer]:
+    def layers(frame: report.Frame) -> Iterator[report.Layer]:
         if before is not None:
-            yield Layer(model_of(before, frame), f"before: {Path(args.before or '').name}", "before")
+            yield report.Layer(report.model_of(before, frame), f"before: {Path(args.before or '').name}", "before")
         if height:
-            yield Layer(model_of(calibration, frame, height), f"{1e3 * height:g} mm above", "lifted")
-        yield Layer(model_of(calibration, frame), args.calibration.name, "after")
+            yield report.Layer(report.model_of(calibration, frame, height), f"{1e3 * height:g} mm above", "lifted")
+        yield report.Layer(report.model_of(calibration, frame), args.calibration.name, "after")
 
     def picture(path: Path) -> tuple[Image, dict[str, Any], str]:
         image, called = _read(path, camera, name), frame_of(path)
         if observations is not None and called not in known:
             raise InputError(f"{path}: {args.observations} has no frame {called!r} of station {station!r}")
-        frame = known.get(called) or frame_by_name(calibration, station, called)
+        frame = known.get(called) or report.frame_by_name(calibration, station, called)
         drawn = list(layers(frame))
-        marks = () if observations is None else marks_of(calibration, observations, frame)
+        marks = () if observations is None else report.marks_of(calibration, observations, frame)
         model = drawn[-1].model
         facts: dict[str, Any] = {"shown": [list(one) for one in frame.shown], "in_view": model.in_view}
         line = f"{', '.join(target for target, _ in frame.shown)}: {model.in_view} lines and points in view"
         if before is not None:
             facts["moved_px"] = moved = model.apart_px(drawn[0].model)
             line += f"; {moved[0]:.2f} px from before in the median, {moved[1]:.2f} px at most"
-        return draw_overlay(image, drawn, marks), facts, line
+        return report.draw_overlay(image, drawn, marks), facts, line
 
     return picture, {"camera": name, "station": station}, "what was drawn"

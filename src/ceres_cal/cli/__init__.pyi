@@ -1,0 +1,12 @@
+from ceres_cal.cli.jobs import LEVELS as LEVELS
+from ceres_cal.cli.jobs import Job as Job
+from ceres_cal.cli.jobs import Outcome as Outcome
+from ceres_cal.cli.jobs import read_plan as read_plan
+from ceres_cal.cli.jobs import run_jobs as run_jobs
+from ceres_cal.cli.jobs import words_of as words_of
+from ceres_cal.cli.page.server import serve as serve
+from ceres_cal.cli.page.session import Session as Session
+from ceres_cal.cli.page.session import opened as opened
+from ceres_cal.cli.page.state import Sitting as Sitting
+from ceres_cal.cli.page.state import State as State
+from ceres_cal.cli.terminal import main as main

@@ -1,0 +1,12 @@
+from ceres_cal.diagnostics.advice import Advice as Advice
+from ceres_cal.diagnostics.advice import Measurement as Measurement
+from ceres_cal.diagnostics.advice import Promise as Promise
+from ceres_cal.diagnostics.advice import advise as advise
+from ceres_cal.diagnostics.checks import Noise as Noise
+from ceres_cal.diagnostics.diagnosis import FALSE_ALARM_RATE as FALSE_ALARM_RATE
+from ceres_cal.diagnostics.diagnosis import Diagnosis as Diagnosis
+from ceres_cal.diagnostics.diagnosis import diagnose as diagnose
+from ceres_cal.diagnostics.labels import mended as mended
+from ceres_cal.diagnostics.labels import renamings as renamings
+from ceres_cal.diagnostics.table import ResidualTable as ResidualTable
+from ceres_cal.effects.effect import Finding as Finding

@@ -1,0 +1,1 @@
+from ceres_cal.posterior.uncertainty import field_grid as field_grid
