@@ -16,8 +16,17 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.robust.other_minima import mirrored, without_mirrored_poses
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
-from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import BoardRanges, Disturbance, Scene, Station, board_scene, simulate
+from ceres_cal.scene.targets import checkerboard, ssl_field
+from ceres_cal.simulate import (
+    BoardRanges,
+    Disturbance,
+    Scene,
+    Station,
+    board_scene,
+    field_scene,
+    overhead_pose,
+    simulate,
+)
 
 OPTIONS = Options(lens="brown")
 
@@ -97,3 +106,17 @@ def test_boards_seen_from_behind_are_named(how: str) -> None:
     given = replace(observed, points=replace(observed.points, pixels=pixels), cameras={"camera": size})
     named = [words for words in calibrate(given).warnings if "checkerboards from behind" in words]
     assert len(named) == (how != "as it is")
+
+
+def test_boards_whose_rows_are_counted_upwards_are_right_beside_a_floor() -> None:
+    """Cameras that see a floor from above have no mirrored pictures, whichever way the rows of boards are counted."""
+    camera = Camera((1280, 960), 700.0, (645.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))
+    stations = {"camera": Station("camera", overhead_pose(0.2, 0.1, 5.0, 8.0, 3.0, yaw_deg=20.0))}
+    field = simulate(field_scene(ssl_field("B"), {"camera": camera}, stations), Disturbance(0.3, 0.3), 1).observations
+    scene = board_scene(checkerboard(9, 6, 0.1), {"camera": camera}, stations, 8, 1)
+    boards = simulate(scene, Disturbance(0.2, 0.2), 1).observations
+    row, column = np.divmod(boards.points.feature, 9)
+    upwards = replace(boards, points=replace(boards.points, feature=(9 * (5 - row) + column).astype(np.int32)))
+    for given, count in ((upwards, 1), (upwards + field, 0)):
+        named = [words for words in calibrate(given).warnings if "checkerboards from behind" in words]
+        assert len(named) == count

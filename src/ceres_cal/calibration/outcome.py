@@ -117,8 +117,11 @@ def unusual_pixels(end: RobustSolution, problem: Problem) -> Iterator[str]:
 
 def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:
     """Words about cameras that see every checkerboard from behind, which no printed one shows: the picture of a plane
-    that is mirrored fits as well as the true one.
+    that is mirrored fits as well as the true one. Not where some camera sees a floor, which `require_possible` found to
+    be seen from above: then its pictures are as they should be, and the rows of the boards are counted upwards.
     """
+    if any(view.placement is None and not observations.targets[view.target].movable for view in observations.views):
+        return
     boards = {name for name, target in observations.targets.items() if target.kind == "checkerboard"}
     posed = [view for view in observations.views if view.target in boards and view.placement in estimate.placements]
     for name in estimate.cameras:
