@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -253,7 +254,7 @@ class Estimate(Frozen, eq=True):
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_frame of each sight as [R t], (S, 3, 4)."""
         stations = self._station_stack(keys)
-        return chained(stations, Poses.of(self.placements).of_names([key.placement for key in keys]))
+        return chained(stations, Poses.of(self.placements).of_names(list(map(itemgetter(2), keys))))
 
     def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
         """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
@@ -264,7 +265,7 @@ class Estimate(Frozen, eq=True):
 
     def _station_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_world of each sight, (S, 3, 4); (3, 4) where one station has them all."""
-        names = [key.station for key in keys]
+        names = list(map(itemgetter(1), keys))
         poses = {name: self.stations[name].cam_from_world for name in dict.fromkeys(names)}
         if len(poses) == 1:
             return poses[names[0]].matrix

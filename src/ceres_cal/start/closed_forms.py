@@ -84,7 +84,7 @@ def homography_from_points(plane_points: ArrayLike, image_points: ArrayLike) -> 
     u = image @ scale
     zero = np.zeros_like(x)
     rows = np.vstack([np.hstack([u[:, 2:] * x, zero, -u[:, :1] * x]), np.hstack([zero, u[:, 2:] * x, -u[:, 1:2] * x])])
-    _, s, vt = np.linalg.svd(rows)
+    _, s, vt = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])
     if s[7] <= 1e-9 * s[0]:
         raise DegenerateError(f"of any four of the {len(plane)} points three lie on one line: add points beside it")
     h = np.linalg.inv(scale) @ vt[-1].reshape(3, 3) @ t

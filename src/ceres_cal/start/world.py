@@ -213,7 +213,7 @@ def chained_poses(
     stations = {name: station.cam_from_world.matrix for name, station in (standing or {}).items()}
     stations = stations or {name: np.eye(3, 4) for name in anchored_stations(sights.observations)}
     placements: dict[str | None, Array] = {None: np.eye(3, 4)}
-    known = -1
+    stacks, known = [np.empty((0, 3, 4))], -1
     while len(stations) + len(placements) > known:
         known = len(stations) + len(placements)
         for key, pose in zip(keys, seen, strict=True):
@@ -224,15 +224,15 @@ def chained_poses(
             if key.placement not in placements and key.station in stations:
                 fresh.setdefault(key.placement, row)
         if fresh:
-            rows = list(fresh.values())
-            world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
-            placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
+            rows, number = list(fresh.values()), {name: number for number, name in enumerate(stations)}
+            world_from_cam = inverted(np.array(list(stations.values())))[[number[keys[row].station] for row in rows]]
+            stacks.append(chained(world_from_cam, seen[rows]))
+            placements |= dict(zip(fresh, stacks[-1], strict=True))
     _require_all(sights, stations, placements, open_numbers or {})
     cameras = sights.observations.stations
-    named = [name for name in placements if name is not None]
     return (
         {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
-        Poses.stacked(named, np.array([placements[name] for name in named]).reshape(-1, 3, 4)),
+        Poses.stacked([name for name in placements if name is not None], np.concatenate(stacks)),
     )
 
 
