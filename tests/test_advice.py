@@ -168,7 +168,7 @@ def test_what_the_camera_does_not_see_tells_nothing() -> None:
 @pytest.mark.parametrize("name", ["whole field, 8 deg", "whole field, 1 deg, 6 boards", "two cameras"])
 def test_the_noise_is_the_one_that_was_found(name: str) -> None:
     """0.3 px, out of what a calibration's file has: 4 % off at most is chance, of 137 curve observations."""
-    weighting = _weighting(calibrated(name).fit)
+    weighting = _weighting(calibrated(name).fit, next(iter(calibrated(name).cameras)))
     fit = calibrated(name).fit
     assert weighting.curve_scale == pytest.approx(0.3 * fit.curve_scale, rel=1e-9)
     if fit.points:
@@ -181,7 +181,7 @@ def test_the_noise_is_the_one_that_was_found(name: str) -> None:
 def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None:
     """The same by the whole posterior with the information added, nothing integrated out before."""
     calibration, advice = calibrated(name), advised(name)
-    known, weighting = calibration.uncertainty, _weighting(calibration.fit)
+    known, weighting = calibration.uncertainty, _weighting(calibration.fit, next(iter(calibration.cameras)))
     tolerances = calibration.options.tolerances
     ground = Ground(known.estimate, known.posterior.keys, calibration.targets, tolerances, weighting)
     for promise in first_of(advice).values():

@@ -234,7 +234,7 @@ def test_correlated_errors() -> None:
     half = np.arange(len(observations.curves)) % 2 == 0
     seen = linearised(observations.part(np.zeros(len(observations.points), bool), half))
     model, every = replace(seen.model, step=np.zeros(len(seen.model.step))), np.eye(len(seen.residuals))
-    family = families_of(model, views_or_placements(model.equations), True)[0]
+    family = families_of(model, views_or_placements(model.equations), model.equations.is_curve)[0]
     at = likelihoods([family], False, float(np.sum(model.shared**2)))
     none = seen.log(every, 0.0 * every)
     for place in np.flatnonzero(np.isfinite(at.log))[1::5]:

@@ -90,7 +90,7 @@ def cross_validate(
         else:
             errors[part & kept] = found
     kept = kept & np.isfinite(errors[:, 0])
-    fit_px = _errors(whole.drawn_alike(observations), kept, whole.estimate)[kept, 0]
+    fit_px = _errors(whole.as_taken(observations), kept, whole.estimate)[kept, 0]
     points = kept & (np.arange(len(kept)) < len(observations.points))
     every = (errors[points, 0], errors[kept & ~points, 0], errors[kept, 0], errors[kept, 1], fit_px)
     return HeldOut(folds, failed, int(np.count_nonzero(kept)), *map(rms, every))
@@ -116,7 +116,7 @@ def _without(
 
 def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:
     """Errors (N + M, 2), px and mm, of held-out observations under a calibration that did not see them."""
-    estimate, observations = trained.estimate, trained.drawn_alike(observations)
+    estimate, observations = trained.estimate, trained.as_taken(observations)
     sights = gather_sights(observations).used(*np.split(held, [len(observations.points)]))
     new = {key.placement for key in sights.keys if key.placement is not None} - set(estimate.placements)
     missing = {key.station for key in sights.keys} - set(estimate.stations)

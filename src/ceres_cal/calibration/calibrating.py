@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from ceres_cal.problem.quantities import require_possible_numbers
 from ceres_cal.problem.structure import EXACT, make_structure
 from ceres_cal.robust.as_built import Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
+from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
@@ -107,7 +109,9 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
 
 
 def _measured(observations: Observations, options: Options, progress: SolveProgress | None, client: Any) -> Calibration:
-    """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
+    """With targets drawn as long, and cameras as noisy, as they were found to be; from there again where that is not
+    how they were taken. Very many observations, of which a part decides, have one noise.
+    """
     # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start
     # and outliers are those of the right drawing; and how many there may be.
     redrawn, most_drawings = 0.005, 4
@@ -116,10 +120,20 @@ def _measured(observations: Observations, options: Options, progress: SolveProgr
         before = calibration.estimate.structure
         calibration = calibration.redrawn()
         moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
-        if float(np.max(np.abs(moved), initial=0.0)) < redrawn:
+        noise = calibration.fit.of_cameras if is_bulk(observations) else _noise_of_cameras(calibration, observations)
+        if float(np.max(np.abs(moved), initial=0.0)) < redrawn and noise == calibration.fit.of_cameras:
             break
-        observations = calibration.drawn_alike(observations)
+        observations = calibration.as_taken(observations).at_noise(noise)
     return calibration
+
+
+def _noise_of_cameras(calibration: Calibration, observations: Observations) -> Mapping[str, float]:
+    """See `noise_of_cameras`: by all observations but copies and those that were found to be something else."""
+    if not calibration.rounds:
+        return {}
+    masks = zip(calibration.inlier_masks(observations), calibration.outlier_masks(observations), strict=True)
+    judged = np.concatenate([inliers | outliers for inliers, outliers in masks])
+    return noise_of_cameras(calibration.problem(observations), calibration.estimate, judged)
 
 
 def _calibrated(

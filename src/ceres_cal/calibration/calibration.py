@@ -153,7 +153,7 @@ class Calibration(Frozen):
             raise InputError("these are not the observations that the calibration was made from: give those")
         from ceres_cal.posterior.seam import disagreement
 
-        used = self.drawn_alike(observations).part(*self.inlier_masks(observations))
+        used = self.as_taken(observations).part(*self.inlier_masks(observations))
         return disagreement(used, self.estimate, self.uncertainty.posterior, self.fit.scales, (first, second))
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
@@ -177,15 +177,17 @@ class Calibration(Frozen):
         estimate = replace(self.estimate, structure=self.estimate.structure.redrawn())
         return replace(self, estimate=estimate, targets=targets) if found else self
 
-    def drawn_alike(self, observations: Observations) -> Observations:
-        """The observations of targets whose dimensions are those that were solved for here."""
+    def as_taken(self, observations: Observations) -> Observations:
+        """The observations as they were taken here: of targets of the dimensions that were solved for, each camera's at
+        its noise.
+        """
         targets = dict(observations.targets)
         for name, target in targets.items():
             own = [one for one in target.dimensions if f"{name}/{one}" in self.options.dimensions]
             if own and name in self.targets:
                 known = self.targets[name].dimensions
                 targets[name] = redrawn(target, {one: known[one] for one in own if one in known})
-        return observations.with_targets(targets)
+        return observations.with_targets(targets).at_noise(self.fit.of_cameras)
 
     @property
     def outliers(self) -> tuple[Rejected, ...]:
@@ -198,7 +200,7 @@ class Calibration(Frozen):
         Args:
             new_data: that the observations are others: then as if they were calibrated with the same options.
         """
-        observations, options = self.drawn_alike(observations), self.options
+        observations, options = self.as_taken(observations), self.options
         sights = gather_sights(observations)
         prior = None if self.refitted is None else self.refitted.prior
         weighting = Weighting(*self.fit.scales, options.loss, options.loss_scale)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PixelOrigin, Units, convert
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.base.version import __version__
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
@@ -124,6 +124,7 @@ class Fit(Frozen, eq=True):
         unknowns: free numbers.
         point_sigma_px, curve_sigma_px: root mean square of the stated sigmas of those that took part; None in files of
             0.1, which do not have them.
+        of_cameras: camera -> its own factor on the stated sigmas, before these scales; none where all are alike.
     """
 
     points: int
@@ -135,6 +136,7 @@ class Fit(Frozen, eq=True):
     unknowns: int
     point_sigma_px: float | None = None
     curve_sigma_px: float | None = None
+    of_cameras: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     @property
     def noise_px(self) -> tuple[float, float]:

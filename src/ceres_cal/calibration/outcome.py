@@ -59,6 +59,8 @@ _BEHIND = (
     "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
 )
 
+_OWN_NOISE = "each counts by its own noise; look whether the photographs of the noisiest are sharp"
+
 
 def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
     """Raise DegenerateError where coefficients of a lens may be anything at all."""
@@ -130,6 +132,13 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
             yield _BEHIND.format(name, len(own))
 
 
+def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
+    """Words about cameras whose observations scatter otherwise than the others', beside what is stated of them."""
+    if noise:
+        each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())
+        yield f"beside what was stated of them the cameras are not equally noisy ({each} times the mean): {_OWN_NOISE}"
+
+
 def _share_text(share: float) -> str:
     return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"
 
@@ -192,7 +201,9 @@ def of_all(calibration: Calibration, settled: Settled) -> Calibration:
 def _fit(end: RobustSolution, layout: Layout) -> Fit:
     points, curves = end.residuals.lengths
     used = points[end.inliers.points], curves[end.inliers.curves]
-    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
+    sights, observations = end.problem.sights, end.problem.observations
+    stated = observations.at_noise({})
+    sigmas = stated.points.sigma_px[sights.point_rows], stated.curves.sigma_px[sights.curve_rows]
     return Fit(
         len(used[0]),
         len(used[1]),
@@ -203,6 +214,7 @@ def _fit(end: RobustSolution, layout: Layout) -> Fit:
         layout.size,
         _rms(sigmas[0]),
         _rms(sigmas[1]),
+        observations.noise,
     )
 
 

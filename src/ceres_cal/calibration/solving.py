@@ -13,6 +13,7 @@ from ceres_cal.base.threads import meanwhile
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
     came_out,
+    noisier_cameras,
     of_all,
     require_lens_told,
     resting_phi,
@@ -195,6 +196,7 @@ def known_of(seen: Explained) -> Calibration:
         strange = (
             *unusual_pixels(seen.end, seen.problem),
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
+            *noisier_cameras(seen.problem.observations.noise),
         )
         warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
     calibration = seen.came_out

@@ -121,7 +121,7 @@ def diagnose(
             cameras or stations that it does not have.
         SolutionError: another camera or target than those calibrated, or it can show none of them.
     """
-    observations = calibration.drawn_alike(observations)
+    observations = calibration.as_taken(observations)
     _require_known(calibration, observations, new_data)
     case = _case(calibration, observations, new_data)
     tested = _tested(case, false_alarm_rate)

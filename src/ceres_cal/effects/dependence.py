@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,7 +58,7 @@ class Correlation(Frozen, eq=True):
     Attributes:
         kind: "points" or "curves". probability: that they do. length_m, share: the likeliest length over which, None
             where whole curves lie aside, and share of the variance that does. lasting: whether over all views of a
-            sight, not anew in each of them.
+            sight, not anew in each of them. camera: whose they are; None where there is one.
     """
 
     kind: str
@@ -65,31 +66,35 @@ class Correlation(Frozen, eq=True):
     length_m: float | None
     share: float
     lasting: bool
+    camera: str | None = None
 
 
 def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[Array, Dependence]:
-    """(G, P, P) the covariance of each group's score, with what errors have in common, and what that rests on.
+    """(G, P, P) covariance of each group's score, with what a camera's errors have in common, and what that rests on.
 
     Args:
         model: of some views, in directions in which everything is known to one. group: (E,) of the G views or
             placements that are compared. informations: (G, P, P) of each, were errors independent.
     """
     fewest_rows = 12
-    scores, private, inverse, kinds = informations.copy(), [1.0], 0.0, []
-    for is_curve, kind in ((False, "points"), (True, "curves")):
-        rows = model.equations.is_curve == is_curve
+    scores, private, kinds, equations = informations.copy(), [1.0], [], model.equations
+    owners = [key.camera for key in equations.sights.keys]
+    names = list(dict.fromkeys(owners))
+    owner, inverse = np.array([names.index(name) for name in owners])[equations.sight], [0.0] * len(names)
+    for number, (is_curve, kind) in product(range(len(names)), ((False, "points"), (True, "curves"))):
+        rows = (owner == number) & (equations.is_curve == is_curve)
         if np.count_nonzero(rows) < fewest_rows:
             continue
-        families = families_of(model, group, is_curve)
+        families = families_of(model, group, rows)
         if not any(map(is_loud, families)):
             continue
         average = _Average.of(model.shared, families, rows, may_be_smooth=not is_curve)
         change, factor = average.change(model.columns, group)
         scores += change
         private.append(factor)
-        inverse += average.inverse_freedom
-        kinds.append(average.correlation(kind))
-    return scores, Dependence(tuple(kinds), None, max(private), inverse)
+        inverse[number] += average.inverse_freedom
+        kinds.append(average.correlation(kind, names[number] if len(names) > 1 else None))
+    return scores, Dependence(tuple(kinds), None, max(private), max(inverse))
 
 
 class _Average(Frozen):
@@ -123,13 +128,13 @@ class _Average(Frozen):
         mixed = 1.0 / _freedom_of_mixture(weight[used], (rest + variance * at.trace)[used])
         return cls(families, at, variance, weight, mixed + float(weight @ at.inverse_freedom))
 
-    def correlation(self, kind: str) -> Correlation:
+    def correlation(self, kind: str, camera: str | None) -> Correlation:
         """What is likeliest."""
         best = 1 + int(np.argmax(self.weight[1:])) if len(self.weight) > 1 else 0
         length, longest = float(self.at.length_m[best]), max(family.longest for family in self.families)
         aside, probability = length > 2.0 * longest, float(1.0 - self.weight[0])
         share, lasting = float(self.at.share[best]), self.families[int(self.at.family[best])].lasting
-        return Correlation(kind, probability, None if aside else length, share, lasting)
+        return Correlation(kind, probability, None if aside else length, share, lasting, camera)
 
     def change(self, columns: Array, group: Indices) -> tuple[Array, float]:
         """(G, P, P) what is added to the covariance of each group's score, and the factor on private placements.
@@ -208,7 +213,7 @@ class Dependence(Frozen, eq=True):
         correlations: of points and of curves, where neighbours might agree. between: how views or placements scatter;
             None where there are too few, or one sees what lasts over all of them.
         private: factor on the variance of placements by their own observations.
-        inverse_freedom: 1 / degrees of freedom of all that, beside the noise scale's.
+        inverse_freedom: 1 / degrees of freedom of all that, beside the noise scale's; of cameras the most.
     """
 
     correlations: tuple[Correlation, ...] = ()
@@ -230,6 +235,7 @@ class Dependence(Frozen, eq=True):
 def _reach(correlation: Correlation) -> str:
     length = correlation.length_m
     over = " as a whole" if length is None else f" over {two_digits(length)} m"
+    over += "" if correlation.camera is None else f" in camera {correlation.camera!r}"
     return over + (" in all views alike" if correlation.lasting else "")
 
 

@@ -67,14 +67,14 @@ def go_over_groups(equations: Equations, group: Indices) -> bool:
     return len(distinct(names * (int(group.max()) + 1) + group)) > len(distinct(names))
 
 
-def families_of(model: Linearised, group: Indices, curves: bool) -> list[StrandFamily]:
+def families_of(model: Linearised, group: Indices, chosen: Mask) -> list[StrandFamily]:
     """The strands of curves or of points, within views and then, where some sight has several, over all of a sight.
 
     Args:
-        group: (E,) of the views or placements that are compared with one another.
+        group: (E,) of the views or placements that are compared with one another. chosen: (E,) which equations.
     """
     equations = model.equations
-    families, rows = [], np.flatnonzero(equations.is_curve == curves)
+    families, rows = [], np.flatnonzero(chosen)
     for lasting, owner in ((False, equations.view), (True, equations.sight)):
         if lasting and not _has_several_views(equations):
             continue

@@ -217,7 +217,7 @@ def matched(calibration: Calibration, observations: Observations) -> Observation
             of their image.
         SolutionError: images of another size, or a target of other dimensions.
     """
-    observations = calibration.drawn_alike(observations)
+    observations = calibration.as_taken(observations)
     for name, size in observations.cameras.items():
         if name not in calibration.cameras:
             known = ", ".join(map(repr, calibration.cameras))

@@ -174,7 +174,7 @@ def _case(observations: Observations, given: Camera) -> _AuditCase:
         raise failure or InputError("nothing was observed")
     ours = min(found, key=lambda one: one[0])[1]
     weighting = Weighting(*ours.fit.scales, "trivial")
-    observations = ours.drawn_alike(observations)
+    observations = ours.as_taken(observations)
     sights = gather_sights(observations)
     problem = ours.problem(observations)
     used = replace(problem, sights=sights, weighting=weighting, priors=())

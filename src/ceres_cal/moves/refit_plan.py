@@ -148,7 +148,7 @@ def make_plan(
         raise InputError(no_such("kind of refit (what)", what, WHAT))
     require_posterior(calibration)
     observed = matched(calibration, observations)
-    observations = calibration.drawn_alike(observations)
+    observations = calibration.as_taken(observations)
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
     for name in chosen - stations.keys():

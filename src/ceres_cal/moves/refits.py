@@ -255,7 +255,11 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
         owners = {("camera", name), *(("station", one) for one, its in stations.items() if its.camera == name)}
         own = known.mixture(name).marginal([key for key in result.posterior.keys if key[:2] in owners])
         mixtures[name] = own if result.posterior.lenses else replace(own, lenses={})
-    return replace(result, estimate=estimate, posterior=replace(result.posterior, mixtures=mixtures))
+    dependence, past = result.posterior.dependence, known.dependence
+    if dependence is not None and past is not None:
+        dependence = replace(dependence, inverse_freedom=max(dependence.inverse_freedom, past.inverse_freedom))
+    posterior = replace(result.posterior, mixtures=mixtures, dependence=dependence)
+    return replace(result, estimate=estimate, posterior=posterior)
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.frozen import cached_property, replace
+from ceres_cal.base.frozen import cached_property, field, replace
 from ceres_cal.base.typed import checked
 from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.columns import (
@@ -50,11 +50,15 @@ class Observations(Content):
             matter then: the solve estimates the scale).
         curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
         priors: what is known beforehand. notes: whatever somebody wants to keep with them, plain data.
+        noise: camera -> factor on the stated sigmas that `sigma_px` has in it already, as a calibration found it; in no
+            file.
 
     Raises:
         InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
             finite, a camera without any observation.
     """
+
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = f"{len(self.points)} points, {len(self.curves)} curve observations in {len(self.views)} views"
@@ -242,6 +246,16 @@ class Observations(Content):
         vars(drawn)["digest"] = self.digest
         return drawn
 
+    def at_noise(self, noise: Mapping[str, float]) -> Observations:
+        """The same observations with sigmas at such a `noise` of cameras and no other; their digest stays."""
+        if noise == self.noise:
+            return self
+        factors = np.array([noise.get(v.camera, 1.0) / self.noise.get(v.camera, 1.0) for v in self.views])
+        points, curves = (replace(c, sigma_px=c.sigma_px * factors[c.view]) for c in (self.points, self.curves))
+        rated = replace(self, points=points, curves=curves, noise=dict(noise))
+        vars(rated)["digest"] = self.digest
+        return rated
+
     def of_station(self, name: str) -> Observations:
         """One station's views with all their observations, without priors."""
         chosen = np.array([view.station == name for view in self.views])
@@ -253,6 +267,7 @@ class Observations(Content):
             tuple(view for view in self.views if view.station == name),
             replace(points, view=order[points.view]),
             replace(curves, view=order[curves.view]),
+            noise=self.noise,
         )
 
     # ---- checks -------------------------------------------------------------------------------------------------

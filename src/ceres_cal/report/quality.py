@@ -113,7 +113,7 @@ def quality_of(calibration: Calibration, observations: Observations) -> Quality:
     that fails, the verdict says so.
     """
     diagnosed = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
-    observations = calibration.drawn_alike(observations)
+    observations = calibration.as_taken(observations)
     if not calibration.rounds:
         return Quality(calibration, observations, None)
     few = thinned(observations, diagnosed)

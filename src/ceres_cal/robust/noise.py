@@ -19,7 +19,14 @@ from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import from_placement
 from ceres_cal.problem.reduced import ReducedInformation
-from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths
+from ceres_cal.problem.residuals import (
+    Equations,
+    Residuals,
+    equations_of,
+    pairs_of,
+    relative_lengths,
+    residuals,
+)
 
 if TYPE_CHECKING:
     from ceres_cal.problem.shares import Histogram
@@ -287,6 +294,39 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
             break
         spread = wider
     return spread
+
+
+def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict[str, float]:
+    """Camera -> factor on the stated sigmas of its observations; none where all are about as noisy as each other.
+
+    A photograph out of focus, a camera of fewer pixels or another detector: at the mean noise of all cameras what is
+    stated of the noisiest is too sure, and of the others too unsure. Of few observations the mean counts as much as in
+    `judge`, and each camera's own numbers and poses are counted against its own observations.
+
+    Args:
+        problem: at the noise of all together. judged: (N + M,) those that are not known to be something else.
+    """
+    alike = 1.25  # ratio up to which sds are right within what statistics of hundreds of runs tell
+    by_chance = 3.0  # standard errors of a scale
+    observations, layout, usual = problem.observations, problem.layout, problem.weighting.scales
+    if len(observations.cameras) < 2 or problem.options.noise_scale == "stated":
+        return {}
+    lengths = relative_lengths(observations, residuals(problem.sights, estimate, problem.feet))
+    kinds, columns = np.split(judged, [len(observations.points)]), (observations.points, observations.curves)
+    owners, noise, differ = np.array([view.camera for view in observations.views]), dict[str, float](), False
+    for name, free in layout.free.items():
+        stations = {station for station, camera in observations.stations.items() if camera == name}
+        seen = {view.placement for view in observations.views if view.camera == name}
+        unknowns = len(free) + 6 * (len(layout.stations & stations) + len(layout.placements & seen))
+        rows = [own & (owners == name)[column.view] for own, column in zip(kinds, columns, strict=True)]
+        points, curves = (EachLength(length[own]) for length, own in zip(lengths, rows, strict=True))
+        equations = 2 * points.count, curves.count
+        found = noise_of(points, curves, by_count(sum(equations), unknowns), problem.options, usual)
+        ratios = np.maximum(found[:2], _LEAST_SCALE_PX) / usual
+        ratio = float(np.sqrt(np.average(ratios**2, weights=equations)))
+        differ |= abs(np.log(ratio)) > max(np.log(alike), by_chance / (2.0 * found.degrees_of_freedom) ** 0.5)
+        noise[name] = ratio * observations.noise.get(name, 1.0)
+    return noise if differ else dict(observations.noise)
 
 
 # ---- outliers by deleted residuals ----------------------------------------------------------------------------------

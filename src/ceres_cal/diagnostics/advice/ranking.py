@@ -162,8 +162,9 @@ def _prepared(calibration: Calibration, station: str | None, height_m: float) ->
     today = known.map_sd_mm(station, height_m)
     if not np.any(today.sd_mm >= 0.0):
         raise InputError(f"station {today.station!r} sees nothing of the field at {1e3 * height_m:.0f} mm")
-    posterior = _of_camera(known.posterior, known.estimate, known.estimate.stations[today.station].camera)
-    tolerances, weighting = calibration.options.tolerances, _weighting(calibration.fit)
+    camera = known.estimate.stations[today.station].camera
+    posterior = _of_camera(known.posterior, known.estimate, camera)
+    tolerances, weighting = calibration.options.tolerances, _weighting(calibration.fit, camera)
     ground = Ground(known.estimate, posterior.keys, calibration.targets, tolerances, weighting)
     return ground, Outlook.of(known.estimate, posterior, today)
 
@@ -177,12 +178,13 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
     return replace(posterior, information=posterior.information.marginal(keys), mixtures=mixtures, stated=stated)
 
 
-def _weighting(fit: Fit) -> Weighting:
-    """Noise in px of points and curves, as the fit found it; of a kind that nobody observed that of the other."""
+def _weighting(fit: Fit, camera: str) -> Weighting:
+    """Noise in px of a camera's points and curves, as the fit found it; of a kind that nobody observed, the other's."""
     points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
         raise InputError("the calibration found no noise at all: advice would promise miracles")
-    return Weighting(points, curves, "trivial")
+    own = fit.of_cameras.get(camera, 1.0)
+    return Weighting(own * points, own * curves, "trivial")
 
 
 def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Target]:
