@@ -145,7 +145,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("diagnostics.checks", "LARGER _FEWEST_PAIRS", "diagnose"),
     *_of("effects.columns", "_LEAST_SHARE", "diagnose"),
     *_of("effects.table.targets", "_FEWEST_ON_CURVE _FEWEST_OF_POINT", "diagnose"),
-    *_of("diagnostics.diagnose", "_FEWEST_AGREE _FAR_M", "diagnose"),
+    *_of("diagnostics.diagnosis", "_FEWEST_AGREE _FAR_M", "diagnose"),
     *_of("moves.checks", "_INLIER_SIGMA _LEAST_SHARE _USUAL_EQUATIONS _WILL_DO", "check"),
     *_of("moves.agreement", "FALSE_ALARMS", "check"),
     *_of("problem.residuals", "_STRAY", "check", "refit"),
