@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
+from ceres_cal import detect, moves, start
 from ceres_cal.base.errors import ImageProgress, InputError
 from ceres_cal.base.images import Images, image_files, images_and_videos
 from ceres_cal.base.typed import checked
@@ -21,9 +22,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
 if TYPE_CHECKING:
-    from ceres_cal.detect.boards import BoardDetections
-    from ceres_cal.detect.photographs import Clicks, FieldDetections, SearchResult
-    from ceres_cal.moves.refit_plan import RefitOptions
     from ceres_cal.problem.bundle import SolveProgress
 
 # ---- detection ------------------------------------------------------------------------------------------------------
@@ -43,7 +41,7 @@ def detect_board(
     frames: int = 30,
     folder: str | PathLike[str] | None = None,
     progress: ImageProgress | None = None,
-) -> BoardDetections:
+) -> detect.BoardDetections:
     """Find a board in photographs or videos of one camera: `detect_board("photographs/", checkerboard(9, 6, 0.025))`.
 
     Args:
@@ -58,25 +56,21 @@ def detect_board(
     Raises:
         InputError: an image cannot be read, or no image shows the board.
     """
-    from ceres_cal.detect.boards import detect_boards, finder_of
-    from ceres_cal.detect.charuco import CharucoSpec
-    from ceres_cal.detect.video import frames_of_videos
-
     if (charuco is None) != (marker_m is None):
         raise InputError("charuco and marker_m belong together: give both or neither")
-    corners = corner_fit if charuco is None or marker_m is None else CharucoSpec(charuco, marker_m, legacy)
-    finder_of(board, corners)  # or says what does not fit, before any video is read
+    corners = corner_fit if charuco is None or marker_m is None else detect.CharucoSpec(charuco, marker_m, legacy)
+    detect.finder_of(board, corners)  # or says what does not fit, before any video is read
     photographs, videos = images_and_videos(images)
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
-        photographs += frames_of_videos(videos, frames, Path(place), progress)
-        return detect_boards(photographs, board, camera, station, corners, progress)
+        photographs += detect.frames_of_videos(videos, frames, Path(place), progress)
+        return detect.detect_boards(photographs, board, camera, station, corners, progress)
 
 
 @checked
 def detect_field(
     images: Images | Callable[[], Images],
     target: Target | None = None,
-    start: Calibration | Camera | Clicks | Mapping[str, tuple[float, float]] | None = None,
+    start: Calibration | Camera | detect.Clicks | Mapping[str, tuple[float, float]] | None = None,
     *,
     auto: bool = False,
     facing: Mapping[str, str] | None = None,
@@ -88,9 +82,9 @@ def detect_field(
     keep_start: bool = False,
     camera: str | None = None,
     station: str | None = None,
-    refused: Callable[[Path, SearchResult], None] | None = None,
+    refused: Callable[[Path, detect.SearchResult], None] | None = None,
     progress: ImageProgress | None = None,
-) -> FieldDetections:
+) -> detect.FieldDetections:
     """Find the painted lines of a field in photographs of one station.
 
     Args:
@@ -112,14 +106,10 @@ def detect_field(
     Raises:
         InputError: an image cannot be read, or a name does not fit. NothingShownError: no image shows the field.
     """
-    from ceres_cal.detect.images import read_grey
-    from ceres_cal.detect.photographs import Auto, Clicks, Facing, FieldOptions
-    from ceres_cal.detect.photographs import detect_field as detected
-
     sides = facing or {}
     if sides and not auto and start is not None:
         raise InputError("facing is for a search without a start: a start says which way round the field is")
-    posed: Camera | Clicks | Auto
+    posed: Camera | detect.Clicks | detect.Auto
     if isinstance(start, Calibration):
         posed, station = start.station(station), start.estimate.station_name(station)
         camera = camera or start.estimate.stations[station].camera
@@ -127,28 +117,29 @@ def detect_field(
     elif isinstance(start, Mapping):
         if auto:
             raise InputError("auto looks for the field without points: leave out auto, or the points")
-        posed = Clicks(dict(start))
+        posed = detect.Clicks(dict(start))
     elif start is not None:
         posed = start
     if start is None or auto:
         before = None if start is None or not isinstance(posed, Camera) else posed
-        posed = Auto(tuple(Facing(*one) for one in sides.items()), before)
+        posed = detect.Auto(tuple(detect.Facing(*one) for one in sides.items()), before)
     if target is None:
         raise InputError("target is missing: name the field, such as ssl_field('B')")
     painted = lines_to_find(target, sides, not_painted, estimate)
-    options = FieldOptions(
+    options = detect.FieldOptions(
         camera or "camera",
         station or camera or "camera",
         points=points,
         edges=edges,
         lengths=tuple(estimate),
-        left_out=None if mask is None else read_grey(Path(mask)) == 0,
+        left_out=None if mask is None else detect.read_grey(Path(mask)) == 0,
         keep_start=keep_start,
         refused=refused,
     )
-    if isinstance(posed, Clicks):
+    if isinstance(posed, detect.Clicks):
         posed.require_names(target)
-    return detected(image_files(images() if callable(images) else images), target, posed, painted, options, progress)
+    paths = image_files(images() if callable(images) else images)
+    return detect.detect_field(paths, target, posed, painted, options, progress)
 
 
 def lines_to_find(
@@ -159,24 +150,19 @@ def lines_to_find(
     Raises:
         InputError: what is said of the field does not fit it: see `detect_field`.
     """
-    from ceres_cal.detect.photographs.facing import Facing, require_sides
-    from ceres_cal.detect.photographs.field import require_findable
-
-    sides = [Facing(*one) for one in facing.items()]
+    sides = [detect.Facing(*one) for one in facing.items()]
     for name in not_painted:
         if name not in target.curves:
             raise InputError(f"not_painted: {no_such('line', name, target.curves)}")
     painted = [name for name in target.curves if name not in not_painted]
-    require_findable(target, painted, lengths)
-    require_sides(sides, target, painted)
+    detect.require_findable(target, painted, lengths)
+    detect.require_sides(sides, target, painted)
     return painted
 
 
 def field_of(calibration: Calibration) -> Target | None:
     """The only target of a calibration with painted lines; None where there are several, or none."""
-    from ceres_cal.detect.photographs.known import is_painted
-
-    fields = [one for one in calibration.targets.values() if is_painted(one)]
+    fields = [one for one in calibration.targets.values() if detect.is_painted(one)]
     return fields[0] if len(fields) == 1 else None
 
 
@@ -193,14 +179,13 @@ def join(*observations: Observations, same_frame: str | None = None) -> Observat
         InputError: sets that contradict one another, or a rule that fits no frames.
     """
     from ceres_cal.observations.same_frame import with_same_frames
-    from ceres_cal.start.same_labels import open_words, with_same_labels
 
     if not observations or not all(isinstance(one, Observations) for one in observations):
         raise InputError("join(): give Observations, one or more: read files with Observations.load")
     every = combine(observations)
-    labels = with_same_labels(every if same_frame is None else with_same_frames(every, same_frame))
+    labels = start.with_same_labels(every if same_frame is None else with_same_frames(every, same_frame))
     for name in labels.open:
-        warnings.warn(open_words(name), stacklevel=2)
+        warnings.warn(start.open_words(name), stacklevel=2)
     return labels.observations
 
 
@@ -229,15 +214,12 @@ def check(
         InputError: a station that the calibration does not have, or an image that cannot be read.
         SolutionError: another camera or another field than those calibrated.
     """
-    from ceres_cal.moves import checks as moves
-
     if isinstance(observations, Observations):
         return moves.check(calibration, observations, false_alarms, checks)
-    from ceres_cal.detect.photographs import check_photographs
 
     images = image_files(observations)
     how = {"checks": checks, "not_painted": not_painted, "progress": progress}
-    return check_photographs(calibration, images, station, false_alarms, **how)[0]  # type: ignore[arg-type]
+    return detect.check_photographs(calibration, images, station, false_alarms, **how)[0]  # type: ignore[arg-type]
 
 
 @checked
@@ -247,7 +229,7 @@ def refit(
     what: Literal["pose", "pose-only", "zoom", "iris", "everything"] = "pose",
     *,
     moved: Sequence[str] | None = None,
-    options: RefitOptions | None = None,
+    options: moves.RefitOptions | None = None,
     progress: SolveProgress | None = None,
     station: str | None = None,
     not_painted: Sequence[str] = (),
@@ -266,11 +248,7 @@ def refit(
         DegenerateError: the observations cannot determine a pose.
         SolutionError: nothing explains the observations, or something that `what` does not allow for.
     """
-    from ceres_cal.moves import refits
-
     if not isinstance(observations, Observations):
-        from ceres_cal.detect.photographs import detect_known
-
         images = image_files(observations)
-        observations = detect_known(calibration, images, station, not_painted=not_painted).require()
-    return refits.refit(calibration, observations, what, moved=moved, options=options, progress=progress)
+        observations = detect.detect_known(calibration, images, station, not_painted=not_painted).require()
+    return moves.refit(calibration, observations, what, moved=moved, options=options, progress=progress)

@@ -55,21 +55,20 @@ def _run(args: RefitArguments) -> Document:
     detections = _photographed(args, calibration, images) if observed is None else None
     observations = detections.require() if detections is not None else observed
     assert observations is not None
-    from ceres_cal.moves.refit_plan import RefitOptions
-    from ceres_cal.moves.refits import movements, refit
 
     photographs = files.report_photographs(args, observations, calibration, images)
-    result = refit(
+    result = moves.refit(
         calibration,
         observations,
         args.what,
         moved=args.moved or None,
-        options=RefitOptions(args.hold_others, args.labels, priors),
+        options=moves.RefitOptions(args.hold_others, args.labels, priors),
     )
     about = result.refitted
     assert about is not None
-    moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(calibration, result).items()}
-    explained = {"what": about.what, "explanation": about.explanation, "moved": moves}
+    every = moves.movements(calibration, result).items()
+    moved = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in every}
+    explained = {"what": about.what, "explanation": about.explanation, "moved": moved}
     first = Section("refit", about.explanation.split("; "), explained)
     return files.calibrated(args, result, observations, photographs, args.inputs, first, shown(detections))
 

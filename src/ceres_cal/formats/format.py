@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 from msgspec import Struct
 
+from ceres_cal import scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, write_bytes
 from ceres_cal.base.frozen import Frozen, field, replace
@@ -15,9 +16,6 @@ from ceres_cal.base.frozen import Frozen, field, replace
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.observations import Observations
-    from ceres_cal.scene.camera import Camera
-    from ceres_cal.scene.foreign import ForeignCamera
-    from ceres_cal.scene.targets import Target
 
 
 class ExportLoss(Struct, frozen=True):
@@ -172,8 +170,8 @@ class ImportFormat(Struct, frozen=True):
 
 def calibration_of(
     source: str,
-    cameras: Mapping[str, Camera | ForeignCamera],
-    targets: Mapping[str, Target] | None = None,
+    cameras: Mapping[str, scene.Camera | scene.ForeignCamera],
+    targets: Mapping[str, scene.Target] | None = None,
     warnings: Sequence[str] = (),
 ) -> Calibration:
     """The cameras of a file, by name, as a calibration of which nobody says how well it is known.
@@ -187,11 +185,10 @@ def calibration_of(
     from ceres_cal.calibration import Calibration, Fit
     from ceres_cal.problem.parameters import Estimate, Options, Station
     from ceres_cal.problem.structure import EXACT
-    from ceres_cal.scene.camera import Camera
 
-    ours, told = dict[str, Camera](), [*warnings]
+    ours, told = dict[str, scene.Camera](), [*warnings]
     for name, given in cameras.items():
-        if isinstance(given, Camera):
+        if isinstance(given, scene.Camera):
             ours[name] = given
             continue
         ours[name], (rms, worst) = given.camera()

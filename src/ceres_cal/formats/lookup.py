@@ -9,11 +9,12 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal import posterior, scene
 from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Array, grid_places
 from ceres_cal.base.errors import InputError
@@ -23,9 +24,6 @@ from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
 from ceres_cal.scene.camera import in_image
-
-if TYPE_CHECKING:
-    from ceres_cal.scene.camera import Camera
 
 FILE_FORMAT, VERSION = "ceres-cal/table", 1
 _COLUMNS: dict[str, Column] = {
@@ -127,7 +125,7 @@ def _table_of(arrays: Mapping[str, AnyArray]) -> LookupTable:
 
 
 def make_lookup_table(
-    camera: Camera, station: str, x_m: Array, y_m: Array, error_mm: float = 0.1, step_px: int | None = None
+    camera: scene.Camera, station: str, x_m: Array, y_m: Array, error_mm: float = 0.1, step_px: int | None = None
 ) -> LookupTable:
     """The table of a camera; without a step, the widest grid whose largest error keeps to `error_mm`.
 
@@ -151,7 +149,7 @@ def make_lookup_table(
     return table
 
 
-def _table(camera: Camera, station: str, step: int, x_m: Array, y_m: Array) -> LookupTable:
+def _table(camera: scene.Camera, station: str, step: int, x_m: Array, y_m: Array) -> LookupTable:
     x, y = (step * np.arange(-1, int(np.ceil((size - 0.5) / step)) + 1, dtype=float) for size in camera.image_size)
     flat = camera.homography(), np.array(camera.cam_from_world.rotation[:, 2])
     plain = LookupTable(station, camera.image_size, step, x, y, *_rays(camera, x, y), {}, *flat)
@@ -161,7 +159,7 @@ def _table(camera: Camera, station: str, step: int, x_m: Array, y_m: Array) -> L
     return replace(plain, error_mm=errors)
 
 
-def _rays(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+def _rays(camera: scene.Camera, x: Array, y: Array) -> tuple[Array, Array]:
     """Where the nodes' rays meet the floor, and how that changes with height, (Y, X, 2) each."""
     floor = camera.locate(grid_places(x, y))
     slope = (camera.position[:2] - floor) / camera.position[2]
@@ -178,11 +176,9 @@ def _export(
     error_mm: Annotated[float, "largest interpolation error on the field; default: 0.1"] = 0.1,
     step_px: Annotated[int | None, "distance of the nodes; default: the widest that keeps to the error"] = None,
 ) -> Exported:
-    from ceres_cal.posterior.uncertainty import field_grid  # not for the command line's help
-
     if not error_mm > 0.0:
         raise InputError(f"error_mm must be above 0, not {error_mm:g}")
-    (station,), box = request.stations, field_grid(request.calibration.targets)
+    (station,), box = request.stations, posterior.field_grid(request.calibration.targets)
     table = make_lookup_table(request.calibration.station(station), station, *box, error_mm, step_px)
     nodes = (len(table.x_px), len(table.y_px))
     return Exported(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ceres_cal import posterior, scene
 from ceres_cal.base.arrays import Array, grid_places, rms_and_largest
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import HEIGHTS_M, at_height
@@ -14,15 +14,11 @@ from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid
 
-if TYPE_CHECKING:
-    from ceres_cal.scene.camera import Camera
-    from ceres_cal.scene.targets import Target
-
 Box = tuple[Array, Array]
 
 
 def field_error_mm(
-    camera: Camera, locate: Callable[[Array, float], Array], pixels: Array, box_m: Box, heights_m: Sequence[float]
+    camera: scene.Camera, locate: Callable[[Array, float], Array], pixels: Array, box_m: Box, heights_m: Sequence[float]
 ) -> dict[float, tuple[float, float]]:
     """height_m -> root mean square and largest error of located pixels, mm.
 
@@ -42,15 +38,13 @@ def field_error_mm(
     return errors
 
 
-def field_box(targets: Mapping[str, Target]) -> Box | None:
+def field_box(targets: Mapping[str, scene.Target]) -> Box | None:
     """x and y of a grid over what does not move; None where everything does."""
-    from ceres_cal.posterior.uncertainty import field_grid  # not for the command line's help
-
     still = {name: target for name, target in targets.items() if not target.movable}
-    return field_grid(still) if still else None
+    return posterior.field_grid(still) if still else None
 
 
-def field_pixels(camera: Camera, box_m: Box) -> Array:
+def field_pixels(camera: scene.Camera, box_m: Box) -> Array:
     """(N, 2) pixels in which the camera shows places evenly over the field and a little above it."""
     places = grid_places(*box_m)
     every = [camera.project(np.column_stack([places, np.full(len(places), h)])) for h in HEIGHTS_M]
@@ -58,7 +52,7 @@ def field_pixels(camera: Camera, box_m: Box) -> Array:
     return np.asarray(pixels[in_image(pixels, camera.image_size)])
 
 
-def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array], box_m: Box | None) -> ExportLoss:
+def camera_loss(station: str, camera: scene.Camera, project: Callable[[Array], Array], box_m: Box | None) -> ExportLoss:
     """What a file gets wrong about a camera.
 
     Args:
@@ -96,7 +90,7 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
 
 
 def as_foreign(
-    request: ExportRequest, models: Callable[[Camera], Sequence[str]]
+    request: ExportRequest, models: Callable[[scene.Camera], Sequence[str]]
 ) -> tuple[list[ForeignCamera], tuple[ExportLoss, ...]]:
     """The cameras of all stations that are asked for, as `nearest_foreign`, and what is lost of each."""
     box_m, cameras = field_box(request.calibration.targets), map(request.calibration.station, request.stations)
@@ -108,7 +102,7 @@ def as_foreign(
 
 
 def nearest_foreign(
-    camera: Camera, station: str, models: Sequence[str], box_m: Box | None
+    camera: scene.Camera, station: str, models: Sequence[str], box_m: Box | None
 ) -> tuple[ForeignCamera, ExportLoss]:
     """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""
     foreign = ForeignCamera.of(camera, *models)

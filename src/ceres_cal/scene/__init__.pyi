@@ -1,6 +1,7 @@
 from ceres_cal.scene.camera import Camera as Camera
 from ceres_cal.scene.camera import camera_to_json as camera_to_json
 from ceres_cal.scene.camera import in_image as in_image
+from ceres_cal.scene.foreign import ForeignCamera as ForeignCamera
 from ceres_cal.scene.lens import LENSES as LENSES
 from ceres_cal.scene.targets import TARGET_KINDS as TARGET_KINDS
 from ceres_cal.scene.targets import Curve as Curve
