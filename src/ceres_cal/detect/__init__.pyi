@@ -15,13 +15,16 @@ from ceres_cal.detect.photographs import FieldDetections as FieldDetections
 from ceres_cal.detect.photographs import FieldOptions as FieldOptions
 from ceres_cal.detect.photographs import KnownDetections as KnownDetections
 from ceres_cal.detect.photographs import SearchResult as SearchResult
+from ceres_cal.detect.photographs import by_hand as by_hand
 from ceres_cal.detect.photographs import check_photographs as check_photographs
 from ceres_cal.detect.photographs import detect_field as detect_field
 from ceres_cal.detect.photographs import detect_known as detect_known
 from ceres_cal.detect.photographs import load_clicks as load_clicks
+from ceres_cal.detect.photographs.facing import distinguishing_feature as distinguishing_feature
 from ceres_cal.detect.photographs.facing import require_sides as require_sides
 from ceres_cal.detect.photographs.field import require_findable as require_findable
 from ceres_cal.detect.photographs.known import is_painted as is_painted
+from ceres_cal.detect.photographs.refit import PointHints as PointHints
 from ceres_cal.detect.rings import RingsDetection as RingsDetection
 from ceres_cal.detect.rings import detect_rings as detect_rings
 from ceres_cal.detect.video import frames_of_videos as frames_of_videos

@@ -1,6 +1,9 @@
 from ceres_cal.report import page as page
 from ceres_cal.report.findings import diagnosis_sections as diagnosis_sections
 from ceres_cal.report.grounds import is_against as is_against
+from ceres_cal.report.live import advice_of as advice_of
+from ceres_cal.report.live import known_of as known_of
+from ceres_cal.report.live import strokes_of as strokes_of
 from ceres_cal.report.maps import comparison_svg as comparison_svg
 from ceres_cal.report.maps import grid_table as grid_table
 from ceres_cal.report.material import FramePhotographs as FramePhotographs
@@ -11,6 +14,7 @@ from ceres_cal.report.pictures.frames import marks_of as marks_of
 from ceres_cal.report.pictures.frames import model_of as model_of
 from ceres_cal.report.pictures.frames import photographs_of as photographs_of
 from ceres_cal.report.pictures.frames import read_photograph as read_photograph
+from ceres_cal.report.pictures.model import Model as Model
 from ceres_cal.report.pictures.overlay import Layer as Layer
 from ceres_cal.report.pictures.overlay import draw_overlay as draw_overlay
 from ceres_cal.report.pictures.overlay import draw_seen as draw_seen
@@ -22,6 +26,8 @@ from ceres_cal.report.pictures.warp import top_view as top_view
 from ceres_cal.report.quality import quality_of as quality_of
 from ceres_cal.report.report import make_report as make_report
 from ceres_cal.report.report import write_report as write_report
+from ceres_cal.report.scale import COLORS as COLORS
+from ceres_cal.report.scale import MM as MM
 from ceres_cal.report.summary import calibration_sections as calibration_sections
 from ceres_cal.report.target_pictures import sheet_pdf as sheet_pdf
 from ceres_cal.report.target_pictures import target_svg as target_svg

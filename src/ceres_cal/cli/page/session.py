@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from ceres_cal import detect, diagnostics, formats, moves, report, scene
 from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.base.files import make_folder
 from ceres_cal.base.frozen import Frozen, replace
@@ -20,23 +21,9 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.files import read_target
 from ceres_cal.cli.open_steps import make
 from ceres_cal.cli.page.state import Change, Drag, Made, Sitting, State, load_state, save_state, target_words
-from ceres_cal.detect.photographs import by_hand, check_photographs
 from ceres_cal.detect.photographs.clicks import FEWEST
-from ceres_cal.detect.photographs.facing import distinguishing_feature
-from ceres_cal.detect.photographs.known import is_painted
-from ceres_cal.detect.photographs.refit import PointHints
-from ceres_cal.diagnostics import diagnose
-from ceres_cal.formats import EXPORT_FORMATS
-from ceres_cal.moves.comparisons import compare
 from ceres_cal.observations import Observations, combine
 from ceres_cal.problem.parameters import Options
-from ceres_cal.report.live import advice_of, known_of, strokes_of
-from ceres_cal.report.pictures.frames import frame_by_name, frames_of, model_of
-from ceres_cal.report.pictures.model import Model
-from ceres_cal.report.quality import quality_of
-from ceres_cal.report.scale import COLORS, MM
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target, targets_by_name
 
 KEPT = "page.json"
 _MOST_UNDONE = 200
@@ -49,7 +36,7 @@ class _Moment(Frozen, eq=True):
     """A state and what was found of it, by which commands; `auto`: without a start. `base`: what was found before."""
 
     state: State
-    base: Camera | None = None
+    base: scene.Camera | None = None
     found: Found | None = None
     made: Made | None = None
     auto: bool = False
@@ -70,8 +57,8 @@ class Session:
         self._past: list[_Moment] = []
         self._future: list[_Moment] = []
         self._now = _Moment(state)
-        self._camera: Camera | None = None
-        self._targets: dict[str, Target] = {}
+        self._camera: scene.Camera | None = None
+        self._targets: dict[str, scene.Target] = {}
         self._start = None if sitting.start is None else Calibration.load(sitting.start)
         self._other = None if sitting.other is None else Calibration.load(sitting.other)
         self._against: dict[str, float] = {}
@@ -87,29 +74,29 @@ class Session:
     def found(self) -> Found | None:
         return self._now.found
 
-    def target(self, state: State) -> Target | None:
+    def target(self, state: State) -> scene.Target | None:
         """The field that is looked for, with the dimensions that were changed."""
         if not state.target:
             if self._start is None:
                 return None
-            return next((one for one in self._start.targets.values() if is_painted(one)), None)
+            return next((one for one in self._start.targets.values() if detect.is_painted(one)), None)
         drawn = self._target(state.target)
         return self._target(target_words(state, drawn)) if state.lengths else drawn
 
-    def _target(self, text: str) -> Target:
+    def _target(self, text: str) -> scene.Target:
         if text not in self._targets:
-            if not (text == self.sitting.target or text in targets_by_name() or text.startswith("{")):
+            if not (text == self.sitting.target or text in scene.targets_by_name() or text.startswith("{")):
                 raise InputError(f"the field {text!r} was not named on the command line, and is none of the list")
             self._targets[text] = read_target(text, "field")
         return self._targets[text]
 
-    def _base(self, target: Target) -> Camera:
+    def _base(self, target: scene.Target) -> scene.Camera:
         """The camera of which the clicks say what is otherwise."""
         if self._now.base is not None:
             return self._now.base
         if self._start is not None:
             return self._start.station()
-        return by_hand.guess(target, self.sitting.sizes[0], self.state.facing.rpartition("=")[2])
+        return detect.by_hand.guess(target, self.sitting.sizes[0], self.state.facing.rpartition("=")[2])
 
     # ---- changes ----
 
@@ -125,7 +112,7 @@ class Session:
         target = self._required_target()
         state = drag.of(self.state, target)
         base = self._base(target)
-        self._camera = by_hand.solved(_shown(state, target), self._camera or base, base, quickly=True)
+        self._camera = detect.by_hand.solved(_shown(state, target), self._camera or base, base, quickly=True)
         if drag.last:
             self._become(state, camera=self._camera)
 
@@ -138,7 +125,7 @@ class Session:
             self._camera = None
             self._settle()
 
-    def _become(self, state: State, camera: Camera | None = None, *, keep: bool = False) -> None:
+    def _become(self, state: State, camera: scene.Camera | None = None, *, keep: bool = False) -> None:
         target = self.target(state)
         if target is not None:
             _require_names(state, target)
@@ -158,7 +145,7 @@ class Session:
         target = self.target(self.state)
         if target is not None and self._now.found is None:
             base, shown = self._base(target), _shown(self.state, target)
-            settled = by_hand.settled(shown, self._camera or base, base)
+            settled = detect.by_hand.settled(shown, self._camera or base, base)
             self._camera, self._against, self.message = settled
         elif target is not None:
             self._camera = self._now.base
@@ -171,7 +158,7 @@ class Session:
         _, unkept = answer_or_reason(lambda: save_state(make_folder(folder) / KEPT, state))
         self.message = self.message or unkept
 
-    def _required_target(self) -> Target:
+    def _required_target(self) -> scene.Target:
         target = self.target(self.state)
         if target is None:
             raise InputError("choose the field first, such as ssl-b")
@@ -187,7 +174,7 @@ class Session:
             made = make(self.sitting, moment.state, target, Path(folder), auto=auto)
             observations = combine([Observations.load(Path(folder) / name) for name in made.observed])
             calibration = Calibration.load(made.calibration)
-            found = Found(calibration, observations, known_of(quality_of(calibration, observations)))
+            found = Found(calibration, observations, report.known_of(report.quality_of(calibration, observations)))
         with self.lock:
             if self._now is not moment:
                 raise InputError("it was changed meanwhile: find the lines again")
@@ -215,12 +202,12 @@ class Session:
             known = moment.found.known
             if "advice" in known or not known["maps"]:
                 return False
-            known["advice"] = advice_of(moment.found.calibration)
+            known["advice"] = report.advice_of(moment.found.calibration)
             return self._now is moment
         if target is None or len(moment.state.points) < FEWEST:
             return False
         seen = _shown(moment.state, target).observed(self.sitting.sizes[0])
-        told = known_of(quality_of(calibrate(seen, _BY_HAND), seen))
+        told = report.known_of(report.quality_of(calibrate(seen, _BY_HAND), seen))
         with self.lock:
             current = self.revision == revision
             self._by_hand = told if current else self._by_hand
@@ -233,20 +220,20 @@ class Session:
         path, old = self.sitting.photographs[photograph], self._start
         if old is None:
             raise InputError("there is no old calibration to be checked: open one with the photograph")
-        answers, seen = check_photographs(old, [path])
+        answers, seen = detect.check_photographs(old, [path])
         said = [f"{name}: {one.words}" for name, one in answers.items()]
         strokes: dict[str, Any] = {}
         if seen.observations is not None:
-            table = diagnose(old, seen.observations, new_data=True).table
+            table = diagnostics.diagnose(old, seen.observations, new_data=True).table
             off = np.abs(table.distance_px[np.isfinite(table.distance_px)])
             said.append(
                 f"its lines are {np.median(off):.2f} px beside the paint in the median, {off.max():.2f} px at most"
             )
-            strokes = strokes_of(table)
+            strokes = report.strokes_of(table)
         if self._other is not None and self.sitting.other is not None:
             apart, name = self._model_of(old, path).apart_px(self._model_of(self._other, path)), self.sitting.other
             said.append(f"{name} draws them {apart[0]:.2f} px elsewhere in the median, {apart[1]:.2f} px at most")
-            for station, one in compare(old, self._other).items():
+            for station, one in moves.compare(old, self._other).items():
                 if one.change is not None:
                     floor = one.change.maps[0]
                     said.append(f"{station}: places on the floor differ by {mm(floor.rms_mm)} (rms)")
@@ -267,10 +254,11 @@ class Session:
         points = camera.project(target.point_array)
         return {
             "lines": {
-                name: np.round(line, 1).tolist() for name, line in by_hand.curves_in_image(target, camera).items()
+                name: np.round(line, 1).tolist()
+                for name, line in detect.by_hand.curves_in_image(target, camera).items()
             },
             "points": dict(zip(target.point_names, np.round(points, 1).tolist(), strict=True)),
-            "feet": np.round(by_hand.feet(shown, camera), 1).tolist(),
+            "feet": np.round(detect.by_hand.feet(shown, camera), 1).tolist(),
         }
 
     def everything(self) -> dict[str, Any]:
@@ -286,11 +274,11 @@ class Session:
                 {"name": path.name, "frame": frame_of(path), "size": size, "board": path in boards}
                 for path, size in zip(self.sitting.photographs, self.sitting.sizes, strict=True)
             ],
-            "targets": list(targets_by_name()),
-            "formats": list(EXPORT_FORMATS),
-            "scale": {"borders": MM.borders, "colors": COLORS},
+            "targets": list(scene.targets_by_name()),
+            "formats": list(formats.EXPORT_FORMATS),
+            "scale": {"borders": report.MM.borders, "colors": report.COLORS},
             "target": None if target is None else _about(target, words),
-            "goal": "" if target is None else distinguishing_feature(target, tuple(target.curves)),
+            "goal": "" if target is None else detect.distinguishing_feature(target, tuple(target.curves)),
             "model": self.model(),
             "against": self._against,
             "known": self._by_hand if found is None else found.known,
@@ -317,17 +305,19 @@ class Session:
             drawn["other"]["lines"] = _lines(self._model_of(self._other, self.sitting.photographs[0]))
         return drawn
 
-    def _model_of(self, calibration: Calibration, photograph: Path) -> Model:
+    def _model_of(self, calibration: Calibration, photograph: Path) -> report.Model:
         station = next(iter(calibration.stations))
-        return model_of(calibration, frame_by_name(calibration, station, frame_of(photograph)))
+        return report.model_of(calibration, report.frame_by_name(calibration, station, frame_of(photograph)))
 
     def _placed(self) -> dict[str, Any]:
         """The boards that were found, by frame, as the calibration has them."""
         found = self._now.found
         if found is None:
             return {}
-        frames = (replace(one, shown=tuple(s for s in one.shown if s[1])) for one in frames_of(found.observations))
-        return {one.name: _lines(model_of(found.calibration, one)) for one in frames if one.shown}
+        frames = (
+            replace(one, shown=tuple(s for s in one.shown if s[1])) for one in report.frames_of(found.observations)
+        )
+        return {one.name: _lines(report.model_of(found.calibration, one)) for one in frames if one.shown}
 
 
 class Found(Struct, frozen=True, eq=False):
@@ -338,17 +328,17 @@ class Found(Struct, frozen=True, eq=False):
     known: dict[str, Any]
 
 
-def _lines(model: Model) -> list[Any]:
+def _lines(model: report.Model) -> list[Any]:
     """(S, 2) px each."""
     return [np.round(line.middle[::4], 1).tolist() for line in model.lines]
 
 
-def _shown(state: State, target: Target) -> PointHints:
+def _shown(state: State, target: scene.Target) -> detect.PointHints:
     points = {name: (one.x, one.y, one.sigma) for name, one in state.points.items()}
-    return PointHints.of(target, points, [(one.curve, one.x, one.y, one.sigma) for one in state.places])
+    return detect.PointHints.of(target, points, [(one.curve, one.x, one.y, one.sigma) for one in state.places])
 
 
-def _require_names(state: State, target: Target) -> None:
+def _require_names(state: State, target: scene.Target) -> None:
     """Raise InputError where the state names what the target does not have."""
     unknown = [name for name in state.points if name not in target.point_index]
     named = (*state.not_painted, *(one.curve for one in state.places))
@@ -358,7 +348,7 @@ def _require_names(state: State, target: Target) -> None:
         raise InputError(f"{unknown[0]!r} is not one of the target's: `ceres-cal targets` lists the names")
 
 
-def _about(target: Target, words: str) -> dict[str, Any]:
+def _about(target: scene.Target, words: str) -> dict[str, Any]:
     """What a window says of a target."""
     return {
         "words": words,

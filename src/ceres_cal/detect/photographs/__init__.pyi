@@ -1,3 +1,4 @@
+from ceres_cal.detect.photographs import by_hand as by_hand
 from ceres_cal.detect.photographs.candidates import Auto as Auto
 from ceres_cal.detect.photographs.clicks import Clicks as Clicks
 from ceres_cal.detect.photographs.clicks import load_clicks as load_clicks
