@@ -48,8 +48,9 @@ def test_exchanged_names_are_found_and_mended(right: Observations, kind: str, fi
     found = tuple(renamings(wrong, calibrate(wrong, Options(lens="radial"))))
     seen = set(getattr(wrong, f"{kind}s").feature.tolist())
     index = getattr(wrong.targets["field"], f"{kind}_index")
-    exchanged = {(kind, a, b) for a, b in ((first, second), (second, first)) if index[a] in seen}
-    assert exchanged and {(one.kind, one.name, one.right) for one in found} == exchanged
+    exchanged = {(index[a], index[b]) for a, b in ((first, second), (second, first)) if index[a] in seen}
+    assert exchanged and {(one.feature, one.instead) for one in found} == exchanged
+    assert {one.is_curve for one in found} == {kind == "curve"}
     again = mended(wrong, found)
     assert np.array_equal(again.points.feature, right.points.feature)
     assert np.array_equal(again.curves.feature, right.curves.feature)

@@ -144,7 +144,8 @@ def _run(args: CalibrateArguments) -> Document:
         if wrong and args.mend_labels:
             observations = diagnostics.mended(observations, wrong)
             calibration = calibrate(observations, options, _solve_progress(bar), **workers)
-    told = (f"{one.words}: {'renamed' if args.mend_labels else 'is it (--mend-labels)?'}" for one in wrong)
+    asked = "renamed" if args.mend_labels else "is it (--mend-labels)?"
+    told = (f"{diagnostics.renaming_words(one, observations)}: {asked}" for one in wrong)
     calibration = replace(calibration, warnings=(*calibration.warnings, *told))
     return files.calibrated(args, calibration, observations, photographs, args.observations)
 

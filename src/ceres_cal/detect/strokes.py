@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
-from ceres_cal.base.frozen import Frozen, Rows
+from ceres_cal.base.frozen import Rows
 from ceres_cal.detect.images import negative
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
@@ -80,7 +80,7 @@ def find_strokes(grey: Array32) -> Strokes:
     by_scale = []
     for scale in _SCALES:
         plane = cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
-        strokes = _strokes(_ridge_points(np.asarray(plane, np.float32)))
+        strokes = _strokes(*_ridge_points(np.asarray(plane, np.float32)))
         by_scale.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
     size = (int(grey.shape[1]), int(grey.shape[0]))
     fine, coarse = by_scale
@@ -100,7 +100,7 @@ def strokes_of_signs(grey: Array32) -> tuple[Strokes, Strokes]:
 
 def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:
     """Those of the narrowest paint that are lines of their own: stripes of sun are wide, or run beside each other."""
-    strokes = _strokes(_ridge_points(grey))
+    strokes = _strokes(*_ridge_points(grey))
     return strokes.take(alone(strokes, reach_px) > _OWN)
 
 
@@ -116,15 +116,8 @@ def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, in
     return np.asarray(np.median(plane[y, x], axis=0), float)
 
 
-class _Ridge(Frozen):
+def _ridge_points(grey: Array32) -> tuple[Array, Array, Indices]:
     """Points on ridges: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
-
-    pixels: Array
-    strength: Array
-    piece: Indices
-
-
-def _ridge_points(grey: Array32) -> _Ridge:
     soft = _smoothed(grey, _SIGMA_PX)
     xx, yy, xy, bend = _bends(soft)
     strength = np.maximum(-bend, 0.0)
@@ -150,7 +143,7 @@ def _ridge_points(grey: Array32) -> _Ridge:
     joined = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX)))
     _, labels = cv2.connectedComponents(joined, connectivity=8)
     pixels = np.column_stack([columns + step * nx, rows + step * ny])[top]
-    return _Ridge(pixels, -c[top], labels[rows[top], columns[top]].astype(np.int64))
+    return pixels, -c[top], labels[rows[top], columns[top]].astype(np.int64)
 
 
 def _bends(soft: Array32) -> tuple[Array32, Array32, Array32, Array32]:
@@ -169,21 +162,21 @@ def _single(plane: AnyArray) -> Array32:
     return np.asarray(plane, dtype=np.float32)
 
 
-def _strokes(ridge: _Ridge) -> Strokes:
+def _strokes(pixels: Array, strength: Array, piece: Indices) -> Strokes:
     """The straight lines through the points of each piece in each tile of the image."""
-    if not len(ridge.pixels):
+    if not len(pixels):
         return Strokes(np.empty((0, 2, 2)), np.empty(0))
-    tile = np.floor(np.maximum(ridge.pixels, 0.0) / _TILE_PX).astype(np.int64)
-    key = (ridge.piece * 4096 + tile[:, 0]) * 4096 + tile[:, 1]
+    tile = np.floor(np.maximum(pixels, 0.0) / _TILE_PX).astype(np.int64)
+    key = (piece * 4096 + tile[:, 0]) * 4096 + tile[:, 1]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)
 
-    weight = ridge.strength**2  # at the ends of dashes ridges fan out, ever fainter
+    weight = strength**2  # at the ends of dashes ridges fan out, ever fainter
     total = np.bincount(group, weight)
 
     def mean(values: Array) -> Array:
         return np.asarray(np.bincount(group, weight * values) / total)
 
-    x, y = ridge.pixels.T
+    x, y = pixels.T
     cx, cy = mean(x), mean(y)
     dx, dy = x - cx[group], y - cy[group]
     xx, xy, yy = mean(dx * dx), mean(dx * dy), mean(dy * dy)
@@ -194,4 +187,4 @@ def _strokes(ridge: _Ridge) -> Strokes:
     across = np.sqrt(np.maximum(0.5 * (xx + yy) - root, 0.0))
     good = (2.0 * half >= _LEAST_PX) & (across < _STRAIGHT_PX) & (count > 2.0 * _DENSE * half)
     centre, reach = np.column_stack([cx, cy]), np.column_stack([half * along_x, half * along_y])
-    return Strokes(np.stack([centre - reach, centre + reach], axis=1)[good], mean(ridge.strength)[good])
+    return Strokes(np.stack([centre - reach, centre + reach], axis=1)[good], mean(strength)[good])

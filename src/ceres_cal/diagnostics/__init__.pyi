@@ -7,6 +7,7 @@ from ceres_cal.diagnostics.diagnosis import FALSE_ALARM_RATE as FALSE_ALARM_RATE
 from ceres_cal.diagnostics.diagnosis import Diagnosis as Diagnosis
 from ceres_cal.diagnostics.diagnosis import diagnose as diagnose
 from ceres_cal.diagnostics.labels import mended as mended
+from ceres_cal.diagnostics.labels import renaming_words as renaming_words
 from ceres_cal.diagnostics.labels import renamings as renamings
 from ceres_cal.diagnostics.table import ResidualTable as ResidualTable
 from ceres_cal.effects.effect import Finding as Finding

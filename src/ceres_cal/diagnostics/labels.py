@@ -9,7 +9,7 @@ any other feature, for each observation; for several of one frame and label that
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 
 import numpy as np
@@ -191,29 +191,9 @@ def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
 # ---- other names ----------------------------------------------------------------------------------------------------
 
 
-class Renaming(Frozen):
-    """What was seen of a feature in one view and lies where another one does.
-
-    Attributes:
-        kind: "point" or "curve". name, right: as it was named, and as it lies. rows: (N,) of its column. feature: the
-            number of the right one in the target.
-    """
-
-    kind: str
-    view: str
-    name: str
-    right: str
-    rows: Indices
-    feature: int
-
-    @property
-    def words(self) -> str:
-        return f"frame {self.view!r}: {self.kind} {self.name!r} is seen where {self.right!r} lies"
-
-
-def renamings(observations: Observations, calibration: Calibration) -> Iterator[Renaming]:
-    """Features of the world all of whose observations in a view lie where another feature does: two and more of a
-    curve, or two features that lie where each other's should.
+def renamings(observations: Observations, calibration: Calibration) -> Iterator[Mislabelled]:
+    """Features of the world all of whose observations in a view, its rows, lie where another feature does: two and
+    more of a curve, or two features that lie where each other's should.
     """
     least_rows = 2  # of a feature that is renamed: one observation lies on some curve by chance
     points, curves = calibration.inlier_masks(observations)
@@ -226,11 +206,15 @@ def renamings(observations: Observations, calibration: Calibration) -> Iterator[
         exchanged = back is not None and back.instead == one.feature
         rows = _rows_of(one, observations)
         if not one.is_curve or len(rows) >= least_rows or exchanged:
-            view = observations.views[one.view]
-            target = observations.targets[view.target]
-            names = target.curve_names if one.is_curve else target.point_names
-            kind = "curve" if one.is_curve else "point"
-            yield Renaming(kind, view.frame, names[one.feature], names[one.instead], rows, one.instead)
+            yield replace(one, rows=rows)
+
+
+def renaming_words(one: Mislabelled, observations: Observations) -> str:
+    """What was seen of a feature lies where another one does."""
+    view = observations.views[one.view]
+    target = observations.targets[view.target]
+    kind, names = ("curve", target.curve_names) if one.is_curve else ("point", target.point_names)
+    return f"frame {view.frame!r}: {kind} {names[one.feature]!r} is seen where {names[one.instead]!r} lies"
 
 
 def _rows_of(one: Mislabelled, observations: Observations) -> Indices:
@@ -250,13 +234,13 @@ def _is_whole(one: Mislabelled, observations: Observations, calibration: Calibra
     return bool(np.all(off <= calibration.options.reject_sigma * scale * column.sigma_px[rows]))
 
 
-def mended(observations: Observations, wrong: tuple[Renaming, ...]) -> Observations:
+def mended(observations: Observations, wrong: Iterable[Mislabelled]) -> Observations:
     """The observations with the right names."""
-    features = {"point": observations.points.feature.copy(), "curve": observations.curves.feature.copy()}
+    points, curves = observations.points.feature.copy(), observations.curves.feature.copy()
     for one in wrong:
-        features[one.kind][one.rows] = one.feature
+        (curves if one.is_curve else points)[one.rows] = one.instead
     return replace(
         observations,
-        points=replace(observations.points, feature=features["point"]),
-        curves=replace(observations.curves, feature=features["curve"]),
+        points=replace(observations.points, feature=points),
+        curves=replace(observations.curves, feature=curves),
     )

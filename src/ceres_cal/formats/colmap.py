@@ -19,7 +19,7 @@ from ceres_cal.base.threads import kept_signals
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign
-from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera
+from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera, camera_matrix
 
 _MODELS = {
     "opencv4": "OPENCV",
@@ -32,10 +32,15 @@ _COUNTS = {"FULL_OPENCV": 8, THIN_PRISM_FISHEYE: 8}  # coefficients behind fx fy
 _HALF = 0.5
 
 
-def _export(request: ExportRequest) -> Exported:
+def _library() -> Any:
     with kept_signals():
         import pycolmap
 
+    return pycolmap
+
+
+def _export(request: ExportRequest) -> Exported:
+    pycolmap = _library()
     cameras, losses = as_foreign(request, lambda _: tuple(_MODELS))
     model, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
     first, images = cameras[0].pose, []
@@ -63,22 +68,16 @@ def _export(request: ExportRequest) -> Exported:
 
 
 def _camera(foreign: ForeignCamera, number: int) -> Any:
-    with kept_signals():
-        import pycolmap
-
     (width, height), name = foreign.image_size, _MODELS[foreign.model]
     values = [*foreign.coefficients, *[0.0] * 8][: _COUNTS.get(name, 4)]
     (cx, cy), focal = foreign.centre, foreign.focal
-    camera = pycolmap.Camera(model=name, width=width, height=height, params=[*focal, cx + _HALF, cy + _HALF, *values])
+    camera = _library().Camera(model=name, width=width, height=height, params=[*focal, cx + _HALF, cy + _HALF, *values])
     camera.camera_id = number
     return camera
 
 
 def _rigid(pose: Pose) -> Any:
-    with kept_signals():
-        import pycolmap
-
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+    return _library().Rigid3d(_library().Rotation3d(pose.rotation), pose.translation)
 
 
 # ---- reading --------------------------------------------------------------------------------------------------------
@@ -86,9 +85,6 @@ def _rigid(pose: Pose) -> Any:
 
 def read_model(folder: Path) -> Any:
     """COLMAP's model; InputError where the folder holds none, a pipe or a device, or too much."""
-    with kept_signals():
-        import pycolmap
-
     if not folder.is_dir():
         raise InputError("COLMAP's model is a folder: name that")
     for name in ("rigs", "cameras", "frames", "images", "points3D"):
@@ -96,7 +92,7 @@ def read_model(folder: Path) -> Any:
             if path.exists():
                 read_bytes(path)  # the library opens them itself: what it would wait for is refused here
     try:
-        return pycolmap.Reconstruction(folder)
+        return _library().Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
         raise InputError(f"not a model of COLMAP (cut short?): {str(error).splitlines()[0]}") from None
 
@@ -128,20 +124,16 @@ def _name(image: Any) -> str:
 
 
 def _foreign(camera: Any, pose: Pose) -> ForeignCamera:
-    with kept_signals():
-        import pycolmap
-
     size, name = (int(camera.width), int(camera.height)), str(camera.model_name)
     focal = (float(camera.focal_length_x), float(camera.focal_length_y))
     centre = (float(camera.principal_point_x) - _HALF, float(camera.principal_point_y) - _HALF)
     extra = np.array(camera.params)[camera.extra_params_idxs()]
     if name.removeprefix("SIMPLE_") in ("PINHOLE", "RADIAL", "OPENCV", "FULL_OPENCV"):
         values = np.concatenate([extra, np.zeros(4 - len(extra))]) if len(extra) < 4 else extra
-        matrix = [[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]]
-        return ForeignCamera.opencv(size, matrix, values, pose)
+        return ForeignCamera.opencv(size, camera_matrix(*focal, *centre), values, pose)
     if name == "OPENCV_FISHEYE":
         return ForeignCamera(size, focal, centre, FISHEYE, tuple(extra.tolist()), pose)
-    bare = pycolmap.Camera(model=name, width=2, height=2, params=_at_focal_length_1(camera))
+    bare = _library().Camera(model=name, width=2, height=2, params=_at_focal_length_1(camera))
 
     def distort(rays: Array) -> Array:
         return np.asarray(bare.img_from_cam(rays))

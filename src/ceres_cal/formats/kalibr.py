@@ -17,7 +17,7 @@ from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
-from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, camera_matrix
 
 _MODELS = {"opencv4": "radtan", FISHEYE: "equidistant"}
 _PROJECTIONS = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # how many numbers stand before the four of K
@@ -79,9 +79,9 @@ def _camera(entry: Mapping[str, Any], key: str, pose: Pose | None) -> ForeignCam
     coefficients = numbers_at(entry.get("distortion_coeffs") or [], f"{key}.distortion_coeffs", _DISTORTIONS[bent])
     width, height = numbers_at(entry.get("resolution"), f"{key}.resolution", 2)
     own, (fx, fy, cx, cy) = values[:extra], values[extra:]
-    size, matrix = (int(width), int(height)), np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    size = int(width), int(height)
     if model == "pinhole" and bent in ("none", "radtan"):
-        return ForeignCamera.opencv(size, matrix, coefficients, pose)
+        return ForeignCamera.opencv(size, camera_matrix(fx, fy, cx, cy), coefficients, pose)
     focal, centre = (float(fx), float(fy)), (float(cx), float(cy))
     if model == "pinhole" and bent == "equidistant":
         return ForeignCamera(size, focal, centre, FISHEYE, tuple(coefficients.tolist()), pose)

@@ -18,7 +18,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
-from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera
+from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera, camera_matrix
 
 _MODELS = {f"LENSMODEL_OPENCV{count}": model for model, count in OPENCV_MODELS.items()}
 _POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
@@ -64,9 +64,7 @@ def _read(request: ImportRequest) -> Any:
     count = 0 if kind == "LENSMODEL_PINHOLE" else OPENCV_MODELS[_MODELS[kind]]
     values = numbers_at(data.get("intrinsics"), "intrinsics", 4 + count)
     size = numbers_at(data.get("imagersize"), "imagersize", 2)
-    fx, fy, cx, cy = values[:4]
-    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    camera = ForeignCamera.opencv([int(s) for s in size], matrix, values[4:], _pose(data))
+    camera = ForeignCamera.opencv([int(s) for s in size], camera_matrix(*values[:4]), values[4:], _pose(data))
     return calibration_of("an mrcal .cameramodel", {request.path.stem: camera})
 
 

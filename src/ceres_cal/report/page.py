@@ -9,6 +9,7 @@ from functools import singledispatch
 from hashlib import sha256
 from html import escape
 from importlib.resources import files
+from string import Template
 from typing import Any
 from urllib.parse import quote
 
@@ -135,20 +136,20 @@ def page(
     title: str, about: str, chapters: Sequence[document.Chapter], foot: str, kind: str = "Calibration report"
 ) -> str:
     """The whole page, which needs nothing from elsewhere, and in which no script but its own runs."""
-    style, script = (
-        files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "hover.js")
+    template, style, script = (
+        files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.html", "style.css", "hover.js")
     )
-    own = b64encode(sha256(script.encode()).digest()).decode("ascii")
-    links = "".join(f'<a href="#{c.name}">{escape(c.title)}</a>' for c in chapters[1:])
     head, *rest = map(html, chapters)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
-        f"script-src 'sha256-{own}'; img-src data:\">\n"
-        '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header><p>{escape(kind)}</p><h1>{escape(title)}</h1><p>{escape(about)}</p></header>\n<main>\n"
-        f"{head}\n<nav>{links}</nav>\n{chr(10).join(rest)}\n</main>\n<footer>{escape(foot)}</footer>\n"
-        f"<script>{script}</script>\n</body>\n</html>\n"
+    return Template(template).substitute(
+        kind=escape(kind),
+        title=escape(title),
+        about=escape(about),
+        foot=escape(foot),
+        style=style,
+        script=script,
+        script_digest=b64encode(sha256(script.encode()).digest()).decode("ascii"),
+        links="".join(f'<a href="#{one.name}">{escape(one.title)}</a>' for one in chapters[1:]),
+        head=head,
+        rest="\n".join(rest),
     )

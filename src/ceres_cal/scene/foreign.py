@@ -135,8 +135,7 @@ class ForeignCamera(Frozen):
     @property
     def matrix(self) -> Array:
         """K, (3, 3)."""
-        (fx, fy), (cx, cy) = self.focal, self.centre
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return camera_matrix(*self.focal, *self.centre)
 
     @property
     def lens(self) -> Lens | None:
@@ -214,6 +213,11 @@ class ForeignCamera(Frozen):
             raise InputError(f"no lens of ours is near its {self.model} model: correct its numbers")
         camera, error_px = min(fits, key=lambda fit: fit[1][0])
         return camera.at(pose), error_px
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """K, (3, 3)."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _focal(camera: Camera) -> tuple[float, float]:

@@ -12,7 +12,6 @@ from itertools import product
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Mask, median
-from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import peaks
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observations_of, refit_camera
@@ -26,11 +25,8 @@ _LEAST = 0.35  # of a curve's places, those on a line that runs along it
 _MOST_BESIDE, _MOST_CHOICES = 3, 48
 
 
-class _PaintLine(Frozen):
-    """Paint that runs along a curve: rows of the course, and where paint is from there, px along the normal."""
-
-    rows: Indices
-    offset_px: Array
+_PaintLine = tuple[Indices, Array]
+"""Paint that runs along a curve: rows of the course, and where paint is from there, px along the normal."""
 
 
 def among_others(
@@ -42,8 +38,7 @@ def among_others(
     course = predict(target, camera, curves, spacing_px, 2.0)
     best, least = None, np.inf
     for nearest, chosen in _choices(_lines_beside(grey, course, _REACH * 0.5 * float(np.hypot(*camera.image_size)))):
-        rows = np.concatenate([line.rows for line in chosen])
-        offset = np.concatenate([line.offset_px for line in chosen])
+        rows, offset = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
         places = course.pixels[rows] + offset[:, None] * course.normals[rows]
         sigma = np.full(len(rows), sigma_px)
         seen = observations_of(target, camera.image_size, course.curve[rows], places, sigma)
@@ -59,7 +54,7 @@ def _choices(beside: Sequence[Sequence[_PaintLine]]) -> Iterator[tuple[bool, lis
 
     Of more curves with others beside them than can be tried, only some take part.
     """
-    ordered = sorted(beside, key=lambda lines: (len(lines) > 1, -len(lines[0].rows)))
+    ordered = sorted(beside, key=lambda lines: (len(lines) > 1, -len(lines[0][0])))
     taking_part, count = [], 1
     for lines in ordered:
         if count * len(lines) <= _MOST_CHOICES:
@@ -79,8 +74,8 @@ def _lines_beside(grey: Array32, course: Course, reach_px: float) -> list[list[_
     beside = []
     for number in np.unique(course.curve):
         rows = np.flatnonzero(course.curve == number)
-        lines = [one for one in _joined(rows, steps, seen) if len(one.rows) >= _LEAST * len(rows)]
-        lines.sort(key=lambda line: abs(median(line.offset_px)))
+        lines = [one for one in _joined(rows, steps, seen) if len(one[0]) >= _LEAST * len(rows)]
+        lines.sort(key=lambda line: abs(median(line[1])))
         if lines:
             beside.append(lines[:_MOST_BESIDE])
     return beside
@@ -102,4 +97,4 @@ def _joined(rows: Indices, steps: Array, seen: Mask) -> list[_PaintLine]:
                 min(before, key=lambda line: abs(line[-1][1] - offset)).append((row, offset))
             else:
                 lines.append([(row, offset)])
-    return [_PaintLine(*(np.array(one) for one in zip(*line, strict=True))) for line in lines]
+    return [(np.array([row for row, _ in line]), np.array([offset for _, offset in line])) for line in lines]
