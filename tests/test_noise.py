@@ -19,6 +19,8 @@ from ceres_cal.moves.checks import check
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
@@ -115,6 +117,8 @@ def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own
     )  # 4.7: the mean counts as ten equations
     (words,) = (text for text in runs[0].warnings if "not equally noisy" in text)
     assert "'c3'" in words
+    levels = {level for level, text in judge_quality(quality_of(runs[0], noisy(0))).reasons if "equally noisy" in text}
+    assert levels == {""}  # it is in the standard deviations
 
 
 def test_cameras_of_alike_noise_have_one() -> None:

@@ -59,7 +59,7 @@ _BEHIND = (
     "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
 )
 
-_OWN_NOISE = "each counts by its own noise; look whether the photographs of the noisiest are sharp"
+OWN_NOISE = "each counts by its own noise; look whether the photographs of the noisiest are sharp"
 
 
 def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
@@ -136,7 +136,7 @@ def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
     """Words about cameras whose observations scatter otherwise than the others', beside what is stated of them."""
     if noise:
         each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())
-        yield f"beside what was stated of them the cameras are not equally noisy ({each} times the mean): {_OWN_NOISE}"
+        yield f"beside what was stated of them the cameras are not equally noisy ({each} times the mean): {OWN_NOISE}"
 
 
 def _share_text(share: float) -> str:

@@ -13,7 +13,7 @@ from msgspec import Struct
 from ceres_cal.base.arrays import median
 from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.outcome import RESTING
+from ceres_cal.calibration.outcome import OWN_NOISE, RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.observations.validation import COUNTED_ONCE
@@ -147,7 +147,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     known = [conflict.words for conflict in calibration.conflicts]
     for text in calibration.warnings:
         if text not in known:
-            is_harmless = text.endswith(COUNTED_ONCE) or RESTING in text  # which is in every standard deviation
+            is_harmless = text.endswith((COUNTED_ONCE, OWN_NOISE)) or RESTING in text  # in every standard deviation
             yield "" if is_harmless else "care", f"{sentence(text)}."
 
 
