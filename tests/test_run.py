@@ -11,6 +11,7 @@ import pytest
 
 from ceres_cal import detect_board, run
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.images import each_camera
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.command import COMMANDS
@@ -146,6 +147,31 @@ def test_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert (out / made).exists(), said
     assert main([*asked, "--camera", "left"]) == 2
     assert "--camera names one camera: several are called like their folders" in capsys.readouterr().err
+
+
+def test_a_folder_of_videos_has_one_for_each_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two videos were "no images in this folder", and two that were named were taken for one camera's."""
+    cameras, out = tmp_path / "cameras", tmp_path / "out"
+    cameras.mkdir()
+    image = np.asarray(cv2.imread(PHOTOGRAPH))
+    for name, frame in (("left", image), ("right", image[::-1, ::-1])):
+        written = cv2.VideoWriter(
+            str(cameras / f"{name}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, image.shape[1::-1]
+        )
+        for _ in range(3):
+            written.write(np.ascontiguousarray(frame))
+        written.release()
+    sides = ("--facing", "left.LeftGoalLine=top", "--facing", "right.LeftGoalLine=bottom")
+    main(["run", str(cameras), *FIELD[:2], *sides, "--lens", "radial", "--quiet", "-o", str(out)])
+    assert "can be trusted" in capsys.readouterr().out
+    assert set(Calibration.load(out / "calibration.json").cameras) == {"left", "right"}
+    assert (out / "report.html").read_text().count("field_median") >= 2  # the picture of each that was measured
+    main(["run", str(cameras / "left.avi"), *FIELD, "--lens", "radial", "--quiet", "-o", str(tmp_path / "one")])
+    assert "field_median" in (tmp_path / "one" / "report.html").read_text()  # no report came of a field's video at all
+    shutil.copy(cameras / "left.avi", cameras / "left.mp4")
+    assert main(["run", str(cameras), *FIELD, "-o", str(out)]) == 2
+    assert "two of what is in it are called 'left'" in capsys.readouterr().err
+    assert each_camera([str(cameras / "left.avi")]) == []
 
 
 def test_no_photograph_at_all(tmp_path: Path) -> None:

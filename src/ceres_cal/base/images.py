@@ -32,7 +32,7 @@ def _files(name: str) -> Iterable[Path]:
     if path.is_dir():
         inside = _inside(path)
         if not inside:
-            folders = ", ".join(folder.name for folder in folders_of_cameras([name]))
+            folders = ", ".join(folder.name for folder in each_camera([name]))
             raise InputError(
                 f"{name}: there are no images in this folder{f', but in its {folders}' if folders else ''}"
             )
@@ -46,14 +46,22 @@ def _files(name: str) -> Iterable[Path]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
+    """The images of a folder, or its videos where there are no images."""
+    files = sorted(file for file in folder.iterdir() if file.is_file())
+    images, videos = ([f for f in files if f.suffix.lower() in endings] for endings in (IMAGE_ENDINGS, VIDEO_ENDINGS))
+    return images or videos
 
 
-def folders_of_cameras(given: Sequence[str]) -> list[Path]:
-    """The folders with images of the one folder that is given, where it has none itself: one for each camera."""
-    alone = [Path(name) for name in given if len(given) == 1]
-    inside = (folder for path in alone if path.is_dir() and not _inside(path) for folder in path.iterdir())
-    return sorted(folder for folder in inside if folder.is_dir() and _inside(folder))
+def each_camera(given: Sequence[str]) -> list[Path]:
+    """What there is of each camera in the one folder that is given, where it has no images itself: folders, or several
+    videos; nothing where all is of one.
+    """
+    alone = [Path(name) for name in given if len(given) == 1 and Path(name).is_dir()]
+    videos = [path for folder in alone for path in _inside(folder)]
+    if any(path.suffix.lower() in IMAGE_ENDINGS for path in videos):
+        return []
+    folders = [path for folder in alone for path in folder.iterdir() if path.is_dir() and _inside(path)]
+    return sorted([*folders, *videos]) if folders or len(videos) > 1 else []
 
 
 def images_and_videos(given: Images) -> tuple[list[Path], list[Path]]:

@@ -10,7 +10,7 @@ from typing import Any
 from ceres_cal import base, detect, formats
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.images import IMAGE_ENDINGS, folders_of_cameras, images_and_videos
+from ceres_cal.base.images import IMAGE_ENDINGS, each_camera, images_and_videos
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
@@ -28,7 +28,7 @@ class RunArguments(QuietArguments):
 
     images: tuple[str, ...] = argument(
         "IMAGE",
-        "photographs of one camera, a folder of them, or a video; or a folder with one such folder for each camera",
+        "photographs of one camera, a folder of them, or a video; or a folder with such a folder, or a video, for each",
     )
     output: Path = arguments.output_option("everything that is made", metavar="FOLDER")
     target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
@@ -92,23 +92,26 @@ def _run(args: RunArguments) -> Document:
 
 
 def _cameras(args: RunArguments) -> list[RunArguments]:
-    """What is asked for of each camera: of the one that there is, or of one for each folder of the folder."""
-    folders = folders_of_cameras(args.images)
-    if not folders:
+    """What is asked for of each camera: of the one that there is, or of each in the folder."""
+    shown = each_camera(args.images)
+    if not shown:
         return [args]
     if args.camera != RunArguments.camera:
-        raise InputError("--camera names one camera: several are called like their folders")
-    prefixes = {folder: f"{folder.name}." for folder in folders}
-    of_all = [side for side in args.facing if not side.startswith(tuple(prefixes.values()))]
+        raise InputError("--camera names one camera: several are called like their folders or videos")
+    names = {path: path.name if path.is_dir() else path.stem for path in shown}
+    if twice := next((name for name in names.values() if list(names.values()).count(name) > 1), None):
+        raise InputError(f"{args.images[0]}: two of what is in it are called {twice!r}, as one camera: rename one")
+    prefixes = tuple(f"{name}." for name in names.values())
+    of_all = [side for side in args.facing if not side.startswith(prefixes)]
     return [
         replace(
             args,
-            images=(str(folder),),
-            output=args.output / folder.name,
-            facing=(*of_all, *(side.removeprefix(own) for side in args.facing if side.startswith(own))),
-            camera=folder.name,
+            images=(str(path),),
+            output=args.output / name,
+            facing=(*of_all, *(side.removeprefix(f"{name}.") for side in args.facing if side.startswith(f"{name}."))),
+            camera=name,
         )
-        for folder, own in prefixes.items()
+        for path, name in names.items()
     ]
 
 
@@ -201,10 +204,12 @@ def _calibrated(args: RunArguments, cameras: Sequence[RunArguments], detected: S
     observations = [data["output"] for data in detected]
     priors = arguments.repeated("--prior", args.prior)
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    folders = [str(one.output / video.stem) for one in cameras for video in images_and_videos(one.images)[1]]
-    given = [name for one in cameras for name in one.images]
+    seen = [(one, *images_and_videos(one.images)) for one in cameras]
+    folders = [str(one.output / video.stem) for one, _, videos in seen for video in videos]
+    given = [name for one, images, _ in seen if images for name in one.images]
     shown = [name for name in (*given, *folders) if Path(name).is_dir() or Path(name).suffix in IMAGE_ENDINGS]
-    images = arguments.repeated("--images", shown)
+    medians = [data["median"]["picture"] for data in detected if "median" in data]
+    images = arguments.repeated("--images", [*shown, *medians])
     asked = [*observations, "--lens", args.lens, *priors, *goal, *images]
     return _step(args, "calibrate", asked, titles=_SHOWN)
 
