@@ -46,7 +46,7 @@ class Rejected(Frozen, eq=True):
         return self.reason.startswith("the whole of ")
 
 
-_TOO_FEW = "the observations are too few to compare lenses by"
+TOO_FEW = "the observations are too few to compare lenses by"
 _NOT_THE_BEST = (
     "the lens that predicts best makes no calibration of all observations; {}, which was taken, predicts {:.1f} "
     "standard errors worse, and its map may be off by more than is stated: name another lens (--lens)"
@@ -93,7 +93,7 @@ class LensChoice(Frozen, eq=True):
     def words(self) -> str:
         """In a line."""
         if not self.groups:
-            return f"{self.chosen}, the paper's: {self.tried[0].failed or _TOO_FEW}"
+            return f"{self.chosen}, the paper's: {self.tried[0].failed or TOO_FEW}"
         others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
         if not others or self.tried[0].rms_px is None:
             return f"{self.chosen}, the only one that can be calibrated"

@@ -30,7 +30,7 @@ from ceres_cal.calibration.lens_forms import (
     pseudo_bma,
     standard_errors,
 )
-from ceres_cal.calibration.lens_seen import Candidate, FewGroupsError, InlierRows, Kind
+from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options
@@ -213,8 +213,7 @@ def choose_lens(
 
     chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
     if isinstance(chosen, CalibrationError):
-        failed = "" if isinstance(chosen, FewGroupsError) else str(chosen)
-        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
+        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=str(chosen)),), 0, 0.0))
     return chosen
 
 
