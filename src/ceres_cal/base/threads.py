@@ -89,7 +89,7 @@ def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
         rows: how many they hold in all. row_ns: about how long one of them takes.
     """
     later_us = 100.0  # that another thread begins after this one
-    worth_us = 180.0  # of work in a part; below it a thread costs more than it brings
+    worth_us = 400.0  # of work in a part; of half of that a thread brings nothing by the clock, and costs a tenth
     work_us = 1e-3 * row_ns * rows
     count = max(1, min(available(), int(work_us / worth_us)))
     ahead = items * later_us / work_us if count > 1 else 0.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.arrays import Array, Mask
@@ -47,6 +46,8 @@ from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from ceres_cal.effects.aside import Explanation
     from ceres_cal.robust.bulk import Settled
 
@@ -157,8 +158,9 @@ def solved_from(task: Task, start: Start, problem: Problem, built: Built = AS_DR
 
 def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
     """Solve and explain what is left; see `solved_from`."""
-    alone = _takes_long(problem) and task.settle is None
-    digest = meanwhile(lambda: problem.observations.digest) if alone else None
+    long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
+    takes_long = problem.observations.rows > long_to_digest
+    digest = meanwhile(lambda: problem.observations.digest) if takes_long and task.settle is None else None
     seen, may_move = _solved(task, start, problem, built), task.chosen and not task.settle
     steady = _made_steady(seen, problem) if may_move else None
     if steady is None:
@@ -166,12 +168,6 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
         may_move = may_move and bool(seen.explanations or seen.as_built)
         steady = _made_steady(seen, problem) if may_move else None
     return replace(steady or seen, digest=digest)
-
-
-def _takes_long(problem: Problem) -> bool:
-    """Whether what passes over all observations is worth a thread, and what makes one."""
-    least = 20_000  # observations
-    return problem.observations.rows > least
 
 
 def known_of(seen: Explained) -> Calibration:
@@ -282,14 +278,11 @@ def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
 
 def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]:
     """What is known of every number, with what the lens hides and whatever else may be."""
-    is_new = seen.task.before is None
-    alike = meanwhile(lambda: seen.leaves_alike) if is_new and _takes_long(seen.problem) else None
     end, posterior = _assess(seen)
+    is_new = seen.task.before is None
     if is_new:
         require_lens_told(end.estimate, posterior)
     known = seen if end is seen.end else replace(seen, end=end)
-    if alike is not None:
-        alike.result()
     if is_new and known.leaves_alike:
         posterior = posterior.widened(*shifts_by_roughness(end))
     return known, with_doubts(posterior, end, conflicts, seen.explanations, seen.others)

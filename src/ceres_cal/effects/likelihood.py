@@ -83,9 +83,8 @@ def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: fl
     size, count, many = family.columns.shape[2] - 7, int(np.count_nonzero(family.filled)), len(shares)
     values, vectors = np.linalg.eigh(decay(family.distance, place[2] or 1.0, place[1]))
     values, rows = np.maximum(values, 0.0), np.swapaxes(family.applied(np.swapaxes(vectors, 1, 2)), 0, 1)
-    logs, shared = np.zeros(many), rows[..., 6:].reshape(-1, size + 1)
-    weights = (np.repeat(1.0 / (1.0 - one * (1.0 - values)), np.diff(family.bounds), axis=0) for one in shares)
-    left = np.array([(shared * weight.T.reshape(-1, 1)).T @ shared for weight in weights])
+    logs, weights = np.zeros(many), 1.0 / (1.0 - shares[:, None, None] * (1.0 - values))
+    left = _left(family, rows[..., 6:], weights)
     taken = strands_left(values, family.bounds, family.group, rows, shares, logs, left)
     log, variance, freedom = _restricted(family, left, count - taken)
     sizes = np.add.reduceat(np.einsum("msz,msz->ms", *[rows[..., 6:-1]] * 2), family.bounds[:-1], axis=1)
@@ -98,6 +97,16 @@ def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: fl
     number, smooth, length_m = (np.full(many, one) for one in place)
     trace = scale * (parts[0] + parts[1])
     return Likelihoods(number, smooth, length_m, shares, log - 0.5 * logs, variance, trace, inverse)
+
+
+def _left(family: StrandFamily, shared: Array, weights: Array) -> Array:
+    """(A, Q, Q) X^T R^-1 X of shared columns (M, S, Q) along the eigenvectors, with weights (A, D, M) of each shape."""
+    each = np.diff(family.bounds)
+    if 4 * len(each) > shared.shape[1]:  # else the products of all strands of a shape serve all shares, in a third
+        every, flat = np.repeat(np.swapaxes(weights, 1, 2), each, axis=2), shared.reshape(-1, shared.shape[2])
+        return np.array([(flat * weight.reshape(-1, 1)).T @ flat for weight in every])
+    products = (np.swapaxes(shared[:, own], 1, 2) @ shared[:, own] for own in family.of_shape)
+    return np.asarray(sum(np.tensordot(weights[:, d], product, 1) for d, product in enumerate(products)))
 
 
 def _restricted(family: StrandFamily, reduced: Array, count: int) -> tuple[Array, Array, float]:
