@@ -309,8 +309,6 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
     alike = 1.25  # ratio up to which sds are right within what statistics of hundreds of runs tell
     by_chance = 3.0  # standard errors of a scale
     observations, layout, usual = problem.observations, problem.layout, problem.weighting.scales
-    if len(observations.cameras) < 2 or problem.options.noise_scale == "stated":
-        return {}
     lengths = relative_lengths(observations, residuals(problem.sights, estimate, problem.feet))
     kinds, columns = np.split(judged, [len(observations.points)]), (observations.points, observations.curves)
     owners, noise, differ = np.array([view.camera for view in observations.views]), dict[str, float](), False
