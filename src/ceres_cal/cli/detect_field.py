@@ -106,23 +106,19 @@ def _run(args: FieldArguments) -> Document:
             merged.update(write_median(one, images, videos, bar))
         return images if one is None else [one]
 
+    same = ("auto", "mask", "edges", "points", "keep_start", "camera", "station")
+    how: dict[str, Any] = {name: getattr(args, name) for name in same}
     look = partial(
         detect_field,
         pictures,
         target=target,
         start=start,
-        auto=args.auto,
         facing=arguments.parse_facing(args.facing),
         not_painted=arguments.parse_names(args.not_painted),
         estimate=arguments.parse_estimates(args.estimate, {"field": target}),
-        mask=args.mask,
-        edges=args.edges,
-        points=args.points,
-        keep_start=args.keep_start,
-        camera=args.camera,
-        station=args.station,
         refused=_drawing(args.picture, target),
         progress=bar.update,
+        **how,
     )
     with bar:
         detections = detected(args.timeout, look)

@@ -19,16 +19,6 @@ from ceres_cal.report.document import Document, Section
 # ---- export ---------------------------------------------------------------------------------------------------------
 
 
-def _export_forms() -> Mapping[str, formats.ExportFormat]:
-    """The formats that are written, by name."""
-    return formats.EXPORT_FORMATS
-
-
-def _import_forms() -> Mapping[str, formats.ImportFormat]:
-    """The formats that are read, by name."""
-    return formats.IMPORT_FORMATS
-
-
 def _listed(forms: Iterable[formats.ExportFormat | formats.ImportFormat]) -> str:
     """What there is to choose from."""
     return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
@@ -48,8 +38,8 @@ def export(
         "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
     ),
     max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm")),
-    to: str = option(lambda: _listed(_export_forms().values()), "FORMAT", REQUIRED),
-    options: Mapping[str, str] = options_of(lambda: _export_forms().values()),
+    to: str = option(lambda: _listed(formats.EXPORT_FORMATS.values()), "FORMAT", REQUIRED),
+    options: Mapping[str, str] = options_of(lambda: formats.EXPORT_FORMATS.values()),
 ) -> Document:
     """A calibration in another format."""
     form = formats.export_format(to)
@@ -113,18 +103,20 @@ def _losses(exported: formats.Exported) -> Iterator[Section]:
 def from_option() -> Any:
     """The option --from FORMAT."""
     return option(
-        lambda: f"default: by ending and content. {_listed(_import_forms().values())}", "FORMAT", flags=("--from",)
+        lambda: f"default: by ending and content. {_listed(formats.IMPORT_FORMATS.values())}",
+        "FORMAT",
+        flags=("--from",),
     )
 
 
 def import_options() -> Any:
     """The options of the formats that are read."""
-    return options_of(lambda: _import_forms().values())
+    return options_of(lambda: formats.IMPORT_FORMATS.values())
 
 
 def typed_options(given: Mapping[str, str], form: str | None) -> dict[str, Any]:
     """What was given of the options of the format that is named, or of any."""
-    forms = _import_forms().values()
+    forms = formats.IMPORT_FORMATS.values()
     return _typed(given, [one for one in forms if one.name == form] or list(forms))
 
 

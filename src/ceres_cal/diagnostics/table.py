@@ -25,6 +25,8 @@ from ceres_cal.scene.camera import Camera
 INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3
 REASONS = ("", "too far off", "cannot be seen from there", "a copy of another")
 """Why an observation was taken out, by its code in `ResidualTable.reason`."""
+_MEASURES = ("distance_px", "error_mm", "sigma_px", "scale", "weight", "leverage", "standardised", "radius_px")
+"""Columns that files have as they are."""
 
 
 class ResidualTable(Frozen):
@@ -99,15 +101,7 @@ class ResidualTable(Frozen):
             "pixel_y": self.pixel[:, 1],
             "residual_x_px": self.residual_px[:, 0],
             "residual_y_px": self.residual_px[:, 1],
-            "distance_px": self.distance_px,
-            "error_mm": self.error_mm,
-            "sigma_px": self.sigma_px,
-            "scale": self.scale,
-            "weight": self.weight,
-            "leverage": self.leverage,
-            "standardised": self.standardised,
-            "radius_px": self.radius_px,
-            "inlier": self.inlier,
+            **{name: getattr(self, name) for name in (*_MEASURES, "inlier")},
             "reason": np.array(REASONS, dtype=np.str_)[self.reason],
         }
 
