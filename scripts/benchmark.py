@@ -40,10 +40,10 @@ from benchmarks.problems import (
 )
 from benchmarks.process import process_rows
 from benchmarks.scale import FOLDER, folder_for, frames_in_turns, stored_growth, write_field
+from scenery import overhead_pose
 
 from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
-from ceres_cal.simulate import overhead_pose
 
 OURS = "ceres-cal"
 MODULES = {OURS: "ceres_cal.calibration.calibrating", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scenery import overhead_pose
 from scenes import LENSES, camera
 
 from ceres_cal import Calibration, Camera
@@ -12,7 +13,6 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.formats.format import calibration_of
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import overhead_pose
 
 __all__ = ["LENSES", "over_field", "places", "same_camera", "two_cameras", "with_lens"]
 _POSES = (overhead_pose(-0.5, -1.2, 5.2, -14.0, -11.5, 4.0), overhead_pose(0.9, 1.1, 5.4, 9.0, 8.0, -94.0))

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose, rings_scene
 
 from ceres_cal.base.transforms import Pose
 from ceres_cal.problem.parameters import Options
@@ -14,7 +15,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.lens.spline import COLUMNS, ROWS
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate import BoardRanges, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
+from ceres_cal.simulate import Scene, Station
 
 # phi, lens, and the height (m) from which the image just holds a division B field.
 _LENSES: dict[str, tuple[float, Lens, float]] = {

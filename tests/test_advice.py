@@ -18,6 +18,7 @@ from accuracy.advice import CASES, Kept, followed, promised_for
 from accuracy.bound import make_trial
 from accuracy.scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
 from accuracy.scenes import Problem as Case
+from scenery import board_scene
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
@@ -38,7 +39,7 @@ from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.structure import Tolerance, make_structure
 from ceres_cal.scene.targets import checkerboard, rings
-from ceres_cal.simulate import Disturbance, board_scene, simulate
+from ceres_cal.simulate import Disturbance, simulate
 
 PROBLEMS: dict[str, Callable[[], Case]] = {**CASES, "two cameras": two_cameras, "as built": partial(tilted, 8.0)}
 

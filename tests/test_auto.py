@@ -11,6 +11,7 @@ from photos import disturbed as disturbed
 from photos import shots as script
 from rendering.photograph import photograph
 from rendering.photography import taken_as
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
@@ -35,7 +36,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Arc, Segment, Target, custom, ssl_field
-from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose
+from ceres_cal.simulate import Scene, Station
 
 FIELD = ssl_field("B")
 NAMES = FIELD.curve_names

@@ -11,6 +11,7 @@ import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
+from scenery import field_scene, overhead_pose
 from scenes import SCENES
 from scipy.optimize import least_squares
 
@@ -35,7 +36,7 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.initialise import initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 from scenes import RADIAL, SCENES
 from scipy.optimize import least_squares
 
@@ -26,19 +27,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import Arc, Segment, Target, checkerboard, custom, ssl_field
-from ceres_cal.simulate import (
-    CLEAN,
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Simulation,
-    Station,
-    board_scene,
-    built_in_scene,
-    field_scene,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import CLEAN, Disturbance, Scene, Simulation, Station, built_in_scene, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)

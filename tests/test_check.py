@@ -8,6 +8,7 @@ from accuracy.checks import KINDS, Kind, checked
 from accuracy.moves import CAMERA, DAY, HOME, NOISE, SMALL_SHIFT, SMALL_TILT, seen, thinned
 from accuracy.moves import calibrated as calibrated_at_home
 from accuracy.scenes import FIELD
+from scenery import field_scene
 from scenes import side_by_side
 
 from ceres_cal.base.errors import InputError, SolutionError
@@ -21,7 +22,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
-from ceres_cal.simulate import Disturbance, field_scene, simulate
+from ceres_cal.simulate import Disturbance, simulate
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
+from scenery import overhead_pose
 from scipy.optimize import minimize
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, euler_from_rotation, nearest_rotation, rotation_from_euler
 from ceres_cal.observations import Observations
-from ceres_cal.simulate import overhead_pose
 from ceres_cal.start.closed_forms import (
     PlaneData,
     RadialProfile,

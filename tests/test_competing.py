@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy.diagnostic_scenes import held_boards
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL, boards, lines_and_arcs
 
 from ceres_cal.base.arrays import Array, Mask
@@ -30,7 +31,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Segment
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import custom, ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 LINES = ("TopTouchLine", "BottomTouchLine", "HalfwayLine", "CenterLine", "LeftPenaltyStretch")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal.base.errors import InputError, SolutionError
@@ -30,7 +31,7 @@ from ceres_cal.report.quality import quality_of
 from ceres_cal.report.summary import calibration_sections
 from ceres_cal.robust.conflicts import _beside
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 HEIGHT_M = 4.02
 WRONG, RIGHT = ((value, 0.005) for value in (3.0, HEIGHT_M))

@@ -12,6 +12,7 @@ import pytest
 import scenes as usual
 from accuracy import diagnostic_scenes as scenes
 from accuracy.cross_validation import cross_validate
+from scenery import board_scene
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
@@ -32,7 +33,7 @@ from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, Station, board_scene, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 PLAIN = Options(lens="radial", usual_camera=False, loss="trivial")
 

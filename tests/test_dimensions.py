@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rendering.photograph import photograph
 from rendering.photography import Photography, taken_as
+from scenery import board_scene, field_scene, join, overhead_pose
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import DegenerateError, InputError
@@ -34,16 +35,7 @@ from ceres_cal.report.summary import numbers_chapter
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import (
-    Disturbance,
-    Scene,
-    Station,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 FIELD = ssl_field("B")
 TRUE = {"field_length_m": 8.28, "field_width_m": 5.52}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from photos import shots as script
 from photos.disturbed import AUTO, taken
+from scenery import overhead_pose
 
 from ceres_cal.base.errors import NothingShownError
 from ceres_cal.calibration import Calibration
@@ -32,7 +33,6 @@ from ceres_cal.report.document import Document
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
-from ceres_cal.simulate import overhead_pose
 
 FIELD = ssl_field("B")
 CAMERA = Camera(

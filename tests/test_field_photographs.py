@@ -13,6 +13,7 @@ from photos import disturbed
 from photos import shots as script
 from rendering.photograph import photograph
 from rendering.photography import Photography
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -30,7 +31,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, custom, ssl_field
-from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose
+from ceres_cal.simulate import Scene, Station
 
 FIELD = ssl_field("B")
 

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+from scenery import overhead_pose
 
 import ceres_cal
 from ceres_cal import Camera, InputError, Observations, Pose, View, calibrate, checkerboard, ssl_field
 from ceres_cal.base.arrays import Array32
 from ceres_cal.scene.lens import Brown
-from ceres_cal.simulate import overhead_pose
 
 BOARD = checkerboard(9, 6, 0.1)
 TRUE = Camera((1280, 960), 900.0, (650.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))

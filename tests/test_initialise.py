@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scenery import board_scene, field_scene, join, overhead_pose
 from scenes import RADIAL, SCENES
 
 from ceres_cal.base.errors import DegenerateError
@@ -18,17 +19,7 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import (
-    Disturbance,
-    Scene,
-    Station,
-    ViewPlan,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, simulate
 from ceres_cal.start.initialise import Start, initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)

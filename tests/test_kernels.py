@@ -13,6 +13,7 @@ import pytest
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenery import overhead_pose
 from scipy.optimize import minimize_scalar
 
 from ceres_cal import kernels
@@ -26,7 +27,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial
 from ceres_cal.scene.targets import Arc, Segment, custom
-from ceres_cal.simulate import overhead_pose
 
 LOSSES = {
     "trivial": pyceres.TrivialLoss,

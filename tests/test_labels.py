@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics.labels import mended, renamings
@@ -12,7 +13,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 CAMERA = Camera((1280, 960), 700.0, (639.5, 479.5), Radial((-5e-5, 6e-7)))
 

@@ -20,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from photos import disturbed as disturbed
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.arrays import Array, grid_places
 from ceres_cal.base.errors import InputError, SolutionError
@@ -48,7 +49,7 @@ from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import LENSES, Brown, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 from ceres_cal.start.initialise import Start, initialise
 
 _PLAIN = Options(loss="trivial", reject_sigma=50.0)

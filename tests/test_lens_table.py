@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import scenes
+from scenery import join
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -26,7 +27,7 @@ from ceres_cal.report import make_report
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens, make_lens, register
 from ceres_cal.scene.lens.base import LinearEquations
-from ceres_cal.simulate import Disturbance, Simulation, join, simulate
+from ceres_cal.simulate import Disturbance, Simulation, simulate
 from ceres_cal.simulate.files import scene_from_json, scene_to_json
 
 

@@ -8,6 +8,7 @@ import pytest
 from accuracy.moves import CAMERA, DAY, MOVED, NOISE, seen
 from accuracy.moves import calibrated as calibrated_at_home
 from accuracy.scenes import FIELD
+from scenery import field_scene
 from scenes import side_by_side
 
 from ceres_cal.calibration import Calibration
@@ -18,7 +19,7 @@ from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.robust.noise import USUAL_EQUATIONS
-from ceres_cal.simulate import field_scene, simulate
+from ceres_cal.simulate import simulate
 
 
 def rows_of(observations: Observations, points: np.ndarray, curves: np.ndarray) -> Observations:

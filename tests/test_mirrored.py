@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.calibration.calibrating import calibrate
@@ -17,16 +18,7 @@ from ceres_cal.robust.other_minima import mirrored, without_mirrored_poses
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import (
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Station,
-    board_scene,
-    field_scene,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 OPTIONS = Options(lens="brown")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy.diagnostic_scenes import held_boards
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
@@ -24,7 +25,7 @@ from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Scene, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, simulate
 
 UNKNOWNS = 5 + 6 * 13
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from photos.templates import take_field
+from scenery import field_scene, overhead_pose
 from scenes import camera
 
 from ceres_cal import InputError, Observations, calibrate, painted_field, ssl_field, tape_grid
@@ -18,7 +19,7 @@ from ceres_cal.scene.curves import Arc, Segment, curve_points, distance_to_curve
 from ceres_cal.scene.symmetry import counterparts, turns_of
 from ceres_cal.scene.targets import Target, target_from_spec, targets_by_name
 from ceres_cal.scene.targets.painted_fields import templates
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 EVERY = {**targets_by_name(), "tape-grid": tape_grid(5, 4, 0.5, 0.02)}
 each = pytest.mark.parametrize("name", EVERY)

@@ -23,6 +23,7 @@ import pycolmap
 import pycolmap.cost_functions
 import pytest
 from beside import page
+from scenery import BoardRanges, board_scene
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
@@ -34,7 +35,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import BoardRanges, Disturbance, Station, board_scene, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 BOARD = checkerboard(9, 6, 0.125)  # its corners are the same numbers in single precision, which OpenCV asks for
 SIZE = (1280, 960)

@@ -13,6 +13,7 @@ from rendering.photography import Photography, photography_of, taken_as
 from rendering.render import SUBPIXELS, averaged, blank_canvas, fill, paint_curves, print_sheet
 from rendering.simulate_photographs import main as simulate_photographs
 from rendering.things import BALL_RADIUS_M, Ball, Robot, outline
+from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 from scenes import LENSES, camera, lines
 
 from ceres_cal.base.arrays import Array
@@ -25,18 +26,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate import (
-    BoardRanges,
-    Scene,
-    Station,
-    board_scene,
-    built_in_scene,
-    field_scene,
-    overhead_pose,
-    scene_from_json,
-    scene_to_json,
-    simulate,
-)
+from ceres_cal.simulate import Scene, Station, built_in_scene, scene_from_json, scene_to_json, simulate
 
 PLAIN = Photography(
     blur_px=0.0, vignetting=0.0, unevenness=0.0, carpet_texture=0.0, read_noise=0.0, shot_noise=0.0, carpet=0.2

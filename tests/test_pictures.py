@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from photos import shots as script
 from photos import straightness
+from scenery import overhead_pose
 from scenes import LENSES, camera, two_cameras
 
 from ceres_cal.base.arrays import Array
@@ -41,7 +42,7 @@ from ceres_cal.report.pictures.straight import Straight, straighten
 from ceres_cal.report.pictures.warp import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.simulate import overhead_pose, simulate
+from ceres_cal.simulate import simulate
 
 POSE = overhead_pose(-2.27, -0.12, 4.02, 3.0, -2.0, 90.0)
 FISHEYE = Camera(

@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal.base.arrays import Array
@@ -24,7 +25,7 @@ from ceres_cal.problem.structure import EXACT
 from ceres_cal.robust.usable import require_possible
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, custom
-from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 NOISE = Disturbance(0.3, 0.3)
 MIRRORED: dict[str, Callable[[Array], Array]] = {

@@ -26,6 +26,7 @@ from accuracy.moves import (
 )
 from accuracy.moves import calibrated as calibrated_at_home
 from accuracy.scenes import FIELD
+from scenery import field_scene, overhead_pose
 from scenes import side_by_side
 
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
@@ -47,7 +48,7 @@ from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import CameraFile, PoseFile
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import field_scene, overhead_pose, simulate
+from ceres_cal.simulate import simulate
 
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 

@@ -31,6 +31,7 @@ import refit_after_move
 import watching
 from conftest import made_once
 from faults import fuzz_commands
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL
 
 from ceres_cal.base.errors import CalibrationError, InputError
@@ -46,7 +47,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, custom, ssl_field
 from ceres_cal.scene.targets.target import MOST_FEATURES
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "ssl_field_moved" / "observations.json"

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Browser, browser
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal import Calibration, Observations, Options, Pose, Prior, calibrate, write_report
@@ -36,7 +37,7 @@ from ceres_cal.report.solve_pictures import ideal_radii
 from ceres_cal.report.summary import verdict_chapter
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, simulate
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import scenes
+from scenery import BoardRanges, board_scene
 from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError
@@ -18,7 +19,7 @@ from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.same_frame import with_same_frames
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.targets import Target, checkerboard
-from ceres_cal.simulate import BoardRanges, Disturbance, board_scene, simulate
+from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.same_labels import with_same_labels
 
 __all__ = ["say"]

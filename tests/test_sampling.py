@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from rendering.photograph import photograph
 from rendering.photography import Photography
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import light
@@ -12,7 +13,7 @@ from ceres_cal.detect.sampling import drawn_aside
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, custom
-from ceres_cal.simulate import Station, field_scene, overhead_pose
+from ceres_cal.simulate import Station
 
 
 @pytest.mark.parametrize("jpeg_quality", [0, 90])

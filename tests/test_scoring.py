@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from photos.real_data import ov_plane
+from scenery import board_scene
 from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError
@@ -20,7 +21,7 @@ from ceres_cal.moves.scores import score
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, board_scene, simulate
+from ceres_cal.simulate import Disturbance, simulate
 
 __all__ = ["say"]
 _CAMERA = scenes.camera("brown")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.calibration import Calibration
@@ -16,7 +17,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Station, simulate
 
 CAMERA = Camera((1280, 960), 700.0, (640.0, 480.0), Radial((-5e-5, 6e-7)))
 KNOWN = Options(lens="radial", fixed={"phi": 700.0, "cx": 640.0, "cy": 480.0, "a2": -5e-5, "a3": 6e-7})

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenery import overhead_pose
 from scenes import SCENES
 from scipy.optimize import minimize_scalar
 
@@ -15,7 +16,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights, gather_sights, nearest_feet
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.targets import Arc, Segment, checkerboard, custom
-from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.5, hidden_points=0.2)
 

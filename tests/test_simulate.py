@@ -11,8 +11,10 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from data.built_in_scenes import content
 from hypothesis import given
 from hypothesis import strategies as st
+from scenery import BoardRanges, board_placements, board_scene, field_scene, join, overhead_pose
 from scenes import SCENES
 
 from ceres_cal.base.arrays import Array
@@ -26,19 +28,14 @@ from ceres_cal.simulate import (
     CLEAN,
     OUTLIER,
     WRONG_LABEL,
-    BoardRanges,
     Disturbance,
     Scene,
     Simulation,
     Station,
     ViewPlan,
-    board_placements,
-    board_scene,
     built_in_scene,
-    field_scene,
-    join,
     load_scene,
-    overhead_pose,
+    scene_from_json,
     scene_names,
     scene_to_json,
     simulate,
@@ -348,7 +345,7 @@ def test_boards_are_seen_whole_by_every_camera(monkeypatch: pytest.MonkeyPatch) 
         assert 20.0 <= np.rad2deg(np.arccos(normal @ middle / distance)) <= 40.0
     again = board_placements(board, posed, 6, seed=4, held=BoardRanges((2.5, 3.5), (20.0, 40.0)))
     assert placements == again
-    monkeypatch.setattr("ceres_cal.simulate.compose._TRIES", 200)
+    monkeypatch.setattr("scenery._TRIES", 200)
     with pytest.raises(InputError, match="no 1 places found"):
         board_placements(board, posed, 1, seed=4, held=BoardRanges((0.2, 0.3)))
 
@@ -477,6 +474,17 @@ def test_bad_scenes_get_one_line(broken: Callable[[dict[str, Any]], None], said:
         load_scene(path)
     text = str(caught.value)
     assert text.startswith(str(path)) and said in text and "\n" not in text
+
+
+@each_built_in
+def test_built_in_scenes_are_as_they_were_made(name: str) -> None:
+    made, disturbance = scene_from_json(content(name), name)
+    kept, same = built_in_scene(name)
+    assert disturbance == same and made.views == kept.views and made.photography == kept.photography
+    assert made.targets == kept.targets and made.cameras == kept.cameras
+    first, second = simulate(made, disturbance, 0).observations, simulate(kept, disturbance, 0).observations
+    assert first.points.pixels == pytest.approx(second.points.pixels, abs=1e-9)
+    assert first.curves.pixels == pytest.approx(second.curves.pixels, abs=1e-9)
 
 
 def test_unknown_built_in_scene() -> None:

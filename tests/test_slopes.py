@@ -7,13 +7,13 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 import scenes
+from scenery import overhead_pose
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
 from ceres_cal.problem.parameters import intrinsic_names, unit_px
 from ceres_cal.problem.quantities import camera_moved, pixel_slopes
 from ceres_cal.scene.camera import Camera
-from ceres_cal.simulate import overhead_pose
 
 _STEP = 1e-6
 _PLACES = np.array([(x, y, z) for x in (-2.0, -0.3, 1.1) for y in (-1.5, 0.2, 1.7) for z in (0.0, 0.15)])

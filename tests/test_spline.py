@@ -12,6 +12,7 @@ import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from photos.real_data import ov_plane
+from scenery import board_scene
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -28,7 +29,7 @@ from ceres_cal.problem.problem import Problem
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, Simulation, board_scene, simulate
+from ceres_cal.simulate import Disturbance, Simulation, simulate
 
 
 @st.composite

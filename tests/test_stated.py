@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scenery import field_scene, overhead_pose
 from scenes import camera, side_by_side
 
 from ceres_cal.base.arrays import Array
@@ -27,7 +28,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.information import Information, Key, over
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 KEYS = tuple(Key("camera", "a", name, "px") for name in ("phi", "cx", "cy", "k1", "k2"))
 ROUNDING = 1.0 + 1e-6

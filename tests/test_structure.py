@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenery import board_scene, field_scene, join, overhead_pose
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -21,7 +22,7 @@ from ceres_cal.problem.structure import EXACT, WARP, Tolerance, make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Arc, Curve, Segment, Target, checkerboard, custom, ssl_field
-from ceres_cal.simulate import Disturbance, Station, board_scene, field_scene, join, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 CAMERA = Camera((1280, 960), 868.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 NOISE = Disturbance(0.3, 0.3)

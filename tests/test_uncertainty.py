@@ -18,6 +18,7 @@ from accuracy.bound import bound, make_trial
 from accuracy.intervals import CASES, cover, share
 from accuracy.odd_scenes import LENSES as ODD_LENSES
 from accuracy.scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
+from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
@@ -47,7 +48,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.foreign import nearest
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Segment
-from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 RADIAL_LENS = Radial((-1.1e-4, 1.6e-6), (2, 3))

@@ -16,6 +16,7 @@ from functools import partial
 
 import numpy as np
 from runner import Row, mean_and_error, script, share_error
+from scenery import field_scene, overhead_pose
 
 from accuracy.bound import attempts
 from accuracy.scenes import CLEAN_NOISE, FIELD, Problem, tilted
@@ -28,7 +29,7 @@ from ceres_cal.diagnostics.advice import Measurement, Promise, advise, promised
 from ceres_cal.observations import Observations, combine
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.targets import custom
-from ceres_cal.simulate import Scene, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Scene, simulate
 
 WITHIN = 0.1
 LEAST_IN_RANGE = 0.9

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from halves import SETS
 from runner import Row, mean_and_error, over, script, share_error
+from scenery import BoardRanges, board_scene
 
 from accuracy.cross_validation import cross_validate
 from accuracy.scenes import RADIAL
@@ -29,7 +30,7 @@ from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, checkerboard
-from ceres_cal.simulate import BoardRanges, Disturbance, Scene, board_scene, simulate
+from ceres_cal.simulate import Disturbance, Scene, simulate
 
 SIGMA_PX = 0.3
 SQUARE_M = 0.03

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from runner import Row, over, script, share_error
+from scenery import field_scene, overhead_pose
 
 from ceres_cal import CalibrationError, Camera, Options, audit, calibrate
 from ceres_cal.base.transforms import Pose
@@ -22,7 +23,7 @@ from ceres_cal.formats.format import calibration_of
 from ceres_cal.moves.audits import resized
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.01)
 FREE = Options(lens="brown", free_aspect=True)

@@ -14,6 +14,7 @@ import numpy as np
 from photos.auto import FACING, VIEWS, near, outcome, searched, take_view
 from photos.shots import Shot, clicks, distances_px, floor_error_mm, hidden_places, off_by, take, turned, varied
 from rendering.photograph import frames, photograph
+from scenery import BoardRanges, board_scene, overhead_pose
 
 from accuracy.accuracy import mirrored_small
 from accuracy.bound import attempts, efficiency
@@ -58,7 +59,7 @@ from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import BoardRanges, Station, board_scene, built_in_scene, overhead_pose, simulate
+from ceres_cal.simulate import Station, built_in_scene, simulate
 
 Figures = dict[str, float]
 

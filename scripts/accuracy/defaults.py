@@ -16,6 +16,7 @@ from functools import partial
 
 import numpy as np
 from runner import Row, mean_and_error, over, script, share_error
+from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose
 
 from accuracy.odd_scenes import farthest
 from ceres_cal.base.arrays import Array, Mask
@@ -31,17 +32,7 @@ from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import (
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Station,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 _DECENTRED = 5e-4  # standard deviation of p1 and of p2
 _NOISE_PX = 0.3

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
@@ -15,18 +16,7 @@ from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
-from ceres_cal.simulate import (
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Station,
-    board_scene,
-    built_in_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, simulate
 
 RADIAL = Options(lens="radial", usual_camera=False)
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)

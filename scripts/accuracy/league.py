@@ -21,6 +21,7 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
+from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose
 
 from accuracy.odd_scenes import LENSES, MOST_RADII, MOST_SIGMAS, farthest
 from ceres_cal.base.errors import CalibrationError
@@ -30,17 +31,7 @@ from ceres_cal.observations import Prior
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import (
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Station,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 MOST_SECONDS, MOST_FLOOR_MM = 5.0, 20.0
 NOISE_PX, TAPE_M = 0.3, 0.01

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 from runner import Row, script
+from scenery import board_scene, field_scene, join, overhead_pose
 
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
@@ -20,7 +21,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, board_scene, field_scene, join, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 _NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 _BOARD, _FIELD = checkerboard(9, 6, 0.1), ssl_field("B")

@@ -22,6 +22,7 @@ import numpy as np
 from photos.shots import varied
 from rendering.photograph import frames, photograph
 from runner import Row, over, script, share_error
+from scenery import board_scene, field_scene, join, overhead_pose
 
 from accuracy.accuracy import map_errors_mm
 from accuracy.odd_scenes import MOST_RADII
@@ -47,17 +48,7 @@ from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import (
-    Disturbance,
-    Scene,
-    Simulation,
-    Station,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Simulation, Station, simulate
 
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
 HOME = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=90.6)

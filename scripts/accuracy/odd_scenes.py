@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 from runner import Row, finished, over, over_processes, parser
+from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 
 from accuracy.scenes import FIELD, Problem
 from ceres_cal.base.arrays import Array
@@ -32,17 +33,7 @@ from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import (
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Station,
-    board_scene,
-    field_scene,
-    overhead_pose,
-    simulate,
-)
-from ceres_cal.simulate.compose import well_inside
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate, well_inside
 
 MOST_SIGMAS, MOST_RADII = 5.0, 2.5
 MOST_WRONG_KNOWN, MOST_WRONG_PLACES = 0, 2  # of 2000 scenes

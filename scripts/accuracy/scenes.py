@@ -9,6 +9,7 @@ from math import hypot
 
 import msgspec
 import numpy as np
+from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
@@ -17,18 +18,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import Arc, Curve, Segment, checkerboard, custom, ssl_field
-from ceres_cal.simulate import (
-    BoardRanges,
-    Disturbance,
-    Scene,
-    Simulation,
-    Station,
-    board_scene,
-    field_scene,
-    join,
-    overhead_pose,
-    simulate,
-)
+from ceres_cal.simulate import Disturbance, Scene, Simulation, Station, simulate
 
 FIELD = ssl_field("B")
 CLEAN_NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)

@@ -21,6 +21,7 @@ import numpy as np
 from photos.real_data import real_place
 from photos.shared import CLICK_PX, Known, known_photographs, spread
 from runner import Row, over, script
+from scenery import field_scene, overhead_pose
 
 from accuracy.advice import followed
 from accuracy.odd_scenes import MOST_SIGMAS, farthest
@@ -38,7 +39,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, nearest_on_curve
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import Target, ssl_field, targets_by_name
-from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 _FIELD = ssl_field("A")
 _SIZE = (1280, 1024)

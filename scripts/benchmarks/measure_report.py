@@ -14,11 +14,12 @@ from functools import partial
 from pathlib import Path
 
 from runner import Row, script
+from scenery import board_scene, field_scene, overhead_pose
 
 from ceres_cal import Camera, Observations, Pose
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import Disturbance, Station, board_scene, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Station, simulate
 
 MOST_SECONDS, MOST_MB = 15.0, 3.0
 _CAMERA = Camera((1280, 960), 868.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scenery import field_scene, overhead_pose
 
 from benchmarks.peers import Corners
 from ceres_cal.base.arrays import Array
@@ -14,7 +15,7 @@ from ceres_cal.observations import NO_CURVES, Columns, Curves, Observations, Poi
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Scene, Station, simulate
 
 WIDE = Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))
 COLUMNS, ROWS, SQUARE_M = 10, 10, 0.1

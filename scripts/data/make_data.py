@@ -10,19 +10,11 @@ from typing import Any
 
 import numpy as np
 from rendering.album import Album, take_album
+from scenery import overhead_pose
 
 from ceres_cal.base.files import write_bytes, write_json
 from ceres_cal.problem.parameters import Station
-from ceres_cal.simulate import (
-    Disturbance,
-    Scene,
-    Simulation,
-    built_in_scene,
-    overhead_pose,
-    simulate,
-    truth_to_json,
-    write_simulation,
-)
+from ceres_cal.simulate import Disturbance, Scene, Simulation, built_in_scene, simulate, truth_to_json, write_simulation
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 SEED = 1

@@ -17,13 +17,14 @@ import cv2
 import numpy as np
 from rendering.album import take_album
 from rendering.photography import Photography, taken_as
+from scenery import field_scene, overhead_pose
 
 import ceres_cal as cc
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main as ceres_cal
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.lens import Brown
-from ceres_cal.simulate import field_scene, overhead_pose, simulate
+from ceres_cal.simulate import simulate
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "honest.jpg"
 RADIAL, LENGTHS = "radial", ["--estimate", "length,width"]

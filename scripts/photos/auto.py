@@ -15,6 +15,7 @@ import numpy as np
 from rendering.photograph import photograph
 from rendering.photography import taken_as
 from runner import Row
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.detect.images import read_light
@@ -23,7 +24,7 @@ from ceres_cal.detect.photographs.search import search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, ssl_field
-from ceres_cal.simulate import Station, field_scene, overhead_pose
+from ceres_cal.simulate import Station
 from photos.shots import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
 
 FACING = Auto((Facing("LeftGoalLine", "top"),))  # as the cameras of `take` are mounted

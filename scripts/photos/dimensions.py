@@ -17,6 +17,7 @@ import numpy as np
 from rendering.photograph import photograph
 from rendering.photography import Photography, taken_as
 from runner import Row, mean_and_error, over, root_and_error, script
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration import Calibration
@@ -27,7 +28,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 CAMERA = Camera((1280, 960), 600.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 KNOWN = {

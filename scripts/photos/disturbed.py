@@ -17,13 +17,14 @@ from rendering.moustache import Moustache
 from rendering.photograph import photograph
 from rendering.photography import Photography
 from runner import Row, over
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.arrays import Array, Image8
 from ceres_cal.detect.photographs import Auto, Facing
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, custom, ssl_field, targets_by_name
-from ceres_cal.simulate import Station, field_scene, overhead_pose
+from ceres_cal.simulate import Station
 from photos.outcomes import MOVED_MM, STATED, USUAL_MM, WRONG, Outcome, outcome
 from photos.painters import (
     Painter,

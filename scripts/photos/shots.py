@@ -17,6 +17,7 @@ import numpy as np
 from rendering.photograph import Photograph, photograph
 from rendering.photography import Photography, taken_as
 from runner import Row
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
@@ -33,7 +34,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track, nearest_on_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, ssl_field
-from ceres_cal.simulate import Scene, Station, built_in_scene, field_scene, overhead_pose
+from ceres_cal.simulate import Scene, Station, built_in_scene
 
 LENSES: tuple[tuple[float, Lens], ...] = (
     (868.0, Radial((-5.2e-5, 6.1e-7), (2, 3))),

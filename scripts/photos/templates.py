@@ -9,10 +9,11 @@ import numpy as np
 from rendering.photograph import photograph
 from rendering.photography import Photography, taken_as
 from runner import Row
+from scenery import field_scene, overhead_pose
 
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, tape_grid, targets_by_name
-from ceres_cal.simulate import Station, field_scene, overhead_pose
+from ceres_cal.simulate import Station
 from photos.auto import rows_for, searched, whole
 from photos.shots import LENSES, Shot, varied
 

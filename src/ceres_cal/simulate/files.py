@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -153,7 +153,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
             for plan in scene.views
         ],
-        "disturbance": vars(disturbance or Disturbance()).copy(),
+        "disturbance": asdict(disturbance or Disturbance()),
         **({"photography": dict(scene.photography)} if scene.photography else {}),
     }
 
@@ -185,7 +185,7 @@ def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
         }
         truth["files"][file_name] = {
             "seed": simulation.seed,
-            "disturbance": vars(simulation.disturbance).copy(),
+            "disturbance": asdict(simulation.disturbance),
             "points": _rows_truth(simulation.points),
             "curves": _rows_truth(simulation.curves),
         }

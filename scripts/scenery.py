@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
-from ceres_cal.simulate.scene import Scene, ViewPlan
+from ceres_cal.simulate import Scene, ViewPlan, board_pose, well_inside
 
 _TRIES = 5_000
 
@@ -80,35 +79,6 @@ def _random_board_pose(board: Target, camera: Camera, held: BoardRanges, rng: np
     tilt = np.deg2rad(rng.uniform(*held.tilt_deg))
     line_of_sight = camera.rays(pixel[None])[0]
     return board_pose(board, line_of_sight, rng.uniform(*held.distance_m), (tilt, direction, spin))
-
-
-def board_pose(board: Target, line_of_sight: Array, distance_m: float, turn_rad: tuple[float, float, float]) -> Pose:
-    """cam_from_board with the board's middle along a line of sight (3,) of length 1, so far from the camera.
-
-    Its normal points away from the camera, so that columns run right and rows down before it is turned: by spin about
-    its own normal, then by the tilt about an axis across the line of sight. That tilt brings its upper edge nearer to
-    the camera at direction 0, its right one at a quarter turn.
-
-    Args:
-        turn_rad: tilt, direction of the tilt, spin.
-    """
-    tilt, direction, spin = turn_rad
-    across = np.array([-line_of_sight[1], line_of_sight[0], 0.0])  # z x line of sight
-    sine = np.linalg.norm(across)
-    facing = rotation_exp(across / max(sine, 1e-12) * np.arctan2(sine, line_of_sight[2]))
-    leaning = rotation_exp((tilt * np.cos(direction), tilt * np.sin(direction), 0.0))
-    rotation = facing @ leaning @ rotation_exp((0.0, 0.0, spin))
-    middle = board.point_array.mean(axis=0)
-    return Pose(rotation, line_of_sight * distance_m - rotation @ middle)
-
-
-def well_inside(camera: Camera, points_world: Array) -> Mask:
-    """(N,) whether points (N, 3) are before the camera, so far inside the image that noise keeps them there."""
-    margin_px = 5.0  # a board stays this far inside the image, so that noise moves no corner out
-    pixels = camera.project(points_world)
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels >= margin_px) & (pixels <= np.array(camera.image_size) - 1.0 - margin_px), axis=1)
-    return np.asarray(inside & (camera.cam_from_world.transform(points_world)[:, 2] > 0.0))
 
 
 def field_scene(
