@@ -133,7 +133,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.bent", "BENDING", "verdicts"),
     *_of("effects.strands", "_LOUD _MATTERS", "verdicts"),
     *_of("robust.noise", "_TAIL", "calibrate"),
-    *_of("problem.priors", "_USUAL_ASPECT _USUAL_DECENTRING", "calibrate", "verdicts"),
+    *_of("problem.priors", "_USUAL_ASPECT USUAL_DECENTRING", "calibrate", "verdicts"),
     *_of("robust.as_built", "_UNMEASURED", "calibrate"),
     *_of("effects.aside", "FEWEST_VIEWS", "calibrate"),
     *_of("robust.other_minima", "FEW _APART", "calibrate"),

@@ -128,6 +128,11 @@ def sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
+def ended(text: str) -> str:
+    """The text as a whole sentence, which a question is already."""
+    return sentence(text) + ("" if text.endswith("?") else ".")
+
+
 def printable(text: str) -> str:
     """The text with what is no letter (bytes of a file's name in another encoding) as \\udc..: it can be written."""
     return text.encode("utf-8", "backslashreplace").decode()

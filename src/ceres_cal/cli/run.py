@@ -18,7 +18,7 @@ from ceres_cal.cli.files import attempted, require_shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
-_SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
+_SHOWN = ("fit", "lens", "rig", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
 _MOST_NAMES = 3
 _BLANK = Section("", [""])
 

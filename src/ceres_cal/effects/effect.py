@@ -265,6 +265,7 @@ class Effect(Frozen):
         prior: what is expected of its amounts, in their own unit, of one whose size `calibrate` estimates: it solves
             for it where it is likely, and states no number better than with it in doubt. reach: by how much more is
             expected of a group, by how large what it is about is. concerns: whether it may displace any observations.
+        usual: of a case and a camera, the size that its amounts usually have, where `calibrate` estimates none.
         together: the findings of several of its groups, as they are told.
     """
 
@@ -278,6 +279,7 @@ class Effect(Frozen):
     prior: SizePrior | None = None
     reach: Callable[[EffectColumns, int, Case], float] = lambda columns, number, case: 1.0
     concerns: Callable[[Observations], bool] = lambda observations: True
+    usual: Callable[[Case, str], float] = lambda case, camera: np.inf
     together: Callable[[Sequence[Finding]], Iterable[Finding]] = tuple
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
@@ -310,7 +312,7 @@ class Effect(Frozen):
         """
         most = 4.0  # times the usual size: 9 mm of a field of 9 m
         prior = self.prior_of(score.effect, score.number, case)
-        usual = np.inf if prior is None else float(np.mean(np.square(prior.sizes)))
+        usual = self.usual(case, score.subject) ** 2 if prior is None else float(np.mean(np.square(prior.sizes)))
         return np.clip(score.amount**2 - score.sd**2, usual, most**2 * usual)
 
     def is_implausible(self, case: Case, score: ScoreTest) -> bool:
@@ -337,9 +339,15 @@ class Effect(Frozen):
         )  # fmt: skip
 
 
-def camera_effect(kind: str, displacement: Displaces, words: Callable[[Evidence], Words]) -> Effect:
+def camera_effect(
+    kind: str,
+    displacement: Displaces,
+    words: Callable[[Evidence], Words],
+    usual: Callable[[Case, str], float] = lambda case, camera: np.inf,
+) -> Effect:
     """What a camera does to its picture besides."""
-    return Effect(kind, partial(_over_cameras, displacement), words, absorbed=True, displacement=displacement)
+    over = partial(_over_cameras, displacement)
+    return Effect(kind, over, words, absorbed=True, displacement=displacement, usual=usual)
 
 
 def _over_cameras(displacement: Displaces, case: Case) -> Iterator[EffectColumns]:

@@ -94,9 +94,13 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 
 def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
-    """From a station to the floor, or from a placement to the nearest station."""
+    """From a station to the floor, or to the nearest placement where that is farther; from a placement to the nearest
+    station. Of a rig that sees no field the floor is nothing: heights are those above another camera.
+    """
     if kind == "station":
-        return max(abs(float(estimate.stations[owner].cam_from_world.position[2])), 1e-3)
+        here, others = estimate.stations[owner].cam_from_world.position, list(estimate.placements.values())
+        floor, away = abs(float(here[2])), [np.linalg.norm(one.translation - here) for one in others]
+        return max(floor, float(min(away, default=0.0)), 1e-3)
     where = estimate.placements[owner].translation
     away = [np.linalg.norm(where - station.cam_from_world.position) for station in estimate.stations.values()]
     return max(float(min(away)), 1e-3)

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base.arrays import median
-from ceres_cal.base.words import HEIGHTS_M, counted, first_of, mm, sentence, short
+from ceres_cal.base.words import HEIGHTS_M, counted, ended, first_of, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import OWN_NOISE, RESTING
 from ceres_cal.diagnostics import Finding
@@ -130,13 +130,13 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     if calibration.converged:
         yield "good", "The solve converged."
     table = None if quality.diagnosis is None else quality.diagnosis.table
-    yield from ((level, f"{sentence(text)}.") for level, text in of_the_solve(calibration, table))
+    yield from ((level, ended(text)) for level, text in of_the_solve(calibration, table))
     if quality.undiagnosed:
         yield "care", f"{sentence(_UNJUDGED)}. So it is not known whether the model is right: {quality.undiagnosed}."
     yield from _of_findings(quality)
-    yield from (("", f"{sentence(words)}.") for words in words_of(calibration.as_built))
+    yield from (("", ended(words)) for words in words_of(calibration.as_built))
     for conflict in calibration.conflicts:
-        yield "care" if conflict.kind == "tolerance" else "no", f"{sentence(conflict.words)}."
+        yield "care" if conflict.kind == "tolerance" else "no", ended(conflict.words)
     if noise_ratio(quality) >= LARGE_NOISE:
         yield (
             "care",
@@ -148,7 +148,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     for text in calibration.warnings:
         if text not in known:
             is_harmless = text.endswith((COUNTED_ONCE, OWN_NOISE)) or RESTING in text  # in every standard deviation
-            yield "" if is_harmless else "care", f"{sentence(text)}."
+            yield "" if is_harmless else "care", ended(text)
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
@@ -191,7 +191,7 @@ def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
     if quality.uncertainty is None:
         return
     if quality.uncertainty.widening:
-        yield "", f"{sentence(quality.uncertainty.widening)}."
+        yield "", ended(quality.uncertainty.widening)
     some = 0.005  # of a probability that is said
     floors = [one for one in quality.calibration.effects if not one.is_solved and one.probability >= some]
     likely = [f"'{one.kind} by {mm(1e3 * one.sigma)}' is {100.0 * one.probability:.0f} % likely" for one in floors]

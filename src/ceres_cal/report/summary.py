@@ -80,7 +80,9 @@ def accuracy_sections(quality: Quality, seams: Sequence[Seam]) -> Iterator[Secti
     if uncertainty is None:
         yield Section(data={"uncertainty": None})
         return
-    yield Section("rig", [_rig_line(pair) for pair in uncertainty.rig])
+    pairs, most_pairs = uncertainty.rig, 6  # of four cameras all
+    more = [f"{plural(len(pairs) - most_pairs, 'more pair')} in --json"] if len(pairs) > most_pairs else []
+    yield Section("rig", [*map(_rig_line, pairs[:most_pairs]), *more])
     yield Section("located", [f"{name}: {_sd_at_heights(every)}" for name, every in maps.items()])
     yield _seams(seams)
     yield Section("widened", [uncertainty.widening] if uncertainty.widening else [])

@@ -14,6 +14,7 @@ from ceres_cal.base.tails import log_f_tail
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_all
 from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.problem.parameters import OF_PIXELS, unit_px
+from ceres_cal.problem.priors import USUAL_DECENTRING
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens
 
@@ -150,6 +151,14 @@ def _one_way(case: Case, camera: str, pixels: Array) -> Array | None:
     return np.concatenate([r2 * np.eye(2), r2**2 * np.eye(2)], axis=2)
 
 
+def _usual_px(case: Case, camera: str) -> float:
+    """What is usual of a lens that is not centred, px in the picture's corners; of a prism no more is known. Without it
+    a prism of 4 ± 2 px moved the principal point of a rig, whose lens leaves 0.006 px, by 42 standard deviations.
+    """
+    one = case.estimate.cameras[camera]
+    return USUAL_DECENTRING * unit_px(one) ** 2 / one.phi
+
+
 def _of_prism(evidence: Evidence) -> Words:
     name = evidence.score.subject
     kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
@@ -218,7 +227,7 @@ def _where_likely(case: Case, every: EffectColumns) -> Iterator[EffectColumns]:
 
 EFFECTS = (
     camera_effect("radius", _along_radius, _of_radius),
-    camera_effect("decentring", _decentred, _of_decentring),
-    camera_effect("prism", _one_way, _of_prism),
+    camera_effect("decentring", _decentred, _of_decentring, _usual_px),
+    camera_effect("prism", _one_way, _of_prism, _usual_px),
     Effect("lens changed", lens_changes, _of_change),
 )
