@@ -82,6 +82,24 @@ def test_the_map_is_as_wrong_as_it_says_under_another_lens(lens: str) -> None:
     assert np.nanmedian(error_mm / known.sd_mm.ravel()) < 1.8  # 0.5 to 1.1
 
 
+@pytest.mark.parametrize("coefficients", [(-0.18, 0.05, 2e-4, -3e-4, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)])
+def test_lenses_are_compared_by_exact_observations(coefficients: tuple[float, ...]) -> None:
+    """What a lens leaves of them is rounding, and so is what normal equations promise."""
+    true = Camera((1280, 960), 700.0, (643.0, 475.0), Brown(coefficients))
+    world = {"camera": Station("camera", overhead_pose(0.2, -0.1, 5.2, 8.0, 3.0, yaw_deg=90.0))}
+    scene = field_scene(ssl_field("B"), {"camera": true}, world, points=(), spacing_m=0.1)
+    observed = simulate(scene, Disturbance(0.0, 0.0), 1).observations
+    stated = replace(observed.curves, sigma_px=np.full(len(observed.curves), 0.3))
+    calibration = calibrate(replace(observed, curves=stated))
+    choice = calibration.lens_choice
+    assert calibration.converged and choice is not None and choice.groups and "nan" not in choice.words
+    places = grid_places(np.linspace(-3.0, 3.0, 7), np.linspace(-2.0, 2.0, 5))
+    seen_at = true.at(world["camera"].cam_from_world).project(np.column_stack([places, np.zeros(len(places))]))
+    known = calibration.uncertainty.located(seen_at)
+    assert np.linalg.norm(known.located - places, axis=1).max() < 1e-6 and known.radius_95_m.max() < 1e-4
+    assert any(coefficients) == choice.chosen.startswith("brown")
+
+
 def test_few_errors_that_all_share_are_no_reason_for_a_longer_lens() -> None:
     """Each group's gain is large, but only one of them has it: the difference is within its own scatter."""
     plain = np.full(12, 10.0)

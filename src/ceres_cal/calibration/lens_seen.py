@@ -66,7 +66,7 @@ class Kind(Frozen):
             return Candidate(form, self, failed=self.failed)
         lens = set(self.forms[0].names) - set(form.names)
         squares, step = self.normals.held_out({key: step for key, step in self._to_nothing.items() if key[2] in lens})
-        rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
+        rms_px = self.sigma_px * float(np.sqrt(max(squares.sum(), 0.0) / self.normals.counts.sum()))
         least = self.normals.squares_at(step)
         return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step, least)
 
@@ -279,12 +279,12 @@ class InlierRows(Frozen):
     def reached(self, candidate: Candidate) -> Estimate | None:
         """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
         points, curves = self.in_sigmas(candidate.estimate)
-        if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
+        if np.sum(points**2) + curves @ curves <= self._kept(candidate):
             return candidate.estimate
         options = candidate.form.of(self.options, max_iterations=_MOST_STEPS)
         problem = self._problem(options, candidate.estimate)
         solution = solve(problem, candidate.estimate, precision=_PRECISION)
-        return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
+        return solution.estimate if 2.0 * solution.cost <= self._kept(candidate) else None
 
     def solved_near(self, candidate: Candidate, *, as_promised: bool = False) -> Estimate:
         """Where a lens is at its best, solved for from where the normal equations have it.
@@ -302,9 +302,13 @@ class InlierRows(Frozen):
         solution = solve(problem, candidate.estimate, precision=at_best, posed=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
-        if as_promised and 2.0 * solution.cost > _KEPT * candidate.least:
+        if as_promised and 2.0 * solution.cost > self._kept(candidate):
             raise DegenerateError("is not at its best where normal equations have it")
         return solution.estimate
+
+    def _kept(self, candidate: Candidate) -> float:
+        """Squares up to which a lens is the one that was compared: exact observations leave less than noise would."""
+        return _KEPT * max(candidate.least, self.sights.equations)
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""

@@ -46,7 +46,9 @@ _TAIL = 0.02
 # Of the root of how many there are: so many outliers more or fewer, at the bound, move what is shared by no 0.05 sd.
 # None of fewer than 60 000.
 SAME = 4e-3
-_LEAST_SCALE_PX = 1e-4  # no image is measured better than that
+# Over what is stated, usually a third of a pixel: no image is measured to better than a thousandth of one. Of exact
+# observations at less all that is known beforehand drowns in rounding.
+_LEAST_SCALE = 3e-3
 _BLOCK = 1 << 16  # lengths at once: what is made of them stays where the processor is quick
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
 _NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
@@ -148,7 +150,7 @@ def median_scales(points: Array, curves: Array) -> tuple[float, float]:
 
 
 def _median_scale(lengths: Lengths, median_of_one: float) -> float:
-    return max(lengths.middle() / median_of_one, _LEAST_SCALE_PX) if lengths.count else 1.0
+    return max(lengths.middle() / median_of_one, _LEAST_SCALE) if lengths.count else 1.0
 
 
 def _middle(lengths: Array) -> float:
@@ -242,7 +244,7 @@ def _scale(sums: _Sums, spare: float, other: _Sums, other_spare: float) -> float
     """The scale of lengths that bring so many spare equations: that of the other kind counts as much as a few."""
     borrowed = min(_BORROWED, max(other_spare, 0.0))
     variance = borrowed * other[1] / max(other_spare, 1.0)
-    return max(float(np.sqrt((sums[1] + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE_PX)
+    return max(float(np.sqrt((sums[1] + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE)
 
 
 def _scale_from(usual: float, sums: _Sums, spare: float) -> float:
@@ -320,7 +322,7 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
         points, curves = (EachLength(length[own]) for length, own in zip(lengths, rows, strict=True))
         equations = 2 * points.count, curves.count
         found = noise_of(points, curves, by_count(sum(equations), unknowns), problem.options, usual)
-        ratios = np.maximum(found[:2], _LEAST_SCALE_PX) / usual
+        ratios = np.maximum(found[:2], _LEAST_SCALE) / usual
         ratio = float(np.sqrt(np.average(ratios**2, weights=equations)))
         differ |= abs(np.log(ratio)) > max(np.log(alike), by_chance / (2.0 * found.degrees_of_freedom) ** 0.5)
         noise[name] = ratio * observations.noise.get(name, 1.0)
