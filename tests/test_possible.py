@@ -24,7 +24,8 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.robust.usable import require_possible
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target, custom
+from ceres_cal.scene.lens import Brown
+from ceres_cal.scene.targets import Target, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
 NOISE = Disturbance(0.3, 0.3)
@@ -143,3 +144,15 @@ def test_under_a_floor(depth_m: float) -> None:
 def test_what_is_seen_lies_behind() -> None:
     with pytest.raises(SolutionError, match=r"^station 'a': 9 of the 9 observations it has of the world lie behind"):
         judged(square(0.0), turned_upwards(2.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(seed: int) -> None:
+    """Turned about another centre than the lens's, a strong lens fits no homography; another place was taken for it."""
+    strong = {"camera": Camera((1280, 960), 700.0, (643.0, 475.0), Brown((-0.18, 0.05, 2e-4, -3e-4, 0.0)))}
+    world = {"camera": Station("camera", overhead_pose(0.2, -0.1, 5.2, 8.0, 3.0, yaw_deg=90.0))}
+    scene = field_scene(ssl_field("B"), strong, world, points=(), spacing_m=0.1)
+    swapped = with_pixels(simulate(scene, NOISE, seed).observations, lambda pixels: pixels[:, ::-1].copy())
+    shown = swapped.curves.pixels[:, 1] < 959.0
+    text = refusal(swapped.part(np.zeros(0, bool), shown))
+    assert "mirrored" in text and "x and y are swapped" in text

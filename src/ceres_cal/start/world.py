@@ -10,7 +10,7 @@ from collections.abc import Container, Iterable, Mapping
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, distinct
-from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.observations import Prior
@@ -76,6 +76,9 @@ def placed(
     Args:
         proposed: cam_from_world (3, 4) of a homography at this log phi, where there is one.
         may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
+
+    Raises:
+        SolutionError: only a mirrored picture of the floor holds.
     """
     bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
     lines = _lines_of(sight, profile, known)
@@ -90,16 +93,31 @@ def placed(
             return _answered(lines, profile, found)
     known = replace(known, bend_sd=bend_sd if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
-    tried = [_searched(sight, one, known, given) for one in ((profile, none) if may_bend else (profile,))]
-    return _answered(*min(tried, key=lambda one: float(one[-1].costs[0])))
+    profiles = (profile, none) if may_bend else (profile,)
+
+    def best(axes: tuple[float, float]) -> tuple[Sightlines, RadialProfile, BestCameras]:
+        every = [_searched(sight, one, known, given, axes) for one in profiles]
+        return min(every, key=lambda one: float(one[-1].costs[0]))
+
+    lines, chosen, found = best((1.0, 1.0))
+    if not holds(lines, found):
+        mirrored, _, other = best((-1.0, 1.0))
+        if holds(mirrored, other) and other.costs[0] + _ALIKE < found.costs[0]:
+            raise SolutionError(
+                f"station {sight.keys[0].station!r}: what it sees of the floor is a mirrored picture: x and y are "
+                "swapped, or y points upwards, or left and right are exchanged in the labels: correct the observations"
+            )
+    return _answered(lines, chosen, found)
 
 
 def _searched(
-    sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates
+    sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates, axes: tuple[float, float]
 ) -> tuple[Sightlines, RadialProfile, BestCameras]:
+    """`axes`: which way the picture's x and y point."""
     few = 8, 4  # points, and places of each curve, for the first rounds of a search
-    lines = _lines_of(sight, profile, known)
-    return lines, profile, searched(lines, _lines_of(sight, profile, known, few), given)
+    every = (_lines_of(sight, profile, known, most) for most in (_MOST, few))
+    lines, some = (replace(one, pixels=one.pixels * axes) for one in every)
+    return lines, profile, searched(lines, some, given)
 
 
 def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> Placed:
