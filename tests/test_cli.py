@@ -647,6 +647,7 @@ def _pickled() -> bytes:
         ("bad.json", SAMPLE.read_bytes()[:5000], "not valid JSON (cut short?)"),
         ("bad.json", b"x,y\n1,2\n", "not valid JSON"),
         ("bad.json", b"", "not valid JSON"),
+        ("corners.csv", b"frame,point,x_px,y_px\n0,A,1,2\n", "`ceres-cal import` makes them of a CSV file"),
         ("bad.json", b"[1, 2]", '"format" must be'),
         ("bad.npz", _pickled(), "is missing"),
         ("bad.npz", SAMPLE.read_bytes(), "no NPZ file"),

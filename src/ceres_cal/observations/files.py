@@ -150,6 +150,10 @@ def read_content(path: Path) -> Content:
         header = decode_json(read_bytes(path / HEADER), ObservationsFile, str(path / HEADER), FORMAT, VERSION)
         return _of_columns(header, read_folder(path, _NUMBERS))
     content = read_bytes(path)
+    if path.suffix not in (".json", ".npz") and not content.lstrip().startswith(b"{"):
+        raise InputError(
+            "not observations (.json, .npz or a folder .columns): `ceres-cal import` makes them of a CSV file"
+        )
     return _from_npz(content, str(path)) if path.suffix == ".npz" else _from_json(content, str(path))
 
 
