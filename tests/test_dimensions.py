@@ -33,7 +33,7 @@ from ceres_cal.report.document import Table
 from ceres_cal.report.quality import quality_of
 from ceres_cal.report.summary import numbers_chapter
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, simulate
 
@@ -214,3 +214,13 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     quality = quality_of(Calibration.load(out), Observations.load(observed))
     tables = [piece for piece in numbers_chapter(quality, ()).pieces if isinstance(piece, Table)]
     assert "Dimensions that were solved for" in [table.caption for table in tables]
+
+
+@pytest.mark.parametrize(("aspect", "is_said"), [(1.004, False), (1.0085, True)])
+def test_pixels_as_far_from_square_as_no_known_camera_has_them_are_said(aspect: float, is_said: bool) -> None:
+    """A field that is a hundredth longer than drawn looks the same, and places are as far off without another word."""
+    camera = Camera((1280, 960), 700.0, (643.0, 475.0), Brown((-0.18, 0.05, 2e-4, -3e-4, 0.0)), aspect=aspect)
+    world = {"camera": Station("camera", overhead_pose(0.2, -0.1, 5.2, 8.0, 3.0, yaw_deg=90.0))}
+    scene = field_scene(ssl_field("B"), {"camera": camera}, world, points=(), spacing_m=0.1)
+    warnings = calibrate(simulate(scene, Disturbance(0.3, 0.3), 1).observations).warnings
+    assert any("pixels so far from square" in words for words in warnings) == is_said
