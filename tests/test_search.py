@@ -14,6 +14,8 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
 from ceres_cal.problem.parameters import Options
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
@@ -69,6 +71,8 @@ def test_seen_alike_from_two_places() -> None:
     assert re.match(
         r"station 'hall': what it shows is seen alike from \(.*\) m and from \(2\.80, 0\.50, 4\.00\)", warning
     )
+    judged = judge_quality(quality_of(calibration, three))
+    assert judged.level == "no" and "is seen alike from another place" in judged.headline
     assert off_in_sd(calibration) < 1.0  # 0.7
     assert off_in_sd(calibrate(replace(three, priors=(HEIGHT,)), KNOWN)) < 3.0  # 0.4
 

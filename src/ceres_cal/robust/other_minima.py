@@ -220,6 +220,9 @@ def minima_of(
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
 
 
+SEEN_ALIKE = "is seen alike from"
+
+
 def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[str]:
     """A warning for each station that may stand elsewhere, with the likeliest other place.
 
@@ -234,7 +237,7 @@ def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float
                 places = (", ".join(f"{value:.2f}" for value in place) for place in (here, there))
                 first, second = (f"({place}) m" for place in places)
                 yield (
-                    f"station {name!r}: what it shows is seen alike from {first} and from {second}: add a point or a "
+                    f"station {name!r}: what it shows {SEEN_ALIKE} {first} and from {second}: add a point or a "
                     "line, or the camera's height as a prior"
                 )
                 break
