@@ -21,7 +21,7 @@ from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.quality import FaultyMap, Quality
 from ceres_cal.robust.as_built import words_of
-from ceres_cal.robust.other_minima import SEEN_ALIKE
+from ceres_cal.robust.other_minima import PLACES_APART
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
@@ -149,7 +149,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     for text in calibration.warnings:
         if text not in known:
             is_harmless = text.endswith((COUNTED_ONCE, OWN_NOISE)) or RESTING in text  # in every standard deviation
-            yield "" if is_harmless else "no" if SEEN_ALIKE in text else "care", ended(text)
+            yield "" if is_harmless else "no" if PLACES_APART in text else "care", ended(text)
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
@@ -328,8 +328,8 @@ def _doubt(quality: Quality) -> str:
         return _UNJUDGED
     if disputed(quality):
         return "the observations contradict what was stated beforehand"
-    if any(SEEN_ALIKE in text for text in quality.calibration.warnings):  # 3.8 m apart once, each known to 42 mm
-        return f"what a station shows {SEEN_ALIKE} another place"
+    if any(PLACES_APART in text for text in quality.calibration.warnings):  # 3.8 m apart once, each known to 42 mm
+        return "what a station shows is seen alike from another place"
     if noise_ratio(quality) >= LARGE_NOISE:
         return f"the noise is {short(noise_ratio(quality))} times the stated sigma"
     if off := misfit_mm(quality):

@@ -27,6 +27,7 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.robust.noise import Inliers
+from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 
@@ -220,27 +221,40 @@ def minima_of(
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
 
 
-SEEN_ALIKE = "is seen alike from"
+PLACES_APART = ", where it shows other places on the floor"
 
 
 def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[str]:
-    """A warning for each station that may stand elsewhere, with the likeliest other place.
+    """A warning for each station that may stand elsewhere, with the likeliest other place; of those where it shows
+    other places on the floor, if there are any.
 
     Args:
         others, half_width: see `minima_of`.
     """
+    likely = [one.estimate for one in sorted(others, key=lambda other: other.cost) if 2.0 * one.cost < half_width**2]
     for name, station in estimate.stations.items():
-        here = station.cam_from_world.position
-        for one in sorted(others, key=lambda other: other.cost):
-            there = one.estimate.stations[name].cam_from_world.position
-            if 2.0 * one.cost < half_width**2 and np.linalg.norm(there - here) > _APART * abs(here[2]):
-                places = (", ".join(f"{value:.2f}" for value in place) for place in (here, there))
-                first, second = (f"({place}) m" for place in places)
-                yield (
-                    f"station {name!r}: what it shows {SEEN_ALIKE} {first} and from {second}: add a point or a "
-                    "line, or the camera's height as a prior"
-                )
-                break
+        here, camera = station.cam_from_world.position, estimate.camera_at(name)
+        far = _APART * abs(here[2])
+        elsewhere = [one.camera_at(name) for one in likely]
+        elsewhere = [one for one in elsewhere if np.linalg.norm(one.position - here) > far]
+        apart = [one for one in elsewhere if _floors_apart_m(camera, one) > far]
+        if elsewhere:
+            there = (apart or elsewhere)[0].position
+            first, second = (f"({', '.join(f'{value:.2f}' for value in place)}) m" for place in (here, there))
+            yield (
+                f"station {name!r}: what it shows is seen alike from {first} and from {second}"
+                f"{PLACES_APART if apart else ''}: add a point or a line, or the camera's height as a prior"
+            )
+
+
+def _floors_apart_m(camera: Camera, other: Camera) -> float:
+    """How far apart two cameras show the floor, median over the picture; along a valley of phi and height that is
+    nothing.
+    """
+    grid = np.linspace(0.1, 0.9, 5)
+    pixels = np.stack(np.meshgrid(*(grid * size for size in camera.image_size)), axis=-1).reshape(-1, 2)
+    apart = np.linalg.norm(camera.locate(pixels) - other.locate(pixels), axis=1)
+    return median(apart[np.isfinite(apart)]) if np.isfinite(apart).any() else np.inf
 
 
 @or_none  # quiet: nothing is seen from there, so no minimum is
