@@ -22,6 +22,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
+from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
@@ -124,6 +125,15 @@ def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own
 
 def test_cameras_of_alike_noise_have_one() -> None:
     assert calibrate(noisy(0, (0.2, 0.2, 0.2, 0.2))).fit.of_cameras == {}
+
+
+def test_a_camera_of_which_nothing_is_judged_has_no_noise_of_its_own() -> None:
+    observations, calibration = noisy(0), calibrated_together(0)
+    judged = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
+    views = np.concatenate([observations.points.view, observations.curves.view])
+    judged[[observations.views[view].camera == "c0" for view in views.tolist()]] = False
+    noise = noise_of_cameras(calibration.problem(observations), calibration.estimate, judged)
+    assert noise.get("c0", 1.0) in (1.0, calibration.fit.of_cameras["c0"])
 
 
 def test_what_is_stated_as_it_is_stays_so() -> None:

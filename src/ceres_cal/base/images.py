@@ -57,11 +57,11 @@ def each_camera(given: Sequence[str]) -> list[Path]:
     videos; nothing where all is of one.
     """
     alone = [Path(name) for name in given if len(given) == 1 and Path(name).is_dir()]
-    videos = [path for folder in alone for path in _inside(folder)]
-    if any(path.suffix.lower() in IMAGE_ENDINGS for path in videos):
+    files = [path for folder in alone for path in _inside(folder)]
+    if any(path.suffix.lower() in IMAGE_ENDINGS for path in files):
         return []
     folders = [path for folder in alone for path in folder.iterdir() if path.is_dir() and _inside(path)]
-    return sorted([*folders, *videos]) if folders or len(videos) > 1 else []
+    return sorted([*folders, *files]) if folders or len(files) > 1 else []
 
 
 def images_and_videos(given: Images) -> tuple[list[Path], list[Path]]:

@@ -252,6 +252,11 @@ Displaces = Callable[[Case, str, Array], Array | None]
 """A displacement by case, camera and pixels, see `Effect`."""
 
 
+def of_any_size(case: Case, camera: str) -> float:
+    """What is usual of amounts of which nothing is."""
+    return np.inf
+
+
 class Effect(Frozen):
     """A row of the table of effects: what may displace the observations besides the free numbers.
 
@@ -279,7 +284,7 @@ class Effect(Frozen):
     prior: SizePrior | None = None
     reach: Callable[[EffectColumns, int, Case], float] = lambda columns, number, case: 1.0
     concerns: Callable[[Observations], bool] = lambda observations: True
-    usual: Callable[[Case, str], float] = lambda case, camera: np.inf
+    usual: Callable[[Case, str], float] = of_any_size
     together: Callable[[Sequence[Finding]], Iterable[Finding]] = tuple
 
     def columns(self, case: Case) -> Iterator[EffectColumns]:
@@ -343,7 +348,7 @@ def camera_effect(
     kind: str,
     displacement: Displaces,
     words: Callable[[Evidence], Words],
-    usual: Callable[[Case, str], float] = lambda case, camera: np.inf,
+    usual: Callable[[Case, str], float] = of_any_size,
 ) -> Effect:
     """What a camera does to its picture besides."""
     over = partial(_over_cameras, displacement)

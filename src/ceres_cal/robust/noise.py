@@ -321,6 +321,8 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
         rows = [own & (owners == name)[column.view] for own, column in zip(kinds, columns, strict=True)]
         points, curves = (EachLength(length[own]) for length, own in zip(lengths, rows, strict=True))
         equations = 2 * points.count, curves.count
+        if not any(equations):  # all of it is something else, or cannot be shown
+            continue
         found = noise_of(points, curves, by_count(sum(equations), unknowns), problem.options, usual)
         ratios = np.maximum(found[:2], _LEAST_SCALE) / usual
         ratio = float(np.sqrt(np.average(ratios**2, weights=equations)))
