@@ -136,6 +136,16 @@ LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
 ROUNDING = 1e-9  # of a cost
 
 
+# ---- lenses ---------------------------------------------------------------------------------------------------------
+
+
+def lens_images(optics: Optics, rays: Array, images: Array) -> None:
+    """Offsets of rays (N, 3) from the principal point on square pixels, px, and their derivatives by the ray's x, y and
+    z, to `images` (2, 4, N): also where the map has folded, and there is no answer.
+    """
+    core().lens_images(optics, rays, images)
+
+
 # ---- the start ------------------------------------------------------------------------------------------------------
 
 

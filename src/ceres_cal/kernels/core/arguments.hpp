@@ -1,4 +1,4 @@
-// What Python hands over, checked, as the kernels take it: see arguments.py.
+// What Python hands over, checked, as the kernels take it: see `kernels/__init__.py`.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -1,4 +1,4 @@
-// Brown's lens as in OpenCV: see brown.py. Form: the places of k4 and s1 among the intrinsics, 0 for none.
+// Brown's lens as in OpenCV: see opencv.py. Form: the places of k4 and s1 among the intrinsics, 0 for none.
 #pragma once
 
 #include <algorithm>

@@ -10,7 +10,7 @@
 
 namespace ceres_cal {
 
-// Placements at their best for given shared numbers: see `Sweep` in arguments.py.
+// Placements at their best for given shared numbers: see `Sweep` in `kernels/__init__.py`.
 struct Sweep {
     double *poses, *gains, *costs, *reduced;
 };

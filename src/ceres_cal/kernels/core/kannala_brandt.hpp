@@ -1,4 +1,4 @@
-// Kannala and Brandt's lens: see kannala_brandt.py. Form: the place of p1 among the intrinsics, 0 for none.
+// Kannala and Brandt's lens: see opencv.py. Form: the place of p1 among the intrinsics, 0 for none.
 #pragma once
 
 #include <cmath>

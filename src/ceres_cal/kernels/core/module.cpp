@@ -1,4 +1,4 @@
-// The module: Python's doors to the kernels. calls.py says what each does, and arguments.py what it takes.
+// The module: Python's doors to the kernels. `kernels/__init__.py` says what each does and takes.
 #if defined(_MSC_VER)
 #define NOMINMAX
 #include <windows.h>
@@ -21,6 +21,28 @@ template <class Work>
 auto unlocked(Work work) {
     const nb::gil_scoped_release release;
     return work();
+}
+
+void lens_images(Tuple optics, const Read<N, 3>& rays, const Filled<2, 4, N>& images) {
+    const int64_t count = static_cast<int64_t>(rays.shape(0));
+    require(images.shape(2) == rays.shape(0), "images are of as many rays");
+    const OpticsGiven given(optics);
+    const std::unique_ptr<Lens> made = given.make();
+    unlocked([&] {
+        Rays chunk;
+        Image seen;
+        const Lane* own[8] = {&seen.x, &seen.xx, &seen.xy, &seen.xz, &seen.y, &seen.yx, &seen.yy, &seen.yz};
+        for (int64_t first = 0; first < count; first += CHUNK) {
+            const int n = static_cast<int>(std::min<int64_t>(CHUNK, count - first));
+            const int filled = (n + LANES - 1) / LANES * LANES;
+            for (int i = 0; i < filled; ++i) {
+                const double* ray = row(rays, first + std::min(i, n - 1));
+                chunk.x[i] = ray[0], chunk.y[i] = ray[1], chunk.z[i] = ray[2];
+            }
+            made->project(filled, chunk, seen);
+            for (int k = 0; k < 8; ++k) std::copy_n(own[k]->value, n, images.data() + k * count + first);
+        }
+    });
 }
 
 void plane_homographies(const Bounds& bounds, const Read<N, 2>& plane, const Read<N, 2>& offsets,
@@ -229,6 +251,7 @@ bool has_avx2() {
 
 NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("has_avx2", &has_avx2);
+    m.def("lens_images", &lens_images);
     m.def("plane_homographies", &plane_homographies);
     m.def("radial_alignment", &radial_alignment);
     m.def("cholesky", &factor);

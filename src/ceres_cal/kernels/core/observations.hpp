@@ -1,4 +1,4 @@
-// What the kernels are handed, as plain pointers: see arguments.py, which says what each is.
+// What the kernels are handed, as plain pointers: see `kernels/__init__.py`, which says what each is.
 #pragma once
 
 #include <cmath>

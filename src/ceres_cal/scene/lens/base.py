@@ -5,8 +5,8 @@ the camera frame (x right, y down, z forward; any length), offsets are (N, 2) me
 on a sensor with square pixels, and phi is the focal length in pixels. Where a model has no answer (behind the camera,
 past its monotone radius) the array functions return NaN.
 
-The package's own models have their map twice: in arrays, as one reads it, and in C++ with derivatives, for the solve
-(`kernels/core`). The solve asks any other model's arrays.
+The package's own models have their map in C++ with derivatives (`kernels/core`), for the solve and for arrays; the
+paper's stands in arrays, too, as one reads it. The solve asks any other model's arrays.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.scene.lens.base import LinearEquations, ahead, unit_rays
+from ceres_cal.scene.lens.base import LinearEquations, ahead
 from ceres_cal.scene.lens.planar import Decentred
 
 _ORDERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 7, "s1": 2, "s2": 4, "s3": 2, "s4": 4}
@@ -25,6 +25,7 @@ class Brown(Decentred):
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "brown"
+    formulas: ClassVar[str] = "brown"
     acts_on_tangents: ClassVar[bool] = True
     decentring: ClassVar[tuple[str, ...]] = ("p1", "p2")
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType(
@@ -47,7 +48,11 @@ class Brown(Decentred):
 
     @staticmethod
     def _lifted(flat: Array) -> Array:
-        return unit_rays(flat, 1.0)
+        return np.column_stack([flat, np.ones(len(flat))])
+
+    @staticmethod
+    def _slopes(flat: Array) -> Array:
+        return np.eye(3, 2)[:, :, None]
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         u = ideal / phi
@@ -72,6 +77,7 @@ class KannalaBrandt(Decentred):
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "kannala-brandt"
+    formulas: ClassVar[str] = "kannala-brandt"
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"tangential": ("p1", "p2")})
     above: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
     _end: ClassVar[float] = np.pi
@@ -97,6 +103,15 @@ class KannalaBrandt(Decentred):
         angle = np.hypot(flat[:, 0], flat[:, 1])
         across = np.where(angle > 0.0, np.sin(angle) / angle, 1.0)
         return np.column_stack([flat * across[:, None], np.cos(angle)])
+
+    @staticmethod
+    def _slopes(flat: Array) -> Array:
+        x, y = flat.T
+        angle = np.maximum(np.hypot(x, y), 1e-9)
+        across = np.sin(angle) / angle
+        bend = (np.cos(angle) - across) / angle**2
+        both = bend * x * y
+        return np.array([[across + bend * x * x, both], [both, across + bend * y * y], [-across * x, -across * y]])
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         columns = {name: angle**power for name, power in zip(self.above, self.orders, strict=False)}

@@ -15,7 +15,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.scene.lens.base import Lens
+from ceres_cal.kernels import Optics, lens_images
+from ceres_cal.scene.lens.base import Lens, unit_rays
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
 
@@ -149,7 +150,12 @@ def dense_polynomial(values: Sequence[float], powers: Sequence[int]) -> Array:
 
 
 class Planar(Lens):
-    """A lens by its map of a plane, in units of its own."""
+    """A lens by its map of a plane, in units of its own. The map is compiled (`kernels/core`), with its derivatives:
+    here are its limit, and its inverse.
+    """
+
+    formulas: ClassVar[str]
+    """The kind whose compiled map it is."""
 
     def _unit(self, phi: float) -> float:
         """How many pixels a unit of the plane is."""
@@ -163,15 +169,12 @@ class Planar(Lens):
     @staticmethod
     @abstractmethod
     def _lifted(flat: Array) -> Array:
-        """Points (N, 2) of the plane at focal length 1 -> rays (N, 3) of unit length."""
+        """Points (N, 2) of the plane at focal length 1 -> rays (N, 3)."""
 
+    @staticmethod
     @abstractmethod
-    def _map(self, flat: Array) -> Array:
-        """Where points (N, 2) are measured, (N, 2)."""
-
-    @abstractmethod
-    def _jacobian(self, flat: Array) -> tuple[Array, Array, Array, Array]:
-        """Derivatives xx, xy, yx and yy of `_map`."""
+    def _slopes(flat: Array) -> Array:
+        """(3, 2, N) derivatives of `_lifted` by the points' x and y, or (3, 2, 1) of all."""
 
     @property
     @abstractmethod
@@ -199,9 +202,18 @@ class Planar(Lens):
         """Points (N, 2), NaN past the limit."""
         return np.where(np.hypot(flat[:, :1], flat[:, 1:]) <= self._limit, flat, np.nan)
 
+    def _images(self, rays: Array, phi: float) -> Array:
+        """(2, 4, N) where rays (N, 3) are measured, px, and the derivatives of that by the ray's x, y and z; also past
+        the limit, where the map has folded.
+        """
+        intrinsics = np.array([phi, 1.0, 0.0, 0.0, *self.values, 0.0])
+        images = np.empty((2, 4, len(rays)))
+        lens_images(Optics(self, self.formulas, self.form, intrinsics, 1.0), rays, images)
+        return images
+
     def _distort(self, rays: Array, phi: float) -> Array:
-        unit = self._unit(phi)
-        return np.asarray(unit * self._map(self._within(self._flat(rays) * (phi / unit))))
+        inside = self._within(self._flat(rays) * (phi / self._unit(phi)))
+        return np.where(np.isnan(inside), np.nan, self._images(rays, phi)[:, 0].T)
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
         unit = self._unit(phi)
@@ -214,30 +226,35 @@ class Planar(Lens):
         flat = measured * np.where(radius > 0.0, start / radius, 1.0)[:, None]
         if not self._is_round:
             flat = self._within(self._newton(flat, measured))
-        return self._lifted(flat * (unit / phi))
+        rays = self._lifted(flat * (unit / phi))
+        return unit_rays(rays[:, :2], rays[:, 2])
 
     def unlimited(self, rays: Array) -> Array:
         """Where rays (N, 3) are measured, (N, 2) at focal length 1, also past the limit, where the map has folded."""
-        return self._map(self._flat(rays))
+        return np.where(np.isnan(self._flat(rays)), np.nan, self._images(rays, 1.0)[:, 0].T)
+
+    def mapped(self, flat: Array) -> Array:
+        """(2, 3, N) where points (N, 2) are measured, and the derivatives of that by their x and y."""
+        unit = self._unit(1.0)
+        images = self._images(self._lifted(flat), unit) / unit
+        return np.concatenate([images[:, :1], np.sum(images[:, 1:, None] * self._slopes(flat), axis=1)], axis=1)
 
     def _newton(self, start: Array, measured: Array) -> Array:
         """Points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
         longest = 0.1  # step of Newton's method, of the limit
         flat, rows = start.copy(), np.arange(len(start))
         for _ in range(STEPS):
-            here = flat[rows]
-            error = self._map(here) - measured[rows]
-            xx, xy, yx, yy = self._jacobian(here)
-            step = np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - yx * error[:, 0]])
-            step /= (xx * yy - xy * yx)[:, None]
+            (x, xx, xy), (y, yx, yy) = self.mapped(flat[rows])
+            x, y = x - measured[rows, 0], y - measured[rows, 1]
+            step = np.column_stack([yy * x - xy * y, xx * y - yx * x]) / (xx * yy - xy * yx)[:, None]
             # At the limit the map hardly grows, and a whole step would end behind others that lead past it.
             length = np.linalg.norm(step, axis=1)
             step *= np.minimum(1.0, longest * self._limit / np.maximum(length, 1e-300))[:, None]
-            flat[rows] = here - step
+            flat[rows] -= step
             rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
             if not len(rows):
                 break
-        error = np.max(np.abs(self._map(flat) - measured), axis=1)
+        error = np.max(np.abs(self.mapped(flat)[:, 0].T - measured), axis=1)
         solved = error <= 1e-12 * (1.0 + np.max(np.abs(measured), axis=1))
         return np.where(solved[:, None], flat, np.nan)
 
@@ -259,12 +276,6 @@ class Decentred(Planar):
         return np.array([known.get(name, 0.0) for name in names])
 
     @cached_property
-    def _radial(self) -> Ratio:
-        """Measured over ideal radius, of the squared ideal one."""
-        above, below = np.append(1.0, self._named(self.above)), np.append(1.0, self._named(self.below))
-        return Ratio(above, below if np.any(below[1:]) else None)
-
-    @cached_property
     def _across(self) -> Array:
         """p1 p2 s1 s2 s3 s4."""
         return self._named(("p1", "p2", "s1", "s2", "s3", "s4"))
@@ -277,34 +288,11 @@ class Decentred(Planar):
     def _profile(self) -> Ratio:
         # In the worst direction decentring takes 3 |p| r^2 off the radius, and a thin prism |s| r^2 and |s'| r^4.
         p1, p2, s1, s2, s3, s4 = self._across
-        above = np.kron(self._radial.above, (0.0, 1.0))
-        below: Array | None = None
-        if self._radial.below is not None:
-            below = np.asarray(np.kron(self._radial.below, (1.0, 0.0))[:-1], dtype=float)
+        above = np.kron(np.append(1.0, self._named(self.above)), (0.0, 1.0))
         worst = np.array([0.0, 0.0, 3.0 * np.hypot(p1, p2) + np.hypot(s1, s3), 0.0, np.hypot(s2, s4)])
-        return Ratio(less(above, worst if below is None else np.convolve(worst, below)), below, self._end)
+        if not np.any(self._named(self.below)):
+            return Ratio(less(above, worst), None, self._end)
+        below = np.asarray(np.kron(np.append(1.0, self._named(self.below)), (1.0, 0.0))[:-1], dtype=float)
+        return Ratio(less(above, np.convolve(worst, below)), below, self._end)
 
     _end: ClassVar[float] = np.inf
-
-    def _map(self, flat: Array) -> Array:
-        x, y = flat[:, 0], flat[:, 1]
-        r2 = x * x + y * y
-        radial = self._radial.value(r2)
-        p1, p2, s1, s2, s3, s4 = self._across
-        return np.column_stack(
-            [
-                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2),
-                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + r2 * s4),
-            ]
-        )
-
-    def _jacobian(self, flat: Array) -> tuple[Array, Array, Array, Array]:
-        x, y = flat[:, 0], flat[:, 1]
-        r2 = x * x + y * y
-        radial, slope = self._radial.value(r2), 2.0 * self._radial.slope(r2)
-        p1, p2, s1, s2, s3, s4 = self._across
-        first, second = 2.0 * (s1 + 2.0 * r2 * s2), 2.0 * (s3 + 2.0 * r2 * s4)
-        both = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x + first * x
-        yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x + second * y
-        return xx, both + first * y, both + second * x, yy

@@ -5,26 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from msgspec import Struct
 
-from ceres_cal.base.arrays import AnyArray, Array, Mask
+from ceres_cal.base.arrays import Array, Mask, grid_places, rms
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 
-if TYPE_CHECKING:
-    from ceres_cal.scene.lens.surface import Surface
-
-COLUMNS, ROWS = 16, 12  # of a surface's nodes
+_GRID = COLUMNS, ROWS = 16, 12  # of a surface's nodes
 EXTENTS = ("wide", "high")
 NODES = tuple(f"{axis}{i:02d}{j:02d}" for i in range(COLUMNS) for j in range(ROWS) for axis in "xy")
 """Names of the coefficients: axis, column, row."""
-_TINY = 1e-150
 _TURNS = 48  # directions, between which nothing turns
 # Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
 # ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
@@ -32,43 +28,30 @@ _LOOSE, _LOOSE_ACROSS, _LEAST, _LEAST_ACROSS = 1000.0, 1e-2, 0.1, 3e-3
 _BEYOND = 1.15  # of the picture, how far a surface goes: places move by less than that
 
 
-class _Monomial(Struct, frozen=True):
-    """weight c q^m conj(q)^n of the complex place q, or conj(c) for c; c has its real part at `name`."""
-
-    names: tuple[str, str]
-    turned: bool
-    m: int
-    n: int
-    weight: float
-
-
 @cache
-def _monomials(powers: tuple[int, ...]) -> tuple[_Monomial, ...]:
-    """What displaces by these powers of the radius, but for what the profile and the camera do.
+def _monomials(power: int) -> Mapping[tuple[str, str], tuple[int, int]]:
+    """What displaces by a power of the radius, but for what the profile and the camera do, and Conrady's decentring:
+    m and n of each c q^m conj(q)^n of the complex place q, by the names of the real and the imaginary part of c.
 
     Of power 2 there are 3 complex terms. Where nothing else bends, q^2 + q conj(q) is what a turn of the camera does
     beside a shift of its principal point: it is left out, and Brown's decentring 2 q conj(q) c + q^2 conj(c) stays,
     with Conrady's further terms, |q|^2 and |q|^4 times as large. Of odd powers q |q|^2k is along the radius, or a
     twist, which no lens has.
     """
-    conrady = 3  # terms of the decentring
-    every = []
-    for power in powers:
-        for k in range(conrady if power == 2 else 0):
-            names = (f"p{2 * k + 2}", f"p{2 * k + 1}")
-            every.append(_Monomial(names, False, k + 1, k + 1, 2.0 / 3.0))
-            every.append(_Monomial(names, True, k + 2, k, 1.0 / 3.0))
-        for m in range(power, -1, -1):
-            n = power - m
-            if m - n != 1 and (power, n) not in ((2, 0), (2, 1)):
-                every.append(_Monomial((f"c{m}{n}", f"d{m}{n}"), False, m, n, 1.0))
-    return tuple(every)
+    orders = ((power - n, n) for n in range(power + 1))
+    kept = ((m, n) for m, n in orders if m - n != 1 and (power, n) not in ((2, 0), (2, 1)))
+    return {(f"c{m}{n}", f"d{m}{n}"): (m, n) for m, n in kept}
+
+
+@cache
+def _names_across(power: int) -> tuple[str, ...]:
+    conrady = ("p2", "p1", "p4", "p3", "p6", "p5") if power == 2 else ()
+    return (*conrady, *chain.from_iterable(_monomials(power)))
 
 
 @cache
 def _names(powers: tuple[int, ...]) -> tuple[str, ...]:
-    across = dict.fromkeys(name for one in _monomials(powers) for name in one.names)
-    return ("rim", *(f"g{k}" for k in range(1, COUNT + 1)), *across)
+    return ("rim", *(f"g{k}" for k in range(1, COUNT + 1)), *chain.from_iterable(map(_names_across, powers)))
 
 
 def _shorter(places: Array, ends: Array) -> Mask:
@@ -144,35 +127,21 @@ def bending() -> Array:
 
 
 class Growth(Frozen):
-    """The profile u + G(u) in rims."""
+    """The profile u + G(u) in rims, of a lens that displaces by nothing else."""
 
-    along: Array
+    lens: Spline
 
-    @cached_property
-    def _polynomials(self) -> Array:
-        """(degree + 1, intervals) of G, lowest power first."""
-        every = np.concatenate([np.zeros(2), self.along])
-        own = np.lib.stride_tricks.sliding_window_view(every, DEGREE + 1)
-        return np.asarray(np.einsum("ja,jad->dj", own, pieces()))
-
-    def bent(self, u: Array) -> tuple[Array, Array]:
-        """G and its slope at u, straight on beyond the last knot."""
-        inside = np.minimum(u, 1.0) * INTERVALS
-        j = np.minimum(np.nan_to_num(inside).astype(int), INTERVALS - 1)
-        t, value, slope = inside - j, self._polynomials[DEGREE][j], np.zeros(np.shape(u))
-        for polynomial in self._polynomials[DEGREE - 1 :: -1]:
-            slope = slope * t + value
-            value = value * t + polynomial[j]
-        slope *= INTERVALS
-        return value + slope * np.maximum(u - 1.0, 0.0), slope
+    def _at(self, x: Array, number: int) -> Array:
+        places = np.column_stack([x.ravel(), np.zeros(x.size)])
+        return np.asarray(self.lens.mapped(places)[0, number].reshape(x.shape))
 
     def value(self, x: Array) -> Array:
         """At x (N,) or one."""
-        return np.asarray(x + self.bent(x)[0])
+        return self._at(x, 0)
 
     def slope(self, x: Array) -> Array:
         """Its derivative at x (N,)."""
-        return np.asarray(1.0 + self.bent(x)[1])
+        return self._at(x, 1)
 
     @cached_property
     def limit(self) -> float:
@@ -214,6 +183,7 @@ class Spline(Planar):
     powers: tuple[int, ...] = (2, 3)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "spline"
+    formulas: ClassVar[str] = "spline"
     acts_on_pixels: ClassVar[bool] = True
     trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3),)
     missing_powers: ClassVar[tuple[int, ...]] = ()
@@ -250,9 +220,12 @@ class Spline(Planar):
     @property
     def note(self) -> str:
         said = "g1, g2, ... are displacements (px) along the radius from the axis to rim, the others across it at rim"
-        if self._surface is None:
+        if not self.terms:
             return said
-        size_px = self._rim_px * self._surface.size(1.0 / _BEYOND)
+        x, y = (side / _BEYOND * np.linspace(-1.0, 1.0, 4 * n) for side, n in zip(self._extents, _GRID, strict=True))
+        plain = Spline(self.values[: len(_names(self.powers))], self.powers)
+        with_it, without = (lens.mapped(grid_places(x, y))[:, 0] for lens in (self, plain))
+        size_px = self._rim_px * rms(np.linalg.norm(with_it - without, axis=0))
         return (
             f"{said}; a surface of {len(NODES) // 2} nodes displaces by {size_px:.2g} px besides (rms over the picture)"
         )
@@ -290,17 +263,17 @@ class Spline(Planar):
         along = Roughness(names[1 : 1 + COUNT], bending(), _LOOSE * rim, _LEAST * rim)
         across = []
         for power in self.powers:
-            own = tuple(dict.fromkeys(n for one in _monomials((power,)) for n in one.names))
+            own = _names_across(power)
             least = _LEAST_ACROSS * rim / 2.0 ** (power - 2)
             across.append(Roughness(own, np.eye(len(own)), _LOOSE_ACROSS * rim, least))
-        if self._surface is not None:
+        if self.terms:
             from ceres_cal.scene.lens.surface import roughness
 
-            matrix = roughness(*self._surface.extents.tolist(), COLUMNS, ROWS)
+            matrix = roughness(*self._extents, COLUMNS, ROWS)
             across.append(Roughness(NODES, matrix, loose_surface * rim, least_surface * rim))
         return (along, *across)
 
-    # ---- in arrays ---------------------------------------------------------------------------------------------------
+    # ---- its plane ---------------------------------------------------------------------------------------------------
 
     @property
     def _rim_px(self) -> float:
@@ -318,38 +291,27 @@ class Spline(Planar):
     @staticmethod
     def _lifted(flat: Array) -> Array:
         quarter = 0.25 * np.sum(flat * flat, axis=1)
-        return np.asarray(np.column_stack([flat, 1.0 - quarter]) / (1.0 + quarter)[:, None])
+        return np.column_stack([flat, 1.0 - quarter])
+
+    @staticmethod
+    def _slopes(flat: Array) -> Array:
+        x, y = flat.T
+        one, none = np.ones_like(x), np.zeros_like(x)
+        return np.array([[one, none], [none, one], [-0.5 * x, -0.5 * y]])
 
     @property
-    def _along(self) -> Array:
-        """The profile's coefficients in rims."""
-        return np.array(self.values[1 : 1 + COUNT]) / self._rim_px
+    def _extents(self) -> tuple[float, ...]:
+        """Half sides of the surface, in rims; 1 where they are not set yet."""
+        return tuple(self.coefficients[name] or 1.0 for name in EXTENTS)
 
     @cached_property
-    def _across(self) -> list[tuple[_Monomial, complex]]:
-        named = self.coefficients
-        both = [(one, complex(named[one.names[0]], named[one.names[1]])) for one in _monomials(self.powers)]
-        rim = self._rim_px
-        return [(one, (c.conjugate() if one.turned else c) * one.weight / rim) for one, c in both if c != 0.0]
-
-    @cached_property
-    def _surface(self) -> Surface | None:
-        if not self.terms:
-            return None
-        from ceres_cal.scene.lens.surface import Surface
-
-        named = self.coefficients
-        wide, high, *heights = (named[name] for name in (*EXTENTS, *NODES))
-        extents = np.where(np.array([wide, high]) > 0.0, [wide, high], 1.0)
-        return Surface(extents, np.reshape(heights, (COLUMNS, ROWS, 2)) / self._rim_px)
-
-    @property
     def _is_round(self) -> bool:
-        return not self._across and (self._surface is None or not np.any(self._surface.heights))
+        own = {*_names(()), *EXTENTS}
+        return not any(value for name, value in self.coefficients.items() if name not in own)
 
     @cached_property
     def _profile(self) -> Growth:
-        return Growth(self._along)
+        return Growth(self if self._is_round else Spline(self.values[: 1 + COUNT], ()))
 
     @property
     def _directions(self) -> Array:
@@ -364,7 +326,7 @@ class Spline(Planar):
     @cached_property
     def _rims(self) -> Array:
         """(T,) where the map ends in each direction."""
-        return np.asarray(np.linalg.norm(self._map(self._limits[:, None] * self._directions), axis=1))
+        return np.asarray(np.linalg.norm(self.mapped(self._limits[:, None] * self._directions)[:, 0], axis=0))
 
     @property
     def _limit(self) -> float:
@@ -376,7 +338,7 @@ class Spline(Planar):
 
     def _least_growth(self, u: Array) -> Array:
         """(N, T) least eigenvalue of the symmetric part of the map's derivative at radii (N, T)."""
-        xx, xy, yx, yy = self._jacobian((u[:, :, None] * self._directions).reshape(-1, 2))
+        (_, xx, xy), (_, yx, yy) = self.mapped((u[:, :, None] * self._directions).reshape(-1, 2))
         least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), 0.5 * (xy + yx))
         return np.asarray(least.reshape(u.shape))
 
@@ -386,44 +348,6 @@ class Spline(Planar):
     def shows(self, offsets: Array, phi: float) -> Mask:
         return _shorter(offsets, self._unit(phi) * self._rims)
 
-    def _map(self, flat: Array) -> Array:
-        u = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), _TINY)
-        outward = 1.0 + self._profile.bent(u)[0] / u
-        answer = flat * outward[:, None]
-        q, conjugate = self._raised(flat[:, 0] + 1j * flat[:, 1])
-        for one, c in self._across:
-            z = c * q[one.m] * conjugate[one.n]
-            answer += np.column_stack([z.real, z.imag])
-        return answer if self._surface is None else answer + self._surface.at(flat)[0]
-
-    def _raised(self, q: AnyArray) -> tuple[list[AnyArray], list[AnyArray]]:
-        """Powers of complex places (N,) and of their conjugates, from 0 as far as displacements across have them."""
-        powers = [np.ones_like(q)]
-        for _ in range(max((max(one.m, one.n) for one, _ in self._across), default=0)):
-            powers.append(powers[-1] * q)
-        return powers, [np.conj(one) for one in powers]
-
-    def _jacobian(self, flat: Array) -> tuple[Array, Array, Array, Array]:
-        x, y = flat[:, 0], flat[:, 1]
-        u = np.maximum(np.hypot(x, y), _TINY)
-        value, slope = self._profile.bent(u)
-        stretch = value / u
-        bend = (slope - stretch) / (u * u)
-        q, conjugate = self._raised(x + 1j * y)
-        first, second = np.zeros_like(q[0]), np.zeros_like(q[0])  # derivatives by q and by its conjugate
-        for one, c in self._across:
-            if one.m:
-                first += c * one.m * q[one.m - 1] * conjugate[one.n]
-            if one.n:
-                second += c * one.n * q[one.m] * conjugate[one.n - 1]
-        both, other = first + second, first - second
-        xx, yy = 1.0 + stretch + bend * x * x + both.real, 1.0 + stretch + bend * y * y + other.real
-        xy, yx = bend * x * y - other.imag, bend * x * y + both.imag
-        if self._surface is None:
-            return xx, xy, yx, yy
-        more = self._surface.at(flat)[1]
-        return xx + more[:, 0, 0], xy + more[:, 0, 1], yx + more[:, 1, 0], yy + more[:, 1, 1]
-
     # ---- for the solve -----------------------------------------------------------------------------------------------
 
     @property
@@ -432,11 +356,8 @@ class Spline(Planar):
         each interval, by power; of each monomial the place of its coefficient, m and n.
         """
         names = self.names
-        rows = [
-            (4.0 + names.index(one.names[0]), float(one.m), float(one.n))
-            for one in _monomials(self.powers)
-            if not one.names[0].startswith("p")
-        ]
+        every = chain.from_iterable(_monomials(power).items() for power in self.powers)
+        rows = [(4.0 + names.index(real), *map(float, orders)) for (real, _), orders in every]
         conrady = 4.0 + names.index("p2") if 2 in self.powers else 0.0
         surface = 4.0 + names.index(EXTENTS[0]) if self.terms else 0.0
         return np.concatenate([[conrady, surface], np.swapaxes(pieces(), 1, 2).ravel(), np.array(rows).ravel()])

@@ -11,56 +11,13 @@ from __future__ import annotations
 from functools import cache, lru_cache
 
 import numpy as np
-from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, grid_places, median, rms
+from ceres_cal.base.arrays import Array, median
 
 _SPLINES = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 # Powers of the place that other terms of the lens and the camera displace by are none of the surface's: it has a
 # thousandth of its size in them.
 _DEGREE, _WITHOUT = 3, 1e-3
-
-
-class Surface(Struct, frozen=True, eq=False):
-    """Displacements of the places of a plane.
-
-    Attributes:
-        extents: (2,) half its width and height. heights: (columns, rows, 2), the displacement of each node.
-    """
-
-    extents: Array
-    heights: Array
-
-    def at(self, flat: Array) -> tuple[Array, Array]:
-        """Displacements (N, 2) at places (N, 2), and their derivatives (N, 2, 2): the same beyond the grid's edge."""
-        (column, x, dx), (row, y, dy) = (_cells(flat[:, k] / self.extents[k], self.heights.shape[k]) for k in (0, 1))
-        answer, slopes = np.zeros((len(flat), 2)), np.zeros((len(flat), 2, 2))
-        for i in range(4):  # of arrays of all sixteen nodes most of the time would be spent on memory
-            down, slope_down = np.zeros((2, len(flat), 2))
-            for j in range(4):
-                node = self.heights[column + i, row + j]
-                down += y[:, j, None] * node
-                slope_down += dy[:, j, None] * node
-            answer += x[:, i, None] * down
-            slopes[:, :, 0] += dx[:, i, None] * down
-            slopes[:, :, 1] += x[:, i, None] * slope_down
-        return answer, slopes / self.extents
-
-    def size(self, part: float) -> float:
-        """Root mean square of the displacements over such a part of its sides."""
-        x, y = (part * np.linspace(-1.0, 1.0, 4 * count) for count in self.heights.shape[:2])
-        places = grid_places(x, y) * self.extents
-        return rms(np.linalg.norm(self.at(places)[0], axis=1))
-
-
-def _cells(place: Array, count: int) -> tuple[Array, Array, Array]:
-    """Of places from -1 to 1: the first of the four nodes, their weights (N, 4) and the slopes of these."""
-    place = np.nan_to_num(place)
-    inside, cells = np.clip(place, -1.0, 1.0), 0.5 * (count - 3)
-    first = np.minimum(((inside + 1.0) * cells).astype(int), count - 4)
-    t = ((inside + 1.0) * cells - first)[:, None]
-    slopes = np.hstack([t**0, 2.0 * t, 3.0 * t * t]) @ _SPLINES[:, 1:].T
-    return first, np.hstack([t**0, t, t * t, t**3]) @ _SPLINES.T, slopes * (cells * (inside == place))[:, None]
 
 
 @cache
