@@ -98,6 +98,11 @@ def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
     return np.array([order[name] for name in names], dtype=np.int64)
 
 
+def evenly(count: int, most: int) -> Indices:
+    """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
+    return np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64)
+
+
 @contextmanager
 def numerical(step: str) -> Iterator[None]:
     """While it lasts, and as a decorator: what fails on its numbers is a SolutionError that names the step.

@@ -253,6 +253,12 @@ def check_header(data: Any, where: str, format_name: str, version: int) -> dict[
     return dict(data)
 
 
+def body_of(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
+    """The data without their header, which is checked."""
+    checked = check_header(data, where, format_name, version)
+    return {name: value for name, value in checked.items() if name not in ("format", "version")}
+
+
 def _clipped(value: Any) -> str:
     return f"{value!r:.100}"
 

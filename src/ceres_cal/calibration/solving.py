@@ -144,16 +144,13 @@ class Explained(Frozen):
         return replace(self, problem=problem, end=replace(conflicts.answer, residuals=shown), others=())
 
 
-def solved_from(task: Task, start: Start, problem: Problem, built: Built = AS_DRAWN) -> Calibration:
+def solved_from(task: Task, start: Start, problem: Problem) -> Calibration:
     """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.
-
-    Args:
-        built: how targets seemed to be built before.
 
     Raises:
         CalibrationError: see `calibrate`.
     """
-    return known_of(explained(task, start, problem, built))
+    return known_of(explained(task, start, problem, AS_DRAWN))
 
 
 def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:

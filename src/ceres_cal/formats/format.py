@@ -11,7 +11,7 @@ from msgspec import Struct
 from ceres_cal import scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, write_bytes
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base.frozen import Frozen, field
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -46,10 +46,6 @@ class Exported(Frozen):
     words: str
     facts: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
-
-    def with_content(self, content: bytes | Mapping[str, bytes]) -> Exported:
-        """The same with this content."""
-        return replace(self, content=content)
 
     def require_loss_mm(self, most: float | None) -> None:
         """Raise InputError where a station is wrong by more than so many mm anywhere on the field."""

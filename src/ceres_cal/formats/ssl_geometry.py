@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base.errors import InputError, attempt
+from ceres_cal.base.frozen import replace
 from ceres_cal.formats.format import (
     Exported,
     ExportFormat,
@@ -56,7 +57,7 @@ def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any
 def _export_packet(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
     before = {} if request.existing is None else geometry_from_bytes(request.existing)
     data, exported = geometry_of(request, camera_id, before)
-    return exported.with_content(to_bytes("SSL_GeometryData", data))
+    return replace(exported, content=to_bytes("SSL_GeometryData", data))
 
 
 def _export_yaml(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
@@ -65,8 +66,8 @@ def _export_yaml(request: ExportRequest, *, camera_id: CameraIds = "") -> Export
     data, exported = geometry_of(request, camera_id, before)
     to_bytes("SSL_GeometryData", data)  # or says what a reader would refuse
     if "field" not in before:
-        return exported.with_content(yaml_text(data).encode())
-    return exported.with_content(_with_calib(text, yaml_text({"calib": data["calib"]})).encode())
+        return replace(exported, content=yaml_text(data).encode())
+    return replace(exported, content=_with_calib(text, yaml_text({"calib": data["calib"]})).encode())
 
 
 def _with_calib(text: str, block: str) -> str:

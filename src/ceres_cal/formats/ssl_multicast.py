@@ -24,7 +24,7 @@ from ceres_cal.formats.format import Exported, ExportRequest
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import geometry_of, read_geometry
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
-from ceres_cal.formats.ssl_settings import settings_field
+from ceres_cal.formats.ssl_settings import settings_target, values_in
 from ceres_cal.formats.yaml_files import yaml_text
 from ceres_cal.scene.targets import Target
 
@@ -173,4 +173,6 @@ def read_ssl_target(path: str | Path) -> Target:
     """
     content = read_bytes(path)
     with naming(path):
-        return settings_field(content) if b"<VarXML" in content else target_of(read_geometry(content)["field"])
+        return (
+            settings_target(values_in(content)) if b"<VarXML" in content else target_of(read_geometry(content)["field"])
+        )

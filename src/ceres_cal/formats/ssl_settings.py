@@ -61,7 +61,7 @@ class _Var(Struct, frozen=True):
     end: int
 
 
-def _values(content: bytes) -> list[_Var]:
+def values_in(content: bytes) -> list[_Var]:
     """Every value of a settings file.
 
     Raises:
@@ -142,7 +142,7 @@ def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
     if request.existing is None:
         raise InputError("ssl-vision's settings are edited in place: name its robocup-ssl.xml (or a copy), with "
                          "ssl-vision closed")  # fmt: skip
-    values = _values(request.existing)
+    values = values_in(request.existing)
     there, box = _cameras(values), field_box(request.calibration.targets)
     box = box or field_box({"field": settings_target(values)})
     entries, losses, warnings = to_entries(request, camera_id, box)
@@ -181,7 +181,7 @@ def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -
 
 
 def _read(request: ImportRequest, *, image_size: ImageSize = "") -> Any:
-    values = _values(request.content)
+    values = values_in(request.content)
     every = sorted(_cameras(values).items())
     cameras, warnings = to_cameras((_entry(*one) for one in every), image_size)
     for number, there in every:
@@ -198,11 +198,6 @@ def _entry(number: int, there: Mapping[str, _Var]) -> dict[str, Any]:
     numbers = {name: _number(there[label]) for name, label in _XML_NAMES.items() if label in there}
     sizes = [_number(there[label]) if label in there else 0.0 for label in ("Image width", "Image height")]
     return {"camera_id": number, **numbers, "pixel_image_width": sizes[0], "pixel_image_height": sizes[1]}
-
-
-def settings_field(content: bytes) -> Target:
-    """The field of a settings file."""
-    return settings_target(_values(content))
 
 
 def settings_target(values: list[_Var]) -> Target:

@@ -87,7 +87,7 @@ def refit(
 
     result = solved_with(what, estimate, assessed=True)
     try:
-        searches = [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)]
+        searches = [PoseSearch(sight, estimate, plan.scales) for sight in _moved_sights(plan)]
         if require_supported(plan, result, searches, solved_with):
             raise why_nothing_fits(plan, searches)
     except SolutionError as error:
@@ -113,7 +113,7 @@ def _start(plan: RefitPlan) -> Estimate:
     poses: dict[str, Pose] = {}
     cameras = dict(plan.known.cameras)
     for sight in _moved_sights(plan):
-        search, pose = _sought(plan, _search_of(plan, sight, plan.known))
+        search, pose = _sought(plan, PoseSearch(sight, plan.known, plan.scales))
         poses[sight.key.station], cameras[sight.key.camera] = pose, search.camera
     if plan.asked.labels == "check":
         require_labels(plan, poses)
@@ -130,10 +130,6 @@ def _moved_sights(plan: RefitPlan) -> list[Sights]:
             "(`ceres-cal score` says how well boards alone agree with held intrinsics)"
         )
     return list(moved.values())
-
-
-def _search_of(plan: RefitPlan, sight: Sights, estimate: Estimate) -> PoseSearch:
-    return PoseSearch(sight, estimate, plan.scales)
 
 
 def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
@@ -173,7 +169,7 @@ def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
         key = sight.key
         if key.placement is None or key.placement in poses:
             continue
-        search = _search_of(plan, sight, estimate)
+        search = PoseSearch(sight, estimate, plan.scales)
         candidates = pose_candidates(search, [], patience=0)
         if candidates:
             poses[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ candidates[0].pose

@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, evenly
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene.camera import Camera
@@ -409,7 +409,7 @@ def thinned(observations: Observations, most: int, fewest_frames: int = 40) -> O
     names, frame = frames_of(observations)
     count = max(min(fewest_frames, len(names)), int(len(names) * most / observations.rows))
     taken = np.zeros(len(names), dtype=bool)
-    taken[np.linspace(0, len(names) - 1, count).round().astype(int)] = True
+    taken[evenly(len(names), count)] = True
     chosen = taken[frame]
     step = max(1, round(np.count_nonzero(chosen) / most))
     masks = np.split(chosen, [len(observations.points)])

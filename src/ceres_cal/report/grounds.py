@@ -98,11 +98,6 @@ def noise_ratio(quality: Quality) -> float:
     return max((one.scale for one in every if np.isfinite(one.stated_px)), default=0.0)
 
 
-def model_error_mm(quality: Quality) -> float:
-    """The largest effect of what is wrong with the model, rms mm; 0 where nothing is known to be."""
-    return _largest_mm(quality.faults)
-
-
 def misfit_mm(quality: Quality) -> float:
     """By how much a refit to new data would move it, rms mm; 0 where it holds on them, or they are its own."""
     return _largest_mm([finding for finding in quality.findings if finding.wrong == "calibration"])
@@ -182,7 +177,7 @@ def _of_faults(quality: Quality) -> tuple[str, str]:
     )
     counted_in = "The accuracy in the first line includes this" if places else "The uncertainties do not include it"
     moved = f"{'places' if places else 'numbers of the cameras'} by {short(sigmas)} of their standard deviations"
-    wrong_mm = mm(model_error_mm(quality))
+    wrong_mm = mm(_largest_mm(quality.faults))
     names = first_of(list(dict.fromkeys(f"{fault.kind} ({fault.subject})" for fault in quality.faults)), 4)
     return level, f"The model is wrong by up to {wrong_mm} rms: {names}. This moves {moved}. {counted_in}."
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, grid_places, largest
+from ceres_cal.base.arrays import Array, evenly, grid_places, largest
 from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, image_grid
@@ -169,18 +169,13 @@ def grid_table(
     Args:
         place: how a place on its axes is written. most: columns and rows. shown: how a value is written.
     """
-    columns, rows = _evenly(len(x), most[0]), _evenly(len(y), most[1])
+    columns, rows = (evenly(len(axis), number).tolist() for axis, number in zip((x, y), most, strict=True))
     cells = [["∞" if np.isinf(value) else shown(value) for value in values[r, columns].tolist()] for r in rows]
     names = (place.format(y[r]) for r in rows)
     return Table(
         (head, *(place.format(x[c]) for c in columns)),
         tuple((name, *row) for name, row in zip(names, cells, strict=True)),
     )
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
-    return [int(number) for number in np.unique(np.linspace(0, count - 1, most).round())]
 
 
 # ---- over the image -------------------------------------------------------------------------------------------------

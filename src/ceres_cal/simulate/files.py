@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import check_header, convert, make_folder, read_json, write_json
+from ceres_cal.base.files import body_of, convert, make_folder, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera, CameraFile, Vector, camera_to_json
@@ -43,8 +43,6 @@ class _PlacementFile(_RotationFile, forbid_unknown_fields=True, kw_only=True):
 
 
 class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
-    format: str
-    version: int
     targets: dict[str, Any]
     cameras: dict[str, Any]
     stations: dict[str, Any]
@@ -81,7 +79,7 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
     Raises:
         InputError: one line that names `where` and the place in it.
     """
-    file = convert(check_header(data, where, SCENE_FORMAT, SCENE_VERSION), _SceneFile, where)
+    file = convert(body_of(data, where, SCENE_FORMAT, SCENE_VERSION), _SceneFile, where)
     with naming(where):
         scene = Scene(
             targets_from_specs(file.targets),

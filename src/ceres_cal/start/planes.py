@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median, rms
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, evenly, median, rms
 from ceres_cal.base.errors import or_none
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.base.threads import kept_signals
@@ -193,7 +193,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialPro
     A profile needs no more: every other homography follows from it.
     """
     enough_boards = 24  # for a profile
-    numbers = distinct(np.linspace(0, len(board) - 1, enough_boards).round().astype(np.int64))
+    numbers = evenly(len(board), enough_boards)
     rows, sizes = ranges(data.bounds, numbers), np.diff(board.point_bounds)[numbers]
     few = PlaneData(
         bounds_of(np.diff(data.bounds)[numbers]), data.plane.take(rows, axis=0), data.offsets.take(rows, axis=0)

@@ -9,7 +9,7 @@ from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, distinct
+from ceres_cal.base.arrays import Array, Indices, distinct, evenly
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
@@ -175,9 +175,10 @@ def _place(poses: Candidates, number: int, profile: RadialProfile) -> CameraPlac
 
 def _lines_of(sight: Sights, profile: RadialProfile, known: Beforehand, most: tuple[int, int] = _MOST) -> Sightlines:
     """Some of what a sight shows, evenly."""
-    points = _evenly(np.arange(len(sight.points)), most[0])
+    points = evenly(len(sight.points), most[0])
     tracks = sight.track_index
-    rows = [_evenly(np.flatnonzero(tracks == track), most[1]) for track in distinct(tracks)]
+    every = (np.flatnonzero(tracks == track) for track in distinct(tracks))
+    rows = [own[evenly(len(own), most[1])] for own in every]
     some = np.concatenate([np.empty(0, np.int64), *rows])
     arc = sight.on_arc[some]
     some, arcs = np.concatenate([some[~arc], some[arc]]), int(np.count_nonzero(arc))
@@ -198,11 +199,6 @@ def _lines_of(sight: Sights, profile: RadialProfile, known: Beforehand, most: tu
         (len(points), len(some) - arcs, arcs),
         np.concatenate([np.full(2 * len(points), -1), tracks[some]]),
     )
-
-
-def _evenly(rows: Indices, most: int) -> Indices:
-    count = min(len(rows), most)
-    return rows[distinct(np.linspace(0, max(len(rows) - 1, 0), count).round().astype(np.int64))]
 
 
 _STATED = {"x": "position_m", "y": "position_m", "height": "height_m", "phi": "phi"}

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, json_text, read_json, write_json
+from ceres_cal.base.files import body_of, convert, json_text, read_json, write_json
 from ceres_cal.scene.targets import Target
 
 FORMAT, VERSION = "ceres-cal/page", 1
@@ -178,8 +178,7 @@ def load_state(path: Path) -> State:
     Raises:
         InputError: one line that names the file.
     """
-    data = check_header(read_json(path, FORMAT, VERSION), str(path), FORMAT, VERSION)
-    return convert({name: value for name, value in data.items() if name not in ("format", "version")}, State, str(path))
+    return convert(body_of(read_json(path, FORMAT, VERSION), str(path), FORMAT, VERSION), State, str(path))
 
 
 def save_state(path: Path, state: State) -> None:

@@ -14,7 +14,7 @@ from ceres_cal.base.transforms import Pose, chained, inverted
 from ceres_cal.detect.photographs.facing import Facing
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
-from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
+from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, StrokeMap, lines_seen, match
 from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.upright import Upright, best_score, find_upright
 from ceres_cal.detect.registration import nearness_to
@@ -153,7 +153,7 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
         optics = _optics(upright, search.stroke_map)
         seen = lines_seen(upright, search.stroke_map)
         for grid in (search.grid, *search.others):
-            found = [(one.score, _posed(optics, one)) for one in match(upright, search.stroke_map, grid, seen)]
+            found = [(score, optics.at(pose)) for score, pose in match(upright, search.stroke_map, grid, seen)]
             drawn |= {id(camera): grid for _, camera in found}
             scored += found
         if scored and max(score for score, _ in scored) > _SURE:
@@ -178,7 +178,7 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
     along, across = offsets_of(search.grid.target, detected, search.grid.turn)
     lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
     optics = _optics(upright, stroke_map)
-    others = [(one.score, _posed(optics, one)) for one in match(upright, stroke_map, search.grid, lines)]
+    others = [(score, optics.at(pose)) for score, pose in match(upright, stroke_map, search.grid, lines)]
     distinct = [camera, *_distinct(others, search.grid.turns, _ALIKE, camera)]
     likely = _likely(search, [(one, search.grid) for one in distinct])
     return [one for one, _ in likely if one is not camera]
@@ -192,10 +192,6 @@ def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> 
     order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST]
     best = likelihood[order[0]] if likelihood else 0.0
     return [cameras[row] for row in order if likelihood[row] >= min(_LIKELY * best, best)]
-
-
-def _posed(optics: Camera, one: Match) -> Camera:
-    return optics.at(Pose.looking(one.position, one.rotation))
 
 
 # ---- one coefficient and lenses -------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import check_header, convert, read_json
+from ceres_cal.base.files import body_of, convert, read_json
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.photographs.refit import CAMERA, FreeIntrinsics, PointHints, refit_camera
@@ -34,8 +33,7 @@ _WRONG = 6.0  # standard deviations of a click: as far off, and it is another pl
 _FREED = ("a3", "phi", "aspect", "a2", "cx", "cy", "a4", "a5")
 
 
-@dataclass(frozen=True)
-class Clicks:
+class Clicks(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Pixels of named points of a target, and of places somewhere on named curves, good to some 15 px; they may lie
     outside the image.
     """
@@ -59,13 +57,6 @@ class Clicks:
                 raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
 
 
-class _ClicksFile(msgspec.Struct, forbid_unknown_fields=True):
-    format: str
-    version: int
-    points: dict[str, tuple[float, float]]
-    curves: tuple[tuple[str, float, float], ...] = ()
-
-
 def load_clicks(path: str | Path) -> Clicks:
     """A file `{"format": "ceres-cal/corners", "version": 1, "points": {"TopLeftCorner": [x, y], ...}}`, which may have
     places of curves besides, `"curves": [["HalfwayLine", x, y], ...]`.
@@ -78,9 +69,8 @@ def load_clicks(path: str | Path) -> Clicks:
 
 def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
     """The clicks that a file describes; InputError that names `where`."""
-    file = convert(check_header(data, where, FORMAT, VERSION), _ClicksFile, where)
     with naming(where):
-        return Clicks(file.points, file.curves)
+        return convert(body_of(data, where, FORMAT, VERSION), Clicks, where)
 
 
 def starts_from_clicks(

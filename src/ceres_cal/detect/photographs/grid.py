@@ -46,18 +46,13 @@ class LineGrid(Frozen):
     @property
     def outline(self) -> Array:
         """(P, 2) places all along the painted curves, in the grid."""
-        return places_along(self, _OUTLINE).grid
+        return places_along(self, _OUTLINE)[0]
 
 
-class Places(Frozen):
-    """Places (P, 2) along the painted curves in the grid's frame; `first` (P,) is 1 where a curve begins."""
-
-    grid: Array
-    first: Mask
-
-
-def places_along(grid: LineGrid, count: int) -> Places:
-    """About so many places at even distances on the painted curves."""
+def places_along(grid: LineGrid, count: int) -> tuple[Array, Mask]:
+    """About so many places (P, 2) at even distances on the painted curves, in the grid's frame; and whether each is the
+    first of its curve.
+    """
     painted = [grid.target.curves[name] for name in grid.curves]
     spacing = sum(curve.length_m for curve in painted) / count
     places, first = [], []
@@ -65,7 +60,7 @@ def places_along(grid: LineGrid, count: int) -> Places:
         there = curve_points(curve, 0, max(int(curve.length_m / spacing), 2))
         places.append(there[:, :2] @ grid.turn)
         first.append(np.arange(len(there)) == 0)
-    return Places(np.concatenate(places).astype(np.float32), np.concatenate(first))
+    return np.concatenate(places).astype(np.float32), np.concatenate(first)
 
 
 def grid_of(target: Target, curves: Collection[str]) -> LineGrid:

@@ -12,9 +12,10 @@ from math import gcd
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.detect.photographs.grid import LineGrid, Places, places_along
+from ceres_cal.base.transforms import Pose
+from ceres_cal.detect.photographs.grid import LineGrid, places_along
 from ceres_cal.detect.photographs.upright import Upright
 from ceres_cal.detect.registration import Nearness
 from ceres_cal.detect.strokes import Strokes, alone
@@ -33,14 +34,6 @@ _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tr
 _LEAST_IN_VIEW = 0.03
 CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
-
-
-class Match(Frozen):
-    """A hypothesis: how good it is, and the camera's place (3,) and turn (3, 3) camera from target."""
-
-    score: float
-    position: Array
-    rotation: Array
 
 
 class StrokeMap(Frozen):
@@ -125,8 +118,8 @@ def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
     return FloorLines(*(_peaks(places[rows], weights[rows], float(weights.sum())) for places, rows in parts))
 
 
-def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[Match]:
-    """The best hypotheses for these lines, the best first."""
+def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[tuple[float, Pose]]:
+    """The best hypotheses for these lines: how good each is, and the camera from the target; the best first."""
     kept = 250
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     scored: list[tuple[float, Array, Array]] = []
@@ -138,14 +131,11 @@ def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorL
         score = _scores(stroke_map, turned, hypotheses[best], many)
         scored += [(float(value), hypotheses[row], turned.rotation) for value, row in zip(score, best, strict=True)]
     scored.sort(key=lambda one: -one[0])
-    return [_as_match(score, place, rotation, grid) for score, place, rotation in scored[:kept]]
-
-
-def _as_match(score: float, place: Array, rotation: Array, grid: LineGrid) -> Match:
-    height, x, y = place
     turn = np.eye(3)
-    turn[:2, :2] = grid.turn.T
-    return Match(score, np.array([*(grid.turn @ [x, y]), height]), rotation @ turn)
+    turn[:2, :2] = grid.turn
+    return [
+        (score, Pose.looking(turn @ place[[1, 2, 0]], rotation @ turn.T)) for score, place, rotation in scored[:kept]
+    ]
 
 
 # ---- hypotheses -----------------------------------------------------------------------------------------------------
@@ -207,24 +197,25 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
 # ---- their scores --------------------------------------------------------------------------------------------------
 
 
-def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
+def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: tuple[Array, Mask]) -> Array:
     """(K,) of each hypothesis, from 0 to 1."""
-    block = 40_000 // len(places.first)  # as many as stay in the cache
+    block = 40_000 // len(places[0])  # as many as stay in the cache
     blocks = range(0, len(hypotheses), block)
     parts = [_scored(stroke_map, upright, hypotheses[b : b + block].astype(np.float32), places) for b in blocks]
     return np.concatenate([np.empty(0), *parts])
 
 
-def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
+def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: tuple[Array, Mask]) -> Array:
     tells_px = 40.0  # of a line, as much as one place on it tells
-    floor = (places.grid.T[:, None] - hypotheses.T[1:, :, None]) / hypotheses[:, 0, None]
+    there, first = places
+    floor = (there.T[:, None] - hypotheses.T[1:, :, None]) / hypotheses[:, 0, None]
     offsets = np.moveaxis(upright.offsets(np.moveaxis(floor, 0, -1)), -1, 0)
     x, y = stroke_map.centre.astype(np.float32)[:, None, None] + np.float32(stroke_map.unit_px) * offsets
     width, height = stroke_map.image_size
     with np.errstate(invalid="ignore"):
         inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
         step = np.sqrt(sum(np.diff(one, axis=1, prepend=one[:, :1]) ** 2 for one in (x, y)))
-    step = np.where(inside & ~places.first & np.isfinite(step), np.minimum(step, tells_px), 0.0)
+    step = np.where(inside & ~first & np.isfinite(step), np.minimum(step, tells_px), 0.0)
     near = stroke_map.near.at(x, y)
     covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
     enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Spread, thin_root
+from ceres_cal.base.arrays import Array, Indices, Spread, evenly, thin_root
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
 from ceres_cal.posterior.mixture import Mixture
@@ -131,7 +131,7 @@ class Outlook(Frozen):
             return ()
         keys, steps, (at, roots) = self.valley.keys, self.valley.steps, self.valley.chains[0]
         within = at[np.abs(roots) <= self.posterior.half_width]
-        some = within[np.unique(np.linspace(0, len(within) - 1, nodes).round().astype(int))]
+        some = within[evenly(len(within), nodes)]
         return tuple((int(node), moved(self.estimate, keys, steps[node])) for node in some)
 
     def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
