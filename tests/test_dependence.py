@@ -12,6 +12,7 @@ from accuracy.intervals import CASES, cover, share
 from accuracy.scenes import CLEAN_NOISE, RADIAL, SSL_PROBLEMS, boards
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import corners
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
@@ -107,6 +108,25 @@ def test_what_all_frames_share_does_not_shrink_with_them() -> None:
     assert six.posterior is not None and six.posterior.dependence is not None
     assert six.posterior.dependence.correlations[0].lasting
     assert np.median(ratio) == pytest.approx(1.0, abs=0.35)  # the model alone: 0.4 and less
+
+
+def test_what_all_frames_share_of_points_does_not_shrink_either() -> None:
+    """Corners in six frames of a static camera, off by the same in each of them."""
+    one = simulate(corners("radial-2-3"), Disturbance(points_sigma_px=0.5), 0).observations
+    rng, pixels = np.random.default_rng(1), one.points.pixels
+    frames = [
+        replace(
+            one,
+            views=(replace(one.views[0], frame=f"{n}"),),
+            points=replace(one.points, pixels=pixels + 0.3 * rng.standard_normal(pixels.shape)),
+        )
+        for n in range(6)
+    ]
+    several, alone = (
+        calibrate(observations, Options(lens="radial", powers=(2, 3))).uncertainty.posterior.sd
+        for observations in (sum(frames[1:], frames[0]), one)
+    )
+    assert np.median(several / alone) == pytest.approx(1.0, abs=0.2)  # were they not seen: 0.4
 
 
 # ---- it does not depend on how things are put -----------------------------------------------------------------------

@@ -42,7 +42,7 @@ class Strand(Frozen):
 def strands_of(equations: Equations, owner: Indices, rows: Indices) -> Iterator[Strand]:
     """The curves, and the image axes of points, of each owner (E,), a view or a sight, among some rows."""
     name = strand_names(equations, owner)[rows]
-    order = np.argsort(name, kind="stable")
+    order = np.lexsort((equations.feature[rows], name))  # what one point shows in several views is side by side
     ends = np.flatnonzero(np.diff(name[order], append=-1)) + 1
     start = 0
     for end in ends.tolist():
@@ -300,7 +300,7 @@ def is_loud(family: StrandFamily) -> bool:
     residuals, private, shared = (family.squared(s) for s in (slice(-1, None), slice(6), slice(6, -1)))
     agreement, count = residuals / noise + private + shared, np.diff(family.bounds)
     for length in (gap, np.sqrt(gap * longest), ASIDE * longest):
-        together = np.exp(-family.distance / length) * (family.distance > 0.0)
+        together = np.exp(-family.distance / length) * ~np.eye(family.distance.shape[1], dtype=bool)
         squares = float(count @ np.sum(together**2, axis=(1, 2)))
         total = float(np.sum(together * agreement))
         widening = total / squares * float(np.sum(together * shared) / np.sum(sums[6:-1]))
