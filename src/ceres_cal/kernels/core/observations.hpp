@@ -70,7 +70,8 @@ struct Unknowns {
 // ---- the robust losses, as Ceres defines them ----
 
 // rho and its derivative at a squared residual s; and sqrt(1 + 2 s rho'' / rho'), how the loss' own bend shortens the
-// Jacobian along the residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3).
+// Jacobian along the residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3). In place of
+// Cauchy's rho, b log(1 + s / b), stands s / b, of which `sum_of_logs` makes it.
 //
 // 1 for the redescending losses: along their bend a step may climb.
 struct Robust {
@@ -88,7 +89,7 @@ inline Robust robust(double scale, double squared) {
         const double root = std::sqrt(1.0 + squared / b);
         return {2.0 * squared / (1.0 + root), 1.0 / root, 1.0 / root};  // 2 b (root - 1) without its rounding
     } else if constexpr (code == LossCode::cauchy) {
-        return {b * std::log1p(squared / b), 1.0 / (1.0 + squared / b)};
+        return {squared / b, 1.0 / (1.0 + squared / b)};
     } else if constexpr (code == LossCode::tukey) {
         const double share = squared / b, rest = 1.0 - share;
         const double inside = squared * (1.0 - share + share * share / 3.0);  // b / 3 (1 - rest^3) without its rounding
@@ -96,6 +97,21 @@ inline Robust robust(double scale, double squared) {
     } else {
         return {squared, 1.0};
     }
+}
+
+// Sum of log(1 + more) over n numbers, a multiple of LANES: a logarithm of each takes longer than all else that a
+// residual needs. Of few factors at once, so that no product overflows; less one, so that none is rounded away.
+inline double sum_of_logs(int n, const double* more) {
+    constexpr int FACTORS = 8;
+    double sum = 0.0;
+    for (int first = 0; first < n; first += FACTORS) {
+        double product[LANES] = {}, whole = 0.0;
+        for (int i = first; i < std::min(first + FACTORS, n); i += LANES)
+            for (int k = 0; k < LANES; ++k) product[k] += more[i + k] * (1.0 + product[k]);
+        for (const double part : product) whole += part * (1.0 + whole);
+        sum += std::log1p(whole);
+    }
+    return sum;
 }
 
 template <LossCode code>

@@ -61,12 +61,17 @@ class Sums {
             const double ey = MANY == 2 ? w * shown_.off_y(i) : 0.0, squared = ex * ex + ey * ey;
             const Robust one = robust<code>(seen_.loss.scale, squared);
             const double root = std::sqrt(one.slope), factor = root * w;
-            cost += one.rho, bend_[i] = one.bend;
+            bend_[i] = one.bend;
+            if constexpr (code == LossCode::cauchy)
+                rho_[i] = one.rho;
+            else
+                cost += one.rho;
             factor_[i] = MANY == 2 ? factor : factor * shown_.normal_x[i];
             factor_[filled + i] = MANY == 2 ? factor : factor * shown_.normal_y[i];
             error[i] = root * ex;
             if (MANY == 2) error[filled + i] = root * ey;
         });
+        if (code == LossCode::cauchy) cost = seen_.loss.scale * seen_.loss.scale * sum_of_logs(filled, rho_.value);
         for (int k = 0; k < last; ++k) {
             double* own = own_[k];
             if constexpr (MANY == 2)
@@ -155,7 +160,7 @@ class Sums {
     bool newton_ = false;
     double *normal_ = nullptr, cost_ = 0.0;
     Projection shown_;
-    Lane weight_, bend_;
+    Lane weight_, bend_, rho_;
     alignas(64) double factor_[2 * CHUNK];
     std::vector<double*> own_;
     std::vector<int> places_;
