@@ -613,6 +613,14 @@ def test_observations_that_cannot_tell(observations: Callable[[], Observations],
     assert "\n" not in str(caught.value)
 
 
+def test_cameras_that_can_do_without_one_are_counted() -> None:
+    few = lines_named("HalfwayLine")
+    (camera,), views = few.cameras.values(), tuple(replace(one, camera="end", station="end") for one in few.views)
+    both = corners_at(lambda p: p[:, 0] > -9.0) + replace(few, cameras={"end": camera}, views=views)
+    with pytest.raises(DegenerateError, match=r"'end'.*fix its pose.*1 other camera can be calibrated without .*'end'"):
+        calibrate(both, RADIAL)
+
+
 def test_one_board_is_enough_for_a_pose_but_not_many() -> None:
     """Four corners of one board among others with 54 are used."""
     calibration = calibrate(fourth_board_with(0, 8, 45, 53), RADIAL)

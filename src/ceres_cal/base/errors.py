@@ -17,9 +17,17 @@ _P = ParamSpec("_P")
 
 
 class CalibrationError(Exception):
-    """Base of every failure of the package. `str(error)` is one line; `exit_code` is what the commands exit with."""
+    """Base of every failure of the package. `str(error)` is one line; `exit_code` is what the commands exit with.
+
+    Attributes:
+        camera: whose observations it comes from, where others may do without it.
+    """
 
     exit_code = 2
+
+    def __init__(self, message: str = "", camera: str | None = None) -> None:
+        super().__init__(message)
+        self.camera = camera
 
     def __str__(self) -> str:
         return " ".join(super().__str__().splitlines())  # names out of a file may hold line breaks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.threads import at_most, for_small_matrices, meanwhile
 from ceres_cal.base.typed import checked
+from ceres_cal.base.words import counted
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
@@ -80,9 +81,22 @@ def calibrate(
                 raise type(error)(f"{error}; {odd}") from None
             free = _without_priors(observations, options)
             if free is None:
-                raise
+                raise type(error)(f"{error}{_others_can(error, observations, options)}", error.camera) from None
             words = _contradicted(observations, options, free)
             raise SolutionError(words or _OTHERWISE) from None
+
+
+def _others_can(failure: CalibrationError, observations: Observations, options: Options) -> str:
+    """What follows the failure's line where the other cameras make a calibration without those that see too little."""
+    left_out, found = list[str](), cast("CalibrationError | Calibration", failure)
+    while isinstance(found, CalibrationError):
+        if found.camera is None or len(observations.cameras) < 2 or is_bulk(observations):
+            return ""
+        left_out.append(found.camera)
+        observations = observations.without_camera(found.camera)
+        found = attempt(partial(_measured, observations, options, None, None))  # reads: "... the other 3 cameras can"
+    those, others = ", ".join(map(repr, left_out)), counted(len(observations.cameras), "other camera")
+    return f"; {others} can be calibrated without what {those} observed: leave that out"
 
 
 def lens_by_held_out(observations: Observations, options: Options) -> LensChoice | None:

@@ -75,7 +75,8 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
         if lost:
             raise DegenerateError(
                 f"camera {name!r}: its observations do not determine {', '.join(lost)} of the {camera.lens.kind} lens: "
-                f"show more of the targets, or hold them, such as --fix {lost[-1]}=0"
+                f"show more of the targets, or hold them, such as --fix {lost[-1]}=0",
+                name,
             )
 
 

@@ -258,13 +258,22 @@ class Observations(Content):
 
     def of_station(self, name: str) -> Observations:
         """One station's views with all their observations, without priors."""
-        chosen = np.array([view.station == name for view in self.views])
-        order, camera = np.cumsum(chosen, dtype=np.int32) - 1, self.stations[name]
+        return self._of_views([view.station == name for view in self.views])
+
+    def without_camera(self, name: str) -> Observations:
+        """The views of the other cameras, with the priors of what they show."""
+        others = self._of_views([view.camera != name for view in self.views])
+        owners = {*others.cameras, *others.stations, *others.placements, *others.targets}
+        return replace(others, priors=tuple(prior for prior in self.priors if prior.name in owners))
+
+    def _of_views(self, which: Sequence[bool]) -> Observations:
+        chosen = np.array(which)
+        order, views = np.cumsum(chosen, dtype=np.int32) - 1, tuple(np.array(self.views, object)[chosen])
         points, curves = taken(self.points, chosen[self.points.view]), taken(self.curves, chosen[self.curves.view])
         return Observations(
             self.targets,
-            {camera: self.cameras[camera]},
-            tuple(view for view in self.views if view.station == name),
+            {view.camera: self.cameras[view.camera] for view in views},
+            views,
             replace(points, view=order[points.view]),
             replace(curves, view=order[curves.view]),
             noise=self.noise,

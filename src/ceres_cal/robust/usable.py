@@ -47,7 +47,8 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
         if 2 * met < len(own.point_rows) + len(own.curve_rows):
             raise SolutionError(
                 f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
-                "check labels, target dimensions and which lens it is"
+                "check labels, target dimensions and which lens it is, or show more of the targets",
+                name,
             )
 
 
@@ -170,7 +171,8 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
         if not camera.lens.may_fold or not all_shown(camera, observed):
             raise SolutionError(
                 f"{where}, inside the image (corner at {corner:.0f} px): "
-                "choose fewer or other coefficients, or observe nearer to the corners"
+                "choose fewer or other coefficients, or observe nearer to the corners",
+                name,
             )
         warnings.append(
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "

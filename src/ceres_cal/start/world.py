@@ -269,4 +269,5 @@ def _require_all(
             what = f"{', '.join(names)} of the camera stay open: add a point or a line beside these{state}"
         else:
             what = "give at least four points, not on one line, or straight lines in two directions, two of each"
-        raise DegenerateError(f"frame {frames} ({key}): {said}: {what}, or remove the view")
+        text = f"frame {frames} ({key}): {said}: {what}, or remove the view"
+        raise DegenerateError(text, sights.observations.stations[key.station])
