@@ -18,6 +18,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.holds import _checked_station
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refit_plan import MIRRORED, relabelled
+from ceres_cal.moves.refits import movements, refit
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance
@@ -75,6 +76,16 @@ def test_sizes_are_those_of_the_movement(calibration: Calibration, pose: Pose) -
     off = 1e3 * np.linalg.norm(CAMERA.at(pose).locate(CAMERA.at(HOME).project(floor)) - floor[:, :2], axis=1)
     assert found.change is not None
     assert found.change.maps[0].mean_mm == pytest.approx(float(np.mean(off)), rel=0.4)  # 3.2 of 3.7 mm, 2.7 of 3.0 mm
+
+
+def test_a_height_that_is_seen_better_is_no_movement() -> None:
+    """A calibration of a field alone, whose height goes with phi: a camera 10 mm aside had moved by 49 mm."""
+    before, moved = calibrate(lines(HOME, 3)), Pose.looking(HOME.position + np.array([0.01, 0.0, 0.0]), HOME.rotation)
+    new = lines(moved, 4)
+    change = check(before, new)["overhead"].change
+    assert change is not None
+    assert change.moved_mm == pytest.approx(10.0, abs=4.0)  # 8.2
+    assert movements(before, refit(before, new))["overhead"][0] == pytest.approx(0.01, abs=0.004)
 
 
 def test_outliers_and_more_noise_are_no_movement(calibration: Calibration) -> None:

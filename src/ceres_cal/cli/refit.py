@@ -66,7 +66,7 @@ def _run(args: RefitArguments) -> Document:
     )
     about = result.refitted
     assert about is not None
-    every = moves.movements(calibration, result).items()
+    every = moves.movements(calibration, result, about.what).items()
     moved = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in every}
     explained = {"what": about.what, "explanation": about.explanation, "moved": moved}
     first = Section("refit", about.explanation.split("; "), explained)

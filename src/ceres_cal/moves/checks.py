@@ -34,7 +34,7 @@ from ceres_cal.moves.agreement import (
     require_posterior,
     require_stations,
 )
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_words, pose_candidates
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_from, moved_words, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.problem.bundle import solve
@@ -171,9 +171,11 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
     holds = apart.probability >= level
     zoomed = None if holds else case.least(used, case.tested, near[0].pose)
     will_do = zoomed is None or posed[0] - zoomed[0] < _WILL_DO * noise**2
-    anew = posed[1] if will_do or zoomed is None else zoomed[1]
+    anew, freed = (posed[1], ()) if will_do or zoomed is None else (zoomed[1], case.tested)
+    shift_m, turn = moved_from(case.prior.without(set(freed) - set(case.station_keys)), case.name, anew)
     grids = field_grids(calibration.targets)
     change = change_of(case.estimate, case.name, anew.camera_at(case.name), grids)
+    change = replace(change, moved_mm=1e3 * shift_m, turned_deg=math.degrees(turn))
     return Agreement(
         name=case.name,
         holds=holds,

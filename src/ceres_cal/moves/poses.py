@@ -17,7 +17,9 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import placement_costs
+from ceres_cal.problem.information import over, pose_keys
 from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.scene.camera import Camera
@@ -197,6 +199,16 @@ def movement(a: Pose, b: Pose) -> tuple[float, float]:
     sine = float(np.linalg.norm(a.rotation - b.rotation)) / np.sqrt(8.0)  # |a - b| = 2 sqrt 2 sin(angle / 2)
     angle = 2.0 * np.arcsin(min(sine, 1.0)) if cosine > -0.9 else np.arccos(np.clip(cosine, -1.0, 1.0))
     return float(np.linalg.norm(a.position - b.position)), float(angle)
+
+
+def moved_from(known: GaussianPrior, station: str, now: Estimate) -> tuple[float, float]:
+    """How far (m) and by what angle (rad) a station stands from where what was known puts it beside everything else as
+    it is seen now: its height changes with phi, and it has not moved for that.
+    """
+    keys = pose_keys("station", station)
+    own = known.given(keys, now)
+    shift_m, turn = np.split(over(own.offsets(now), own.keys, keys), 2)
+    return float(np.linalg.norm(shift_m)), float(np.linalg.norm(turn))
 
 
 def moved_words(shift_m: float, turned_deg: float, before: Posterior, camera: str, about: str = "") -> str:

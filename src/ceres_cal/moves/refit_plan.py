@@ -23,6 +23,7 @@ from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, int
 from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import intrinsic_keys, require_possible_numbers
+from ceres_cal.scene.lens import Lens
 from ceres_cal.scene.symmetry import counterparts
 from ceres_cal.scene.targets import target_from_spec
 
@@ -119,16 +120,18 @@ class RefitPlan(Frozen):
 
     def loosened(self, what: str) -> frozenset[Key]:
         """The intrinsics of which nothing is taken to be known any more."""
-        keys: set[Key] = set()
-        for name in self.moved_cameras:
-            lens = self.calibration.cameras[name].lens
-            which = {"zoom": ("phi",), "iris": lens.names, "everything": intrinsic_names(lens)}.get(what, ())
-            keys |= {key for key in intrinsic_keys(name, lens) if key.quantity in which}
-        return frozenset(keys)
+        cameras = self.calibration.cameras
+        return frozenset().union(*(loosened(what, name, cameras[name].lens) for name in self.moved_cameras))
 
     def prior_for(self, what: str) -> GaussianPrior:
         """What is known beforehand when so much is let go."""
         return self.prior.without(self.loosened(what))
+
+
+def loosened(what: str, camera: str, lens: Lens) -> frozenset[Key]:
+    """The intrinsics of a camera of which a refit of `what` takes nothing to be known any more."""
+    which = {"zoom": ("phi",), "iris": lens.names, "everything": intrinsic_names(lens)}.get(what, ())
+    return frozenset(key for key in intrinsic_keys(camera, lens) if key.quantity in which)
 
 
 def make_plan(

@@ -25,8 +25,8 @@ from ceres_cal.moves.explanations import (
     why_nothing_fits,
     zoomed_search,
 )
-from ceres_cal.moves.poses import PoseSearch, equations, moved_words, movement, pose_candidates
-from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, make_plan, refit_problem
+from ceres_cal.moves.poses import PoseSearch, equations, moved_from, moved_words, movement, pose_candidates
+from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, loosened, make_plan, refit_problem
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
@@ -259,7 +259,7 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:
-    words, moves, known = [], movements(plan.calibration, result), plan.calibration.uncertainty.posterior
+    words, moves, known = [], movements(plan.calibration, result, plan.what), plan.calibration.uncertainty.posterior
     for name in sorted(plan.moved):
         how = moved_words(*moves[name], known, plan.stations[name]) if name in moves else "is new"
         words.append(f"station {name!r} {how}")
@@ -270,14 +270,19 @@ def _explained(plan: RefitPlan, result: Calibration) -> str:
     return "; ".join(words)
 
 
-def movements(before: Calibration, after: Calibration) -> dict[str, tuple[float, float]]:
-    """How far (m) and by how much (degrees) each station that both have stands elsewhere."""
+def movements(before: Calibration, after: Calibration, what: str = "pose") -> dict[str, tuple[float, float]]:
+    """How far (m) and by how much (degrees) each station that both have was moved, by a refit of `what`."""
+    known, old = before.uncertainty.posterior, before.estimate
     moves = {}
-    for name, station in after.estimate.stations.items():
-        if name in before.estimate.stations:
-            old = before.estimate.stations[name].cam_from_world
-            shift_m, turn = movement(station.cam_from_world, old)
-            moves[name] = (shift_m, float(np.degrees(turn)))
+    for name in after.estimate.stations.keys() & old.stations.keys():
+        camera = old.stations[name].camera
+        let_go = loosened(what, camera, old.cameras[camera].lens)
+        shift_m, turn = (
+            moved_from(before.prior_of(tuple(set(known.keys_of(old, name)) - let_go)), name, after.estimate)
+            if known.knows_station(name)
+            else movement(after.estimate.stations[name].cam_from_world, old.stations[name].cam_from_world)
+        )
+        moves[name] = (shift_m, float(np.degrees(turn)))
     return moves
 
 
