@@ -127,6 +127,10 @@ class Sights(Frozen, Sequence["Sights"]):
         self, camera: str | None = None, station: str | None = None, placements: Container[str | None] | None = None
     ) -> Indices:
         """Numbers of the sights of this camera, station and these placements; None asks for nothing."""
+        if self.cameras == (camera,):
+            camera = None
+        if camera is station is placements is None:
+            return np.arange(len(self))
         numbers = [
             number
             for number, key in enumerate(self.keys)
