@@ -54,9 +54,9 @@ def assert_same(one: Calibration, other: Calibration) -> None:
 def test_one_file_given_twice_counts_once() -> None:
     twice = calibrate(combine([seen(), seen()]), RADIAL)
     assert_same(twice, calibrated())
-    assert twice.warnings == (
+    assert twice.remarks == (
         "936 observations of frame '0001', '0002', 'board_01', ... are there more than once: counted once",
-        *calibrated().warnings,
+        *calibrated().remarks,
     )
     assert len(twice.rejected) == 936 + len(calibrated().rejected)
     assert twice.outliers == calibrated().rejected
@@ -69,7 +69,7 @@ def test_frames_under_other_names_count_once(times: int) -> None:
     many = calibrate(combine([seen(), *(again(seen(), f"again {n}") for n in range(times))]), RADIAL)
     assert_same(many, calibrated())
     others = f", and so do {8 * times - 1} other frames"
-    assert many.warnings[0] == f"frame '0001 again 0' repeats frame '0001' point by point{others}: counted once"
+    assert many.remarks[0] == f"frame '0001 again 0' repeats frame '0001' point by point{others}: counted once"
     copies = [entry for entry in many.rejected if entry.frame == "0002 again 0"]
     assert copies and {entry.reason for entry in copies} == {"a copy of frame '0002'"}
 
@@ -78,7 +78,7 @@ def test_rows_twice_in_one_frame_count_once() -> None:
     points = taken(seen().points, np.sort(np.concatenate([np.arange(len(seen().points)), np.arange(5, 17)])))
     doubled = calibrate(replace(seen(), points=points), RADIAL)
     assert_same(doubled, calibrated())
-    assert doubled.warnings[0] == "12 observations of frame '0001' are there more than once: counted once"
+    assert doubled.remarks[0] == "12 observations of frame '0001' are there more than once: counted once"
     assert [entry.row for entry in doubled.rejected] == list(range(6, 30, 2))
 
 

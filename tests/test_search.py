@@ -71,6 +71,7 @@ def test_seen_alike_from_two_places() -> None:
     assert re.match(
         r"station 'hall': what it shows is seen alike from \(.*\) m and from \(2\.80, 0\.50, 4\.00\)", warning
     )
+    assert calibration.ambiguities == (warning,)
     judged = judge_quality(quality_of(calibration, three))
     assert judged.level == "no" and "is seen alike from another place" in judged.headline
     assert off_in_sd(calibration) < 1.0  # 0.7

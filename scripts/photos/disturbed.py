@@ -190,7 +190,8 @@ def disturbed_rows(runs: int, kinds: Sequence[str] = tuple(KINDS)) -> Iterator[R
         for seed, one in enumerate(over(partial(_disturbed, name), range(runs))):
             every.append(one)
             said = one.why or f"{one.mean_mm:.2f} mm, {one.over_stated:.2f} of stated"
-            print(f"{name} {seed}: {said}, {one.lens} {one.seconds:.1f} s", file=sys.stderr)
+            wrong = f", WRONG BUT TRUSTED ({100.0 * one.beyond:.0f} % beyond)" if one.certified else ""
+            print(f"{name} {seed}: {said}, {one.lens} {one.seconds:.1f} s{wrong}", file=sys.stderr)
         yield from _rows(name, every, kind.most_mm)
 
 

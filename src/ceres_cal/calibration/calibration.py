@@ -52,7 +52,8 @@ if TYPE_CHECKING:
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice", "as_built", "effects"),
+    *("phi_from", "warnings", "remarks", "ambiguities", "digest", "versions", "conflicts", "lens_choice", "as_built"),
+    "effects",
 )
 """What the file has as it is."""
 
@@ -67,7 +68,8 @@ class Calibration(Frozen):
         rounds: solves it took. history: cost at each iteration of the last one.
         phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on; after a refit
             "posterior", where phi is under what was known of it.
-        warnings: what to know before using it, each one line.
+        warnings: what may be wrong with it, each one line. remarks: what was made of the observations, which costs no
+            trust. ambiguities: those warnings that say that the world is seen alike from another place.
         posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
@@ -98,6 +100,8 @@ class Calibration(Frozen):
     lens_choice: LensChoice | None = None
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
+    remarks: tuple[str, ...] = ()
+    ambiguities: tuple[str, ...] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

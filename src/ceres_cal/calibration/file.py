@@ -301,6 +301,8 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     lens_choice: LensChoice | None = None
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
+    remarks: tuple[str, ...] = ()
+    ambiguities: tuple[str, ...] = ()
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:

@@ -45,10 +45,10 @@ _UNKNOWN = (
 _LOST = 1e3
 # Times the standard deviation of phi without what is usual of cameras: what rests on it is said.
 _RESTING = 1.5
-RESTING = "are determined only with what is usual of cameras"
 _USUAL = (
-    f"camera {{!r}}: phi and the numbers correlated with it {RESTING} (a usual phi, a principal point near the "
-    "middle of the image, square pixels, little decentring). Without that the standard deviation of phi is {}"
+    "camera {!r}: phi and the numbers correlated with it are determined only with what is usual of cameras (a usual "
+    "phi, a principal point near the middle of the image, square pixels, little decentring). Without that the standard "
+    "deviation of phi is {}"
 )
 _OBLONG = (
     "camera {!r}: fy / fx comes out as {:.4f}. Few cameras have pixels so far from square. If its pixels are "
@@ -58,8 +58,6 @@ _BEHIND = (
     "camera {!r} sees all {} checkerboards from behind: its pictures are mirrored, x and y of its pixels or rows and "
     "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
 )
-
-OWN_NOISE = "each counts by its own noise; look whether the photographs of the noisiest are sharp"
 
 
 def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
@@ -137,7 +135,10 @@ def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
     """Words about cameras whose observations scatter otherwise than the others', beside what is stated of them."""
     if noise:
         each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())
-        yield f"beside what was stated of them the cameras are not equally noisy ({each} times the mean): {OWN_NOISE}"
+        yield (
+            f"beside what was stated of them the cameras are not equally noisy ({each} times the mean): each counts by "
+            "its own noise; look whether the photographs of the noisiest are sharp"
+        )
 
 
 def _share_text(share: float) -> str:
@@ -164,6 +165,7 @@ def came_out(
         observations.warnings,
         problem.options,
         observations.digest,
+        remarks=observations.remarks,
     )
 
 
@@ -196,6 +198,7 @@ def of_all(calibration: Calibration, settled: Settled) -> Calibration:
         ),
         rejected=_rejected(observations, used.rows, sigmas, settled.explanations),
         warnings=observations.warnings,
+        remarks=observations.remarks,
     )
 
 

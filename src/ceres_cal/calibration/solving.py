@@ -181,23 +181,24 @@ def known_of(seen: Explained) -> Calibration:
     explanations = settled.explanations if settled else seen.explanations
     effects = seen.effects
     warnings = (*(one.warning for one in explanations), *(one.warning for one in effects if one.is_solved))
-    posterior = None
+    posterior, alike, remarks = None, dict[str, bool](), tuple[str, ...]()
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)
-        alike = seen_alike(seen.others, seen.end.estimate, posterior.half_width)
-        phi = (*unknown_phi(seen.end, posterior), *resting_phi(seen.end, seen.problem))
+        alike = dict(seen_alike(seen.others, seen.end.estimate, posterior.half_width))
         strange = (
             *unusual_pixels(seen.end, seen.problem),
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
-            *noisier_cameras(seen.problem.observations.noise),
         )
-        warnings = (*warnings, *conflicts.words, *phi, *strange, *alike)
+        warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
+        remarks = (*resting_phi(seen.end, seen.problem), *noisier_cameras(seen.problem.observations.noise))
     calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)
     wholes = [one.rows for one in seen.explanations if one.is_taken]
     warnings = (*calibration.warnings, *require_usable(seen.end, seen.problem, wholes), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
+    apart = tuple(text for text, is_apart in alike.items() if is_apart)
+    calibration = replace(calibration, remarks=(*calibration.remarks, *remarks), ambiguities=apart)
     tolerances = {**seen.problem.options.tolerances, **tolerances_of(seen.as_built)}
     options = replace(seen.problem.options, tolerances=tolerances)
     return replace(calibration, options=options, as_built=seen.as_built, effects=effects)

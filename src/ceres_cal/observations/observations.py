@@ -201,9 +201,13 @@ class Observations(Content):
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What to know of the observations first, a line each: strays outside an image, odd sizes, copies."""
-        copied = self.copies.words(self.views, (self.points, self.curves))
-        return (*self.require_inside(), *odd_sizes(self), *copied)
+        """What may be wrong with the observations, a line each: strays outside an image, odd sizes."""
+        return (*self.require_inside(), *odd_sizes(self))
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """What was made of them, a line each: which are copies, that count once."""
+        return tuple(self.copies.words(self.views, (self.points, self.curves)))
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:

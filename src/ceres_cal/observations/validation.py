@@ -166,8 +166,6 @@ def odd_sizes(content: Content) -> Iterator[str]:
 
 Hashes = NDArray[np.uint64]
 
-COUNTED_ONCE = ": counted once"
-"""How a line about copies ends."""
 # Large odd numbers without pattern, those of splitmix64: what the parts of a row are multiplied with.
 _X, _FEATURE, _FRAME = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
@@ -204,11 +202,11 @@ class Copies(Frozen):
         frames = [pair for pair in rows if pair[0] != pair[1]]
         if frames:
             more = f", and so do {len(frames) - 1} other frames" if len(frames) > 1 else ""
-            yield f"frame {frames[0][0]!r} repeats frame {frames[0][1]!r} point by point{more}{COUNTED_ONCE}"
+            yield f"frame {frames[0][0]!r} repeats frame {frames[0][1]!r} point by point{more}: counted once"
         twice = {frame: count for (frame, first), count in rows.items() if frame == first}
         if twice:
             some = ", ".join(map(repr, list(twice)[:3])) + (", ..." if len(twice) > 3 else "")
-            yield f"{sum(twice.values())} observations of frame {some} are there more than once{COUNTED_ONCE}"
+            yield f"{sum(twice.values())} observations of frame {some} are there more than once: counted once"
 
 
 def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies:

@@ -13,15 +13,12 @@ from msgspec import Struct
 from ceres_cal.base.arrays import median
 from ceres_cal.base.words import HEIGHTS_M, counted, ended, first_of, mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.outcome import OWN_NOISE, RESTING
 from ceres_cal.diagnostics import Finding
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.observations.validation import COUNTED_ONCE
 from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.quality import FaultyMap, Quality
 from ceres_cal.robust.as_built import words_of
-from ceres_cal.robust.other_minima import PLACES_APART
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
@@ -143,8 +140,8 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     known = [conflict.words for conflict in calibration.conflicts]
     for text in calibration.warnings:
         if text not in known:
-            is_harmless = text.endswith((COUNTED_ONCE, OWN_NOISE)) or RESTING in text  # in every standard deviation
-            yield "" if is_harmless else "no" if PLACES_APART in text else "care", ended(text)
+            yield "no" if text in calibration.ambiguities else "care", ended(text)
+    yield from (("", ended(text)) for text in calibration.remarks)  # which are in every standard deviation
 
 
 def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
@@ -323,7 +320,7 @@ def _doubt(quality: Quality) -> str:
         return _UNJUDGED
     if disputed(quality):
         return "the observations contradict what was stated beforehand"
-    if any(PLACES_APART in text for text in quality.calibration.warnings):  # 3.8 m apart once, each known to 42 mm
+    if quality.calibration.ambiguities:  # 3.8 m apart once, each known to 42 mm
         return "what a station shows is seen alike from another place"
     if noise_ratio(quality) >= LARGE_NOISE:
         return f"the noise is {short(noise_ratio(quality))} times the stated sigma"

@@ -115,7 +115,7 @@ def stopped(calibration: Calibration) -> Section:
 def warnings(calibration: Calibration) -> Iterator[str]:
     """What to know of it, and what may be wrong with the observations."""
     large_scale = 4.0  # from where on a warning is due
-    yield from calibration.warnings
+    yield from (*calibration.warnings, *calibration.remarks)
     yield from (text for _, text in of_the_solve(calibration))
     scale = max(calibration.fit.scales)
     if calibration.rounds and scale > large_scale:

@@ -221,12 +221,9 @@ def minima_of(
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
 
 
-PLACES_APART = ", where it shows other places on the floor"
-
-
-def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[str]:
-    """A warning for each station that may stand elsewhere, with the likeliest other place; of those where it shows
-    other places on the floor, if there are any.
+def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[tuple[str, bool]]:
+    """A warning for each station that may stand elsewhere, with the likeliest other place, and whether it shows other
+    places on the floor from there: of those, if there are any.
 
     Args:
         others, half_width: see `minima_of`.
@@ -242,8 +239,12 @@ def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float
             there = (apart or elsewhere)[0].position
             first, second = (f"({', '.join(f'{value:.2f}' for value in place)}) m" for place in (here, there))
             yield (
-                f"station {name!r}: what it shows is seen alike from {first} and from {second}"
-                f"{PLACES_APART if apart else ''}: add a point or a line, or the camera's height as a prior"
+                (
+                    f"station {name!r}: what it shows is seen alike from {first} and from {second}"
+                    f"{', where it shows other places on the floor' if apart else ''}: add a point or a line, or the "
+                    "camera's height as a prior"
+                ),
+                bool(apart),
             )
 
 
