@@ -113,12 +113,19 @@ def read_observations(paths: Iterable[str | Path]) -> Observations:
     return observations.combine([Observations.load(path) for path in paths])
 
 
-def station_of(path: Path, station: str | None, calibration: Calibration) -> str:
-    """Name of the station in --station, or of the only one there is in a calibration out of a file."""
-    if station is None and len(calibration.stations) > 1:
-        raise InputError(f"{path} has several stations, name one: --station {' or '.join(calibration.stations)}")
-    calibration.station(station)  # or says which there are
-    return station or next(iter(calibration.stations))
+def station_of(path: Path, station: str | None, calibration: Calibration, camera: str | None = None) -> str:
+    """Name of the station in --station, or of the only one there is in a calibration out of a file, or of --camera."""
+    stations = calibration.estimate.stations
+    if camera is not None and camera not in calibration.cameras:
+        raise InputError(no_such("camera", camera, calibration.cameras))
+    if station is not None:
+        calibration.station(station)  # or says which there are
+    fitting = [name for name, one in stations.items() if station in (None, name) and camera in (None, one.camera)]
+    if station is not None and not fitting:
+        raise InputError(f"station {station!r} is of camera {stations[station].camera!r}: leave out --camera")
+    if len(fitting) > 1:
+        raise InputError(f"{path} has several stations, name one: --station {' or '.join(fitting)}")
+    return fitting[0]
 
 
 # ---- files ----------------------------------------------------------------------------------------------------------

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from ceres_cal import detect, posterior, report, scene
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.images import image_files
-from ceres_cal.base.words import frame_of, no_such
+from ceres_cal.base.words import frame_of
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, argument, command, flag, given, option, switch
-from ceres_cal.cli.files import read_calibration, read_observations, require_folder, save
+from ceres_cal.cli.files import read_calibration, read_observations, require_folder, save, station_of
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -148,26 +148,6 @@ def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[
     return outputs
 
 
-def _station(args: UndistortArguments, calibration: Calibration) -> str:
-    """The station that took the photographs; --camera is enough where it stood at one only."""
-    stations = calibration.estimate.stations
-    if args.station is not None:
-        calibration.station(args.station)  # or says which there are
-    if args.camera is not None and args.camera not in calibration.cameras:
-        raise InputError(no_such("camera", args.camera, calibration.cameras))
-    fitting = [
-        name
-        for name, station in stations.items()
-        if args.station in (None, name) and args.camera in (None, station.camera)
-    ]
-    if not fitting:
-        owner = stations[str(args.station)].camera
-        raise InputError(f"station {args.station!r} is of camera {owner!r}: leave out --camera")
-    if len(fitting) > 1:
-        raise InputError(f"there are several stations, name one: --station {' or '.join(fitting)}")
-    return fitting[0]
-
-
 def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, str | None, scene.Camera]:
     """Names of the camera and of its station, where that is one, and the camera, posed in that case."""
     owners = {name: station.camera for name, station in calibration.estimate.stations.items()}
@@ -175,7 +155,7 @@ def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, st
     if args.station is None and len(wanted) == 1 and list(owners.values()).count(*wanted) > 1:
         (name,) = wanted
         return name, None, calibration.cameras[name]  # several stations: straight all the same
-    station = _station(args, calibration)
+    station = station_of(args.calibration, args.station, calibration, args.camera)
     return owners[station], station, calibration.stations[station]
 
 
@@ -244,7 +224,7 @@ def _black(size: tuple[int, int], count: int) -> str:
 
 
 def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    station = _station(args, calibration)
+    station = station_of(args.calibration, args.station, calibration, args.camera)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     area = args.area or _field(calibration)
     mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
@@ -281,7 +261,8 @@ def _field(calibration: Calibration) -> Area:
 
 
 def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    station, height = _station(args, calibration), arguments.metres(args.height_mm)
+    station = station_of(args.calibration, args.station, calibration, args.camera)
+    height = arguments.metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     before = None if args.before is None else read_calibration(args.before)
     observations = None if args.observations is None else read_observations([args.observations])
