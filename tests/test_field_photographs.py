@@ -157,13 +157,13 @@ def test_what_robots_hide_is_not_observed(shot: script.Shot) -> None:
 
 def test_crossings_lie_where_branches_meet(shot: script.Shot) -> None:
     found = follow(shot.grey, FIELD, [shot.camera], FIELD.curve_names)
-    met = find_crossings(FIELD, found.camera, found.lines)
+    met, used = find_crossings(FIELD, found.camera, found.lines)
     truth = shot.camera.project(FIELD.point_array[met.feature])
     error = met.pixels - truth
     assert len(met.feature) >= 6
     assert np.max(np.abs(error)) < 0.15  # 0.05 px
     assert np.std(error / met.sigma_px[:, None]) == pytest.approx(1.0, abs=0.4)
-    assert np.all(found.lines.found[met.used])
+    assert np.all(found.lines.found[used])
 
 
 def test_where_places_scatter_more_than_stated_so_do_crossings(shot: script.Shot) -> None:
@@ -174,7 +174,7 @@ def test_where_places_scatter_more_than_stated_so_do_crossings(shot: script.Shot
             rng.random(len(found.lines.course)) < 0.125, 10.0, 1.0
         )
         lines = replace(found.lines, offset_px=noise * found.lines.sigma_px)
-        met = find_crossings(FIELD, found.camera, lines)
+        met, _ = find_crossings(FIELD, found.camera, lines)
         error = met.pixels - found.camera.project(FIELD.point_array[met.feature])
         pulls.append((error / met.sigma_px[:, None]).ravel())
     assert np.std(np.concatenate(pulls)) < 2.0  # 1.24; by the stated sigmas alone 4.0

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenery import overhead_pose
 from scipy.optimize import minimize_scalar
+from scipy.stats import norm
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Indices32
@@ -849,3 +850,12 @@ def test_no_saddle_is_looked_for_outside_of_a_picture() -> None:
     fitted = np.zeros((3, 14))
     kernels.fit_saddles(np.ones((10, 10), np.float32), starts, fitted)
     assert np.isnan(fitted).all()
+
+
+def test_the_normal_distribution_is_told_far_out() -> None:
+    """As far as there are numbers, of any shape."""
+    x = np.array([[-37.0, -8.0, -1.0], [0.0, 2.0, 9.0]])
+    found = kernels.normal_cdf(x)
+    assert np.allclose(found, norm.cdf(x), rtol=1e-12, atol=0.0)
+    assert kernels.normal_cdf([-np.inf, np.inf]).tolist() == [0.0, 1.0] and np.isnan(kernels.normal_cdf(np.nan))
+    assert kernels.normal_cdf(x.T[::2]).tolist() == found.T[::2].tolist()

@@ -238,7 +238,7 @@ def floor_rows(runs: int) -> Iterator[Row]:
                 continue
             means.append(float(np.mean(floor_error_mm(shot, calibration.station()))))
             (followed,) = found.found.values()
-            met = find_crossings(shot.target, followed.camera, followed.lines)
+            met, _ = find_crossings(shot.target, followed.camera, followed.lines)
             truth = shot.camera.project(shot.target.point_array[met.feature])
             point_pulls.append(((met.pixels - truth) / met.sigma_px[:, None]).ravel())
     pull = np.concatenate(point_pulls)

@@ -23,34 +23,6 @@ _MOST_TERMS = 20_000
 _lgamma = np.vectorize(math.lgamma, otypes=[float])
 
 
-# Of Chebyshev's expansion of the complementary error function (Press et al., Numerical Recipes, section 6.2): relative
-# errors below 1.2e-7 everywhere.
-_CHEBYSHEV = (
-    0.17087277,
-    -0.82215223,
-    1.48851587,
-    -1.13520398,
-    0.27886807,
-    -0.18628806,
-    0.09678418,
-    0.37409196,
-    1.00002368,
-)
-
-
-def normal_cdf(x: ArrayLike) -> Array:
-    """Probability that a standard normal variable is smaller, to seven digits."""
-    farthest = 40.0  # standard deviations beyond which a tail is no number
-    z = np.clip(np.asarray(x, dtype=float), -farthest, farthest) / -math.sqrt(2.0)
-    t = np.asarray(1.0 / (1.0 + 0.5 * np.abs(z)))
-    series = np.zeros_like(t)
-    for coefficient in _CHEBYSHEV:
-        series += coefficient
-        series *= t
-    above = 0.5 * t * np.exp(np.minimum(-z * z - 1.26551223 + series, 0.0))
-    return np.asarray(np.where(z >= 0.0, above, 1.0 - above))
-
-
 def upper_tail(value: float, degrees: int, freedom: float = math.inf) -> float:
     """Probability that a chi-squared variable is larger.
 

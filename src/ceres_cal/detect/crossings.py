@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
+from ceres_cal.observations import Points
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import distance_to_curve, nearest_on_curve
 from ceres_cal.scene.targets import Target
@@ -15,20 +16,6 @@ from ceres_cal.scene.targets import Target
 # Places that scatter as stated, beside those of a branch, which are few: where these scatter more (worn paint ends in
 # one, a shadow in another), so does where it leads. From 0 to 8 nothing changes but the largest errors.
 _AS_STATED = 2.0
-
-
-class Crossings(Frozen):
-    """Points of a target as their branches tell.
-
-    Attributes:
-        feature: (P,) index among the target's points. pixels: (P, 2). sigma_px: (P,) of each coordinate, on average.
-        used: (N,) the lines' places that went into them; who takes both must leave these out, or pixels count twice.
-    """
-
-    feature: Indices32
-    pixels: Array
-    sigma_px: Array
-    used: Mask
 
 
 class _Branch(Frozen):
@@ -40,8 +27,9 @@ class _Branch(Frozen):
     rows: Indices
 
 
-def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
-    """Every point of the target in which at least two measured curves meet.
+def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points, Mask]:
+    """Every point of the target in which at least two measured curves meet; and the lines' places (N,) that went into
+    them: who takes both must leave these out, or pixels count twice.
 
     Each branch is a parabola through the offsets of its nearest places from the course: the course itself bends as lens
     and arc do, but for what a formula of the lens leaves. Straight lines were up to nine standard deviations off.
@@ -63,7 +51,8 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
             sigmas.append(met[1])
             for branch in branches:
                 used[branch.rows] = True
-    return Crossings(np.array(features, np.int32), np.reshape(pixels, (-1, 2)), np.array(sigmas, float), used)
+    columns = np.array(features, np.int32), np.reshape(pixels, (-1, 2)), np.array(sigmas, float)
+    return Points(np.zeros(len(features), np.int32), *columns), used
 
 
 def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:

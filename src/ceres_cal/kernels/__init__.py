@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Array32, Indices
 
@@ -217,6 +218,16 @@ def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, 
 def loss_weights(loss: Loss, squared: Array, weights: Array) -> None:
     """rho' at each squared residual, to `weights` (N,): what an observation has in the solve."""
     core().loss_weights(loss, squared, weights)
+
+
+# ---- statistics -----------------------------------------------------------------------------------------------------
+
+
+def normal_cdf(x: ArrayLike) -> Array:
+    """Probability that a standard normal variable is smaller, of each x."""
+    shares = np.empty(np.shape(x))
+    core().normal_cdf(np.ravel(x), shares.reshape(-1))
+    return shares
 
 
 # ---- photographs ----------------------------------------------------------------------------------------------------

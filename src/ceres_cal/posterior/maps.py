@@ -22,8 +22,9 @@ from ceres_cal.base.arrays import Array, Mask, grid_places, largest
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.shown import brief, drawn
-from ceres_cal.base.tails import NORMAL_95, normal_cdf
+from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
+from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.bent import weak_axes
 from ceres_cal.posterior.mixture import FARTHER, Mixture, quantiles, radii
 from ceres_cal.posterior.posterior import Posterior

@@ -35,7 +35,7 @@ from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import SearchResult, SeveralWaysError, search
 from ceres_cal.detect.strokes import Strokes, strokes_of_signs
-from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Points, Prior, View, combine
+from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Prior, View, combine
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
 from ceres_cal.scene.camera import Camera
@@ -371,11 +371,11 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
     built = followed.built
     if options.points:
-        met = find_crossings(followed.target, camera, lines)
-        laid = target.point_array[met.feature] + built.scatter_m * np.eye(3)[:2, None]
-        laid_px = np.linalg.norm(camera.project(laid.reshape(-1, 3)).reshape(2, -1, 2) - met.pixels, axis=2)
-        sigma = np.hypot(met.sigma_px, laid_px.mean(axis=0)) if built.scatter_m else met.sigma_px
-        points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, sigma), met.used
+        points, used = find_crossings(followed.target, camera, lines)
+    if built.scatter_m:
+        laid = target.point_array[points.feature] + built.scatter_m * np.eye(3)[:2, None]
+        laid_px = np.linalg.norm(camera.project(laid.reshape(-1, 3)).reshape(2, -1, 2) - points.pixels, axis=2)
+        points = replace(points, sigma_px=np.hypot(points.sigma_px, laid_px.mean(axis=0)))
     curves, beside = _curves(lines, lines.found & ~used, options.edges), followed.beside
     if beside is not None:
         aside = _curves(beside, beside.found, options.edges)

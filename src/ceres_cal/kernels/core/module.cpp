@@ -93,6 +93,13 @@ void loss_weights(Tuple given, const Read<N>& squared, const Filled<N>& weights)
     });
 }
 
+void normal_cdf(const Read<N>& x, const Filled<N>& shares) {
+    require(shares.size() == x.size(), "x and shares are (N,)");
+    unlocked([&] {
+        for (size_t i = 0; i < x.size(); ++i) shares.data()[i] = 0.5 * std::erfc(-x.data()[i] / std::sqrt(2.0));
+    });
+}
+
 bool block(Tuple optics, Tuple unknowns, Tuple points, Tuple curves, Tuple loss, Tuple at, const Filled<N>& residuals,
            Tuple jacobians) {
     Seen seen(0, 1, optics, unknowns, points, curves, loss);
@@ -256,6 +263,7 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("radial_alignment", &radial_alignment);
     m.def("cholesky", &factor);
     m.def("loss_weights", &loss_weights);
+    m.def("normal_cdf", &normal_cdf);
     m.def("evaluate_block", &block);
     m.def("eliminate_placements", &eliminate_placements);
     m.def("sight_normals", &sight_normals);
