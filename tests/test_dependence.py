@@ -21,7 +21,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
 from ceres_cal.effects.groups import _averaged, _expected
 from ceres_cal.effects.likelihood import likelihoods
-from ceres_cal.effects.strands import Strand, StrandFamily, _shown, decay, distances_of
+from ceres_cal.effects.strands import Strand, StrandFamily, _shown, decay, decays, distances_of
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
@@ -108,6 +108,13 @@ def test_what_all_frames_share_does_not_shrink_with_them() -> None:
     assert six.posterior is not None and six.posterior.dependence is not None
     assert six.posterior.dependence.correlations[0].lasting
     assert np.median(ratio) == pytest.approx(1.0, abs=0.35)  # the model alone: 0.4 and less
+
+
+def test_lengths_that_halve_are_squares() -> None:
+    distance = np.linspace(0.0, 9.0, 50)
+    places = [(160.0, False), (8.0, True), (8.0, False), (4.0, False), (1.0, True), (0.5, False)]
+    for place, correlation in zip(places, decays(distance, places), strict=True):
+        assert correlation == pytest.approx(decay(distance, *place), rel=1e-13, abs=1e-29)  # 4e-14 measured
 
 
 def test_what_all_frames_share_of_points_does_not_shrink_either() -> None:

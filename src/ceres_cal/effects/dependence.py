@@ -32,7 +32,7 @@ from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.strands import (
     Strand,
     StrandFamily,
-    decay,
+    decays,
     distances_of,
     families_of,
     go_over_groups,
@@ -166,11 +166,15 @@ class _Average(Frozen):
         places, used, together = strand.places, weights > 0.0, dict[tuple[float, bool], float]()
         for *place, weight in zip(self.at.length_m[here][used], self.at.smooth[here][used], weights[used], strict=True):
             together[*place] = together.get((*place,), 0.0) + weight
+        along = sorted(together, reverse=True)
+        each = [together[place] for place in along]
         kernel = np.zeros((len(places), len(places)))
         for first in range(0, len(places) if together else 0, rows):
-            distance = distances_of(places[first : first + rows], places)
-            for (length, smooth), weight in sorted(together.items()):
-                kernel[first : first + rows] += weight * decay(distance, length, smooth)
+            distance = distances_of(places[first : first + rows], places[first:])
+            part = kernel[first : first + rows, first:]
+            for weight, correlation in zip(each, decays(distance, along), strict=True):
+                part += weight * correlation
+            kernel[first:, first : first + rows] = part.T  # as far from the one to the other as back
         return kernel
 
 

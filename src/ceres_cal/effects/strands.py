@@ -120,6 +120,21 @@ def decay(distance: Array, length: float, smooth: bool) -> Array:
     return np.asarray(correlation)
 
 
+def decays(distance: Array, places: Sequence[tuple[float, bool]]) -> Iterator[Array]:
+    """Correlation at distances, by lengths and smoothness, the longest first: half a length is a square."""
+    last: dict[bool, tuple[float, Array]] = {}
+    for length, smooth in places:
+        before, correlation = last.get(smooth, (0.0, distance))
+        times = float(np.log2(before / length)) if before else np.inf
+        if times.is_integer():
+            for _ in range(int(times) * (2 if smooth else 1)):
+                correlation = correlation * correlation
+        else:
+            correlation = decay(distance, length, smooth)
+        last[smooth] = length, correlation
+        yield correlation
+
+
 class StrandFamily(Frozen):
     """S strands side by side, of M rows each at most that are looked at.
 
