@@ -274,7 +274,7 @@ def movements(before: Calibration, after: Calibration, what: str = "pose") -> di
     """How far (m) and by how much (degrees) each station that both have was moved, by a refit of `what`."""
     known, old = before.uncertainty.posterior, before.estimate
     moves = {}
-    for name in after.estimate.stations.keys() & old.stations.keys():
+    for name in filter(old.stations.__contains__, after.estimate.stations):
         camera = old.stations[name].camera
         let_go = loosened(what, camera, old.cameras[camera].lens)
         shift_m, turn = (
