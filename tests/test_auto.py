@@ -23,9 +23,8 @@ from ceres_cal.detect.images import light
 from ceres_cal.detect.lines import SPACING_PX, measure
 from ceres_cal.detect.photographs import Auto, Facing, detect_field
 from ceres_cal.detect.photographs.candidates import candidates, off_centre, prepare_search
-from ceres_cal.detect.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
 from ceres_cal.detect.photographs.follow import Tracker
-from ceres_cal.detect.photographs.grid import grid_of
+from ceres_cal.detect.photographs.grid import agreeing_with_facing, grid_of, nearest_to_before, side_of
 from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import search

@@ -13,7 +13,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import light
 from ceres_cal.detect.photographs.beside import among_others
-from ceres_cal.detect.photographs.clicks import unknown_optics
+from ceres_cal.detect.photographs.by_hand import unknown_optics
 from ceres_cal.detect.photographs.painted import visible_curves
 from ceres_cal.detect.photographs.refit import observations_of, refit_camera
 from ceres_cal.detect.strokes import find_narrow_strokes, find_strokes

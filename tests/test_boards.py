@@ -16,8 +16,8 @@ from ceres_cal.base.threads import at_most
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect import boards
 from ceres_cal.detect.boards import BoardDetections, detect_boards, right_handed
-from ceres_cal.detect.charuco import CharucoSpec
 from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.markers import CharucoSpec
 from ceres_cal.detect.partly import part_of_board
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ceres_cal import InputError, Observations, custom, ssl_field
-from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.detect.photographs.by_hand import Clicks, starts_from_clicks
 from ceres_cal.scene.curves import Arc, Curve, Segment, crossings, distance_to_curve
 
 number = st.floats(-3.0, 3.0, allow_nan=False)

@@ -19,7 +19,7 @@ from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
 from ceres_cal.detect.photographs import Auto, Clicks, FieldDetections, FieldOptions, detect_field
 from ceres_cal.detect.photographs.as_built import FieldAsBuilt, as_built
-from ceres_cal.detect.photographs.clicks import unknown_optics
+from ceres_cal.detect.photographs.by_hand import unknown_optics
 from ceres_cal.detect.photographs.field import _observations
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.matching import StrokeMap

@@ -24,7 +24,7 @@ from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
 from ceres_cal.detect.photographs import Clicks, FieldDetections, FieldOptions, detect_field, load_clicks
-from ceres_cal.detect.photographs.clicks import FORMAT, clicks_from_json
+from ceres_cal.detect.photographs.by_hand import FORMAT, clicks_from_json
 from ceres_cal.detect.photographs.field import _signs
 from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.observations import Observations

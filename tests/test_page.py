@@ -30,7 +30,7 @@ from ceres_cal.cli.page.server import serve
 from ceres_cal.cli.page.session import KEPT, Session, opened
 from ceres_cal.cli.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
 from ceres_cal.detect.photographs import Clicks, by_hand, load_clicks
-from ceres_cal.detect.photographs.clicks import starts_from_clicks
+from ceres_cal.detect.photographs.by_hand import starts_from_clicks
 from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import targets_by_name

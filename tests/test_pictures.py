@@ -36,8 +36,7 @@ from ceres_cal.report.pictures.frames import (
     model_of,
     photographs_of,
 )
-from ceres_cal.report.pictures.model import model_seen
-from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay
+from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay, model_seen
 from ceres_cal.report.pictures.straight import Straight, straighten
 from ceres_cal.report.pictures.warp import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera

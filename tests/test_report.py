@@ -29,8 +29,7 @@ from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, reaches, worst
 from ceres_cal.report.maps import levels_of
-from ceres_cal.report.material import Material
-from ceres_cal.report.quality import quality_of
+from ceres_cal.report.quality import Material, quality_of
 from ceres_cal.report.residual_pictures import significant_means
 from ceres_cal.report.scale import COLORS, MM, PX
 from ceres_cal.report.solve_pictures import ideal_radii

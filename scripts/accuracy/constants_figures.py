@@ -46,7 +46,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.detect.photographs import Auto
-from ceres_cal.detect.photographs.clicks import starts_from_clicks
+from ceres_cal.detect.photographs.by_hand import starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.diagnostics.advice import advise

@@ -29,7 +29,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.detect.photographs.by_hand import Clicks, starts_from_clicks
 from ceres_cal.diagnostics.advice import advise
 from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations, Prior

@@ -27,7 +27,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main as cli
 from ceres_cal.cli.command import COMMANDS, Parser
 from ceres_cal.detect.images import read_colour, read_grey
-from ceres_cal.detect.photographs.clicks import load_clicks
+from ceres_cal.detect.photographs.by_hand import load_clicks
 from ceres_cal.formats import LookupTable, export, make_lookup_table, read_foreign
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options

@@ -12,7 +12,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import grouped
 
 _MOST_LINES, _MOST_LETTERS = 9, 70  # of a text; and of a value in it
-_PICTURES = "ceres_cal.report.plots"  # far above: it is loaded when somebody draws
+_PICTURES = "ceres_cal.report"  # far above: it is loaded when somebody draws
 
 Shown = tuple[str, Sequence[tuple[str, ...]]]
 """A line that says what an object is, and rows on what it holds."""
@@ -55,7 +55,8 @@ def html_of(shown: Shown) -> str:
 
 
 def drawn(picture: str, thing: Any, ax: Any, **how: Any) -> Any:
-    """Draw a picture of the report into the given Axes, or into those that pyplot draws in; returns the Axes.
+    """Draw a picture of the report, "module.function", into the given Axes, or into those that pyplot draws in; returns
+    the Axes.
 
     Raises:
         InputError: Matplotlib is not installed, or ax is something else.
@@ -68,5 +69,6 @@ def drawn(picture: str, thing: Any, ax: Any, **how: Any) -> Any:
         ax = pyplot.gca()
     if not hasattr(ax, "contourf"):
         raise InputError(f"ax must be Matplotlib's Axes, not {type(ax).__name__}")
-    getattr(import_module(_PICTURES), picture)(thing, ax, **how)
+    module, _, name = picture.partition(".")
+    getattr(import_module(f"{_PICTURES}.{module}"), name)(thing, ax, **how)
     return ax

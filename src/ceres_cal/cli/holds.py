@@ -1,5 +1,6 @@
 """Does a calibration hold? `ceres-cal check`, `score`, `audit` and `compare`: it is held against new observations, or
-against another calibration; exit code 0 yes, 1 no, so that cron may ask.
+against another calibration; exit code 0 yes, 1 no, so that cron may ask. And after a move `refit`: the poses anew from
+few observations and all that was known.
 """
 
 from __future__ import annotations
@@ -8,21 +9,14 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import base, detect, formats, moves, report
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.words import HEIGHTS_M, at_height, fixed
-from ceres_cal.cli import arguments
+from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
-from ceres_cal.cli.files import (
-    read_calibration,
-    read_observations,
-    require_different,
-    require_output,
-    save,
-)
 from ceres_cal.cli.foreign import from_option, import_options, typed_options
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
@@ -30,6 +24,7 @@ from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
+    from ceres_cal.observations import Observations, Prior
 
 
 def _share(text: str) -> float:
@@ -63,7 +58,9 @@ def _check(
     if images:
         answer, detections = _photographed(args, images, false_alarms, checks)
     else:
-        answer = moves.check(read_calibration(args.calibration), read_observations(args.inputs), false_alarms, checks)
+        answer = moves.check(
+            files.read_calibration(args.calibration), files.read_observations(args.inputs), false_alarms, checks
+        )
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
     rate = f"({100.0 * false_alarms:g} % false alarms{often})"
     holds = f"{'yes' if answer.holds else 'no'} {rate}"
@@ -76,7 +73,7 @@ def _check(
 def _photographed(
     args: InputArguments, images: list[Path], false_alarms: float, checks: int
 ) -> tuple[moves.Agreements, detect.KnownDetections]:
-    calibration, not_painted = read_calibration(args.calibration), arguments.parse_names(args.not_painted)
+    calibration, not_painted = files.read_calibration(args.calibration), arguments.parse_names(args.not_painted)
     with progress_bar(args.silent) as bar:
         return detect.check_photographs(
             calibration,
@@ -138,13 +135,13 @@ def _score(
         "SIGMA",
     ),
 ) -> Document:
-    require_different(observations)
+    files.require_different(observations)
 
-    before = read_calibration(calibration)
+    before = files.read_calibration(calibration)
     asked = {name: value for name, value in (("loss", loss), ("reject_sigma", reject_sigma)) if value is not None}
     options = replace(before.options, **asked)
     return _scored(
-        moves.score(before, read_observations(observations), options=options, hold_stations=hold_stations), before
+        moves.score(before, files.read_observations(observations), options=options, hold_stations=hold_stations), before
     )
 
 
@@ -210,7 +207,7 @@ def _audit(
 
     ours = form is None and file.suffix == ".json" and b"ceres-cal/calibration" in base.read_bytes(file)[:4096]
     given = Calibration.load(file) if ours else formats.import_calibration(file, form, **typed_options(options, form))
-    stations = moves.audit(given, read_observations(observations))
+    stations = moves.audit(given, files.read_observations(observations))
     return Document(
         (
             Section(
@@ -261,8 +258,8 @@ def _compare(
     over_image: bool = switch("intrinsics, over the image in px; default where there is no field"),
     without_turn: bool = switch("the same without the turn that brings them nearest to each other"),
 ) -> Document:
-    require_output(picture, [a, b], "pictures are", ".svg")
-    first, second = read_calibration(a), read_calibration(b)
+    files.require_output(picture, [a, b], "pictures are", ".svg")
+    first, second = files.read_calibration(a), files.read_calibration(b)
     if not (over_image or without_turn or all(target.movable for target in first.targets.values())):
         return _over_field(first, second, arguments.metres(height_mm), station, picture)
     if picture is not None or station is not None:
@@ -281,7 +278,7 @@ def _over_field(
             names = " or ".join(comparisons)
             raise InputError(f"--picture shows one station: name it with --station {names}")
 
-        save(picture, report.comparison_svg(next(iter(comparisons.values())), first).encode())
+        files.save(picture, report.comparison_svg(next(iter(comparisons.values())), first).encode())
     return Document(tuple(section for one in comparisons.values() for section in _compared_station(one)))
 
 
@@ -335,3 +332,77 @@ def _explained(one: moves.Agreement) -> str:
         False: f"more than their uncertainties explain (probability {one.probability:.1g})",
         None: "no statement on uncertainty: one of the calibrations does not have it",
     }[one.holds]
+
+
+# ---- after a move: poses anew ---------------------------------------------------------------------------------------
+
+
+class RefitArguments(InputArguments, arguments.ReportArguments):
+    """What was seen after a move, and what may have changed."""
+
+    output: Path | None = arguments.output_option("the new calibration", None)
+    what: Literal["pose", "pose-only", "zoom", "iris", "everything"] = option(
+        "what is free: pose: poses, the intrinsics under what is known of them (default); pose-only: poses, the "
+        "intrinsics held; zoom: phi, too: nothing is known of it any more; iris: the lens's coefficients, too; "
+        "everything: all intrinsics, too",
+        default="pose",
+    )
+    moved: tuple[str, ...] = option(
+        "only this one moved (repeatable); default: all observed", "STATION", repeatable=True
+    )
+    hold_others: bool = switch("hold stations that did not move, and their cameras, exactly")
+    labels: Literal["check", "as-given", "turned"] = option(
+        "refuse labels that look turned by 180 degrees (default), believe them, or turn them", default="check"
+    )
+    prior: tuple[str, ...] = arguments.prior_option("STATION.height_m=VALUE:SIGMA", "a height measured after the move")
+
+
+@command(
+    "refit",
+    "after a move: poses anew, everything else under what was known",
+    "calibration.json now.png -o calibration.json",
+    "calibration.json new.json --what zoom -o calibration.json --report report.html",
+)
+def _refit(args: RefitArguments) -> Document:
+    images = photographs_in(args)
+    # To replace the old calibration is what many want.
+    files.require_outputs(args, images or args.inputs)
+    calibration = files.read_calibration(args.calibration)
+    observed = None if images else files.read_observations(args.inputs)
+    priors = _priors(args, calibration if observed is None else observed)
+    detections = _detected(args, calibration, images) if observed is None else None
+    observations = detections.require() if detections is not None else observed
+    assert observations is not None
+
+    photographs = files.report_photographs(args, observations, calibration, images)
+    result = moves.refit(
+        calibration,
+        observations,
+        args.what,
+        moved=args.moved or None,
+        options=moves.RefitOptions(args.hold_others, args.labels, priors),
+    )
+    about = result.refitted
+    assert about is not None
+    every = moves.movements(calibration, result, about.what).items()
+    moved = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in every}
+    explained = {"what": about.what, "explanation": about.explanation, "moved": moved}
+    first = Section("refit", about.explanation.split("; "), explained)
+    return files.calibrated(args, result, observations, photographs, args.inputs, first, shown(detections))
+
+
+def _priors(args: RefitArguments, known: Calibration | Observations) -> tuple[Prior, ...]:
+    owners = {"station": known.stations, "camera": known.cameras}
+    return tuple(arguments.parse_prior(spec, owners, {"station": ("height_m",)}) for spec in args.prior)
+
+
+def _detected(args: RefitArguments, calibration: Calibration, images: list[Path]) -> detect.KnownDetections:
+    moves.require_posterior(calibration)
+    station = files.station_of(args.calibration, args.station, calibration)
+    if strange := set(args.moved) - {station}:
+        raise InputError(
+            f"--moved {sorted(strange)[0]}: the photographs are of station {station!r}: name that, or none"
+        )
+    not_painted = arguments.parse_names(args.not_painted)
+    with progress_bar(args.silent) as bar:
+        return detect.detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)

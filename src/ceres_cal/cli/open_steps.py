@@ -14,7 +14,7 @@ from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.page.state import Made, Region, Sitting, State, target_words
 from ceres_cal.detect.images import encoded
-from ceres_cal.detect.photographs.clicks import FEWEST, FORMAT, VERSION
+from ceres_cal.detect.photographs.by_hand import FEWEST, FORMAT, VERSION
 from ceres_cal.formats import export_format
 from ceres_cal.report.document import Document
 from ceres_cal.scene.targets import Target

@@ -1,10 +1,10 @@
 from ceres_cal.detect.boards import BoardDetections as BoardDetections
 from ceres_cal.detect.boards import detect_boards as detect_boards
 from ceres_cal.detect.boards import finder_of as finder_of
-from ceres_cal.detect.charuco import CharucoSpec as CharucoSpec
 from ceres_cal.detect.images import encoded as encoded
 from ceres_cal.detect.images import read_colour as read_colour
 from ceres_cal.detect.images import read_grey as read_grey
+from ceres_cal.detect.markers import CharucoSpec as CharucoSpec
 from ceres_cal.detect.median import MOST_PICTURES as MOST_PICTURES
 from ceres_cal.detect.median import Merged as Merged
 from ceres_cal.detect.median import merged as merged
@@ -20,9 +20,9 @@ from ceres_cal.detect.photographs import check_photographs as check_photographs
 from ceres_cal.detect.photographs import detect_field as detect_field
 from ceres_cal.detect.photographs import detect_known as detect_known
 from ceres_cal.detect.photographs import load_clicks as load_clicks
-from ceres_cal.detect.photographs.facing import distinguishing_feature as distinguishing_feature
-from ceres_cal.detect.photographs.facing import require_sides as require_sides
 from ceres_cal.detect.photographs.field import require_findable as require_findable
+from ceres_cal.detect.photographs.grid import distinguishing_feature as distinguishing_feature
+from ceres_cal.detect.photographs.grid import require_sides as require_sides
 from ceres_cal.detect.photographs.known import is_painted as is_painted
 from ceres_cal.detect.photographs.refit import PointHints as PointHints
 from ceres_cal.detect.rings import RingsDetection as RingsDetection

@@ -24,7 +24,7 @@ from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
 
 if TYPE_CHECKING:
-    from ceres_cal.detect.charuco import CharucoSpec
+    from ceres_cal.detect.markers import CharucoSpec
 
 CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
@@ -186,7 +186,7 @@ def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
     if isinstance(corners, str):
         return lambda image: _measured_chessboard(image, columns, rows, corners)
-    from ceres_cal.detect.charuco import charuco_detector
+    from ceres_cal.detect.markers import charuco_detector
 
     detector = charuco_detector(corners, columns, rows, square_m)
     margin = 0.5 * (1.0 - corners.marker_m / square_m)  # white around a marker, in squares

@@ -82,7 +82,7 @@ class Diagnosis(Frozen):
         Args:
             camera: its name; may be left out where there is only one.
         """
-        return drawn("plot_residuals", self, ax, camera=camera)
+        return drawn("residual_pictures.plot_residuals", self, ax, camera=camera)
 
     @cached_property
     def summaries(self) -> Summaries:

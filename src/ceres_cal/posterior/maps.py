@@ -111,7 +111,7 @@ def located_by(station: str, pixels: Array, height_m: float) -> Functional:
 
 def _plot(self: FieldMap | ImageMap, ax: Any = None) -> Any:
     """Draw the map of 95 % radii into Matplotlib's Axes, in the colours of the report; returns the Axes."""
-    return drawn("plot_map", self, ax)
+    return drawn("maps.plot_map", self, ax)
 
 
 class FieldGrid(Frozen):

@@ -10,9 +10,9 @@ from ceres_cal.base.arrays import rms
 from ceres_cal.base.words import counted, first_of, fixed
 from ceres_cal.calibration import Calibration
 from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
-from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
 from ceres_cal.report.pictures.frames import Frame, frames_of, jpeg_of_at_most, marks_of, model_of, read_photograph
 from ceres_cal.report.pictures.overlay import Layer, draw_overlay
+from ceres_cal.report.quality import ClosedForm, FramePhotographs, Material
 
 MOST_PHOTOGRAPHS = 4
 _READING = (

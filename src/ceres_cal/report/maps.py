@@ -10,12 +10,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array, evenly, grid_places, largest
 from ceres_cal.base.words import at_height, mm, sentence, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.posterior.maps import FieldMap, image_grid
+from ceres_cal.posterior.maps import FieldMap, ImageMap, image_grid
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Draw, Hover
 from ceres_cal.report.document import Figure, Table
-from ceres_cal.report.material import Material, image_border, paint_of
-from ceres_cal.report.residual_pictures import number_of, owner_suffix
+from ceres_cal.report.quality import Material, image_border, paint_of
+from ceres_cal.report.residual_pictures import counts_of_parts, number_of, owner_suffix
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 
 if TYPE_CHECKING:
@@ -103,6 +103,18 @@ def levels_of(*maps: Array) -> Array:
         if len(levels) > fewest_steps:
             break
     return levels
+
+
+def plot_map(one: FieldMap | ImageMap, axes: Axes) -> None:
+    """95 % radii over the field, m, or over the image, px, in somebody's own axes."""
+    if isinstance(one, FieldMap):
+        fill(axes, MM, (one.x_m, one.y_m), one.radius_95_mm)
+        axes.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+        MM.bar(axes, LABEL)
+    else:
+        fill(axes, PX, (one.x_px, one.y_px), one.radius_95_px)
+        axes.set(ylim=(one.y_px[-1], one.y_px[0]), aspect="equal", xlabel="px", ylabel="px")
+        PX.bar(axes, "95 % within, px")
 
 
 # ---- how far off a located point may be -----------------------------------------------------------------------------
@@ -193,6 +205,7 @@ def _over_image(
     cover; `name`: of the figure, its title, and what it shows.
     """
     (width, height), unit = image_size, scale.unit
+    counts, _ = counts_of_parts(observed, image_size)
 
     def draw(axes: Axes, width_in: float) -> None:
         fill(axes, scale, grid, radii)
@@ -203,19 +216,13 @@ def _over_image(
 
     return Figure(
         *name[:2],
-        f"{name[2]} Dots: observations, in {_covered(observed, image_size)} of 192 parts of the image. Where there are "
-        "none, the lens model is extrapolated.",
+        f"{name[2]} Dots: observations, in {np.count_nonzero(counts)} of {counts.size} parts of the image. Where there "
+        "are none, the lens model is extrapolated.",
         draw,
         grid_table(f"95 % within, {unit}, at y \\ x", radii, *grid, "{:.0f} px"),
         0.92 * height / width + 0.2,
         hover=Hover.of(*grid, spoken(radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
     )
-
-
-def _covered(pixels: Array, image_size: tuple[int, int]) -> int:
-    """How many of 16 x 12 parts of an image have an observation in them."""
-    parts = np.floor((pixels + 0.5) / image_size * (16, 12)).astype(int)
-    return len(np.unique(parts, axis=0))
 
 
 def image_figure(material: Material, station: str) -> Figure:

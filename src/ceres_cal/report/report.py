@@ -16,12 +16,11 @@ from ceres_cal.report import findings
 from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Piece, Text
 from ceres_cal.report.grounds import promises
 from ceres_cal.report.maps import image_figure, lens_image_figure, map_figure
-from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
 from ceres_cal.report.page import page
-from ceres_cal.report.residual_pictures import against_radius, by_frame, outliers, vectors
+from ceres_cal.report.quality import ClosedForm, FramePhotographs, Material
+from ceres_cal.report.residual_pictures import against_radius, by_frame, outliers, support, vectors
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation, distortion
 from ceres_cal.report.summary import numbers_chapter, verdict_chapter
-from ceres_cal.report.support import support
 
 _CHAPTERS = 8  # at most
 MOST_CAMERAS = 8

@@ -1,4 +1,7 @@
-"""Pictures of the residuals: over the image, against the radius, by frame; and what was taken out, by feature."""
+"""Pictures of the residuals: over the image, against the radius, by frame; and what was taken out, by feature.
+
+And what was observed: which parts of a camera's image, and which stretches of the field's lines.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.words import fixed, grouped, short
-from ceres_cal.diagnostics import ResidualTable
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import fixed, grouped, no_such, short
+from ceres_cal.diagnostics import Diagnosis, ResidualTable
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summary
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Hover
 from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.findings import summary_table
-from ceres_cal.report.material import Material, paint_of
+from ceres_cal.report.quality import Material, paint_of
 from ceres_cal.report.scale import spoken
 from ceres_cal.scene.camera import Camera
 
@@ -117,6 +121,26 @@ def draw_vectors(
     text = axes.text(end[0, 0] + 0.012 * size[0], start[0, 1], f"median {short(typical)} px", va="center", fontsize=7.0)
     text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85})
     canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
+
+
+def plot_residuals(diagnosis: Diagnosis, axes: Axes, camera: str | None) -> None:
+    """Residual vectors over one camera's image, as large as what was observed there, in somebody's own axes.
+
+    Raises:
+        InputError: no such camera, or none named where there are several.
+    """
+    table = diagnosis.table
+    owners = [str(view["camera"]) for view in table.views]
+    known = list(dict.fromkeys(owners))
+    if camera is None and len(known) > 1:
+        raise InputError(f"which camera? Name one of {', '.join(known)}")
+    if camera is not None and camera not in known:
+        raise InputError(no_such("camera", camera, known))
+    own = (np.array(owners) == (camera or known[0]))[table.view]
+    inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & table.outlier)
+    width, height = (int(np.ceil(end)) + 1 for end in table.pixel[own].max(axis=0))
+    means = significant_means(table, inliers, (width, height))
+    draw_vectors(axes, canvas.WIDE_IN, table, (inliers, outliers), (width, height), means)
 
 
 def owner_suffix(material: Material, camera: str) -> str:
@@ -339,3 +363,76 @@ def outliers(material: Material) -> Figure | None:
         Table(("farthest first", "feature", "frame", "px off", "sigma"), tuple(cells)),
         0.2 + 0.055 * max(len(named), 6),
     )
+
+
+# ---- what was observed ----------------------------------------------------------------------------------------------
+
+
+_NEAR = 0.06  # of the image's width: a stretch of a line is supported where an observation of it lies as near
+_FILLED, _EMPTY = "#d9e8f3", "#fcede4"
+
+
+def support(material: Material, name: str) -> Figure:
+    """The picture of one camera."""
+    table, size = material.diagnosis.table, material.calibration.cameras[name].image_size
+    own = material.of_camera(name) & table.inlier
+    counts, ends = counts_of_parts(table.pixel[own], size)
+    lines = []
+    for curve, pixels in lines_in_image(material, name).items():
+        known = curve in table.features
+        of_curve = own & table.is_curve & (table.feature == (table.features.index(curve) if known else -1))
+        lines.append((curve, pixels, _near(pixels, table.pixel[of_curve], _NEAR * size[0]), int(of_curve.sum())))
+    seen = [np.isfinite(pixels[:, 0]) for _, pixels, _, _ in lines]
+    found = [near[visible] for (_, _, near, _), visible in zip(lines, seen, strict=True)]
+    shares = [float(np.mean(one)) if len(one) else np.nan for one in found]
+    whole, observed = sum(map(len, found)), sum(int(one.sum()) for one in found)
+
+    def draw(axes: Axes, width_in: float) -> None:
+        from matplotlib.colors import ListedColormap
+
+        axes.pcolormesh(*ends, counts > 0, cmap=ListedColormap([_EMPTY, _FILLED]), vmin=0, vmax=1, edgecolor="white")
+        canvas.dots(axes, table.pixel[own][:: stride(material, int(own.sum()))], POINT, 1.2, alpha=0.5)
+        for color, kept, label in ((OUTLIER, False, "line not observed"), (CURVE, True, "line observed")):
+            parts = [np.where((near == kept)[:, None], pixels, np.nan) for _, pixels, near, _ in lines]
+            if parts:
+                apart = [np.vstack([part, [[np.nan, np.nan]]]) for part in parts]
+                axes.plot(*np.concatenate(apart).T, color=color, linewidth=2.0, label=label)
+        frame_image(axes, size)
+        if lines:
+            canvas.key(axes)
+
+    filled = int(np.count_nonzero(counts))
+    of_lines = f" {100.0 * observed / whole:.0f} % of the visible line length was observed (green)." if whole else ""
+    shape = size[1] / size[0]
+    rows = [
+        (curve, "not visible" if np.isnan(share) else f"{100.0 * share:.0f} %", grouped(count))
+        for (curve, _, _, count), share in zip(lines, shares, strict=True)
+    ]
+    rows.append(("parts of the image", f"{100.0 * filled / counts.size:.0f} %", grouped(int(own.sum()))))
+    return Figure(
+        f"support-{number_of(material, name)}",
+        f"What the observations support{owner_suffix(material, name)}",
+        f"Observations lie in {filled} of {counts.size} parts of the image (blue). Elsewhere the lens model is "
+        f"extrapolated.{of_lines} Where lines are orange, neither lens nor field was checked.",
+        draw,
+        Table(("line", "visible length observed", "observations"), tuple(rows)),
+        0.86 * shape + 0.18,
+        0.93 * shape + 0.07,
+    )
+
+
+def counts_of_parts(pixels: Array, size: tuple[int, int]) -> tuple[Array, tuple[Array, Array]]:
+    """How many observations (Y, X) lie in each part of an image, and the parts' ends."""
+    cells = 16  # along the longer side of the image
+    cell = max(size) / cells
+    ends = [np.linspace(-0.5, side - 0.5, round(side / cell) + 1) for side in size]
+    counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], ends)
+    return counts.T, (ends[0], ends[1])
+
+
+def _near(places: Array, observed: Array, reach: float) -> Mask:
+    """(S,) whether an observation lies within reach of each place."""
+    if not len(observed):
+        return np.zeros(len(places), dtype=bool)
+    apart = np.linalg.norm(places[:, None] - observed[None], axis=2)
+    return np.asarray(np.nan_to_num(apart, nan=np.inf).min(axis=1) <= reach)

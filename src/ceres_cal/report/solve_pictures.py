@@ -14,7 +14,7 @@ from ceres_cal.problem.information import Key
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Hover
 from ceres_cal.report.document import Figure, Table
-from ceres_cal.report.material import ClosedForm, Material
+from ceres_cal.report.quality import ClosedForm, Material
 from ceres_cal.report.residual_pictures import number_of, owner_suffix
 from ceres_cal.scene.camera import Camera
 
@@ -196,8 +196,8 @@ def ideal_radii(camera: Camera, radii: Array) -> Array:
         return np.where((rays[:, 2] > 0.0) & (ideal <= widest * np.maximum(radii, 1.0)), ideal, np.nan)
 
 
-def draw_distortion(axes: Axes, camera: Camera, reach: float = np.inf) -> None:
-    """r' against r of a camera; dotted beyond the reach of observations, px."""
+def plot_distortion(camera: Camera, axes: Axes, reach: float = np.inf) -> None:
+    """r' against r of a camera, px, also in somebody's own axes; dotted beyond the reach of observations."""
     radii = np.linspace(0.0, camera.corner_radius, _STEPS)
     ideal, known = ideal_radii(camera, radii), radii <= reach
     axes.plot(radii, radii, color=QUIET, linewidth=0.9, dashes=(4, 3), label="no distortion")
@@ -223,7 +223,7 @@ def distortion(material: Material, name: str) -> Figure:
         f"The distortion curve{owner_suffix(material, name)}",
         f"Radius of a pixel from the principal point, measured (horizontal) and without distortion (vertical), "
         f"{model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px. The dotted part is extrapolated.",
-        lambda axes, _: draw_distortion(axes, camera, reach),
+        lambda axes, _: plot_distortion(camera, axes, reach),
         Table(("r, px", "r', px", "r' - r, px", "r' / r"), tuple(rows)),
     )
 

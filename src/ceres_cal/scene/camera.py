@@ -109,7 +109,7 @@ class Camera(Frozen, eq=True):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the distortion curve (undistorted against measured radius) into Matplotlib's Axes; returns the Axes."""
-        return drawn("plot_distortion", self, ax)
+        return drawn("solve_pictures.plot_distortion", self, ax)
 
     @property
     def position(self) -> Array:

@@ -21,7 +21,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.files import read_target
 from ceres_cal.cli.open_steps import make
 from ceres_cal.cli.page.state import Change, Drag, Made, Sitting, State, load_state, save_state, target_words
-from ceres_cal.detect.photographs.clicks import FEWEST
+from ceres_cal.detect.photographs.by_hand import FEWEST
 from ceres_cal.observations import Observations, combine
 from ceres_cal.problem.parameters import Options
 

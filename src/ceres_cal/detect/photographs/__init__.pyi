@@ -1,11 +1,11 @@
 from ceres_cal.detect.photographs import by_hand as by_hand
+from ceres_cal.detect.photographs.by_hand import Clicks as Clicks
+from ceres_cal.detect.photographs.by_hand import load_clicks as load_clicks
 from ceres_cal.detect.photographs.candidates import Auto as Auto
-from ceres_cal.detect.photographs.clicks import Clicks as Clicks
-from ceres_cal.detect.photographs.clicks import load_clicks as load_clicks
-from ceres_cal.detect.photographs.facing import Facing as Facing
 from ceres_cal.detect.photographs.field import FieldDetections as FieldDetections
 from ceres_cal.detect.photographs.field import FieldOptions as FieldOptions
 from ceres_cal.detect.photographs.field import detect_field as detect_field
+from ceres_cal.detect.photographs.grid import Facing as Facing
 from ceres_cal.detect.photographs.known import KnownDetections as KnownDetections
 from ceres_cal.detect.photographs.known import check_photographs as check_photographs
 from ceres_cal.detect.photographs.known import detect_known as detect_known

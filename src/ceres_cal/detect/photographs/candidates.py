@@ -11,9 +11,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose, chained, inverted
-from ceres_cal.detect.photographs.facing import Facing
 from ceres_cal.detect.photographs.followed import Followed
-from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
+from ceres_cal.detect.photographs.grid import Facing, LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, StrokeMap, lines_seen, match
 from ceres_cal.detect.photographs.painted import likelihoods_of_places
 from ceres_cal.detect.photographs.upright import Upright, best_score, find_upright

@@ -27,8 +27,8 @@ from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_colour, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.median import MOST_PICTURES, merged
+from ceres_cal.detect.photographs.by_hand import STRETCH, Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.candidates import Auto, prepare_search
-from ceres_cal.detect.photographs.clicks import STRETCH, Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed

@@ -9,6 +9,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.detect.photographs.by_hand import SIGMA_PX, unknown_optics
 from ceres_cal.detect.photographs.candidates import (
     BUDGET_S,
     Auto,
@@ -19,17 +20,16 @@ from ceres_cal.detect.photographs.candidates import (
     off_centre,
     prepare_search,
 )
-from ceres_cal.detect.photographs.clicks import SIGMA_PX, unknown_optics
-from ceres_cal.detect.photographs.facing import (
+from ceres_cal.detect.photographs.follow import Tracker
+from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
+from ceres_cal.detect.photographs.grid import (
     agreeing_with_facing,
     distinguishing_feature,
+    grid_of,
     nearest_to_before,
     require_sides,
     side_of,
 )
-from ceres_cal.detect.photographs.follow import Tracker
-from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
-from ceres_cal.detect.photographs.grid import grid_of
 from ceres_cal.detect.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.detect.strokes import Strokes

@@ -18,8 +18,7 @@ from ceres_cal.base.words import frame_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.images import encoded, read_colour
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.report.pictures.model import Model, model_seen
-from ceres_cal.report.pictures.overlay import Marks, in_8_bit_colour
+from ceres_cal.report.pictures.overlay import Marks, Model, in_8_bit_colour, model_seen
 
 Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""
