@@ -51,7 +51,9 @@ class Frozen:
 
     def __init_subclass__(cls, *, eq: bool = False, kw_only: bool = False, **others: Any) -> None:
         super().__init_subclass__(**others)
-        dataclass(init=False, repr=False, eq=eq, unsafe_hash=eq, kw_only=kw_only)(cls)
+        dataclass(init=False, repr=False, eq=False, kw_only=kw_only)(cls)
+        if eq:
+            cls.__eq__, cls.__hash__ = _are_equal, _hash_of  # type: ignore[assignment]
 
     if not TYPE_CHECKING:
 
@@ -75,6 +77,18 @@ class Frozen:
     def __repr__(self) -> str:
         held = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.__dataclass_fields__)
         return f"{type(self).__qualname__}({held})"
+
+
+def _are_equal(one: Any, other: object) -> Any:
+    return _held(one) == _held(other) if type(other) is type(one) else NotImplemented
+
+
+def _hash_of(one: Any) -> int:
+    return hash(_held(one))
+
+
+def _held(one: Any) -> tuple[Any, ...]:
+    return tuple(getattr(one, name) for name in one.__dataclass_fields__)
 
 
 @cache

@@ -10,16 +10,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np  # noqa: F401 its BLAS is what the controller looks for
-from threadpoolctl import ThreadpoolController
-
 if TYPE_CHECKING:
     from concurrent.futures import Future, ThreadPoolExecutor
+
+    from threadpoolctl import ThreadpoolController
 
 
 _allowed: ContextVar[int] = ContextVar("allowed", default=0)
@@ -46,6 +45,9 @@ def _cores() -> int:
 
 @cache
 def _controller() -> ThreadpoolController:
+    import numpy as np  # noqa: F401 its BLAS is what the controller looks for
+    from threadpoolctl import ThreadpoolController
+
     return ThreadpoolController()
 
 
@@ -73,7 +75,8 @@ def for_small_matrices() -> Iterator[None]:
     the cores that our own parts need.
     """
     _keep_freed_memory()
-    with _controller().limit(limits=1, user_api="blas"):
+    has_none = os.environ.get("OPENBLAS_NUM_THREADS") == "1"  # as commands have it; finding BLAS takes 3 ms
+    with nullcontext() if has_none else _controller().limit(limits=1, user_api="blas"):
         yield
 
 

@@ -1,3 +1,5 @@
+from ceres_cal.cli import arguments as arguments
+from ceres_cal.cli import files as files
 from ceres_cal.cli.jobs import LEVELS as LEVELS
 from ceres_cal.cli.jobs import Job as Job
 from ceres_cal.cli.jobs import Outcome as Outcome

@@ -160,7 +160,8 @@ def as_a_program() -> None:
     """Take SIGTERM like Ctrl-C, print whatever a name holds wherever it goes, and let nobody but us write on standard
     error.
     """
-    objects = 50_000  # between collections: what is imported is no garbage, and to look it through takes time
+    # Between collections: `calibrate` imports and makes half of that, no garbage, and looking it through takes 20 ms.
+    objects = 100_000
     signal.signal(signal.SIGTERM, _terminate)
     gc.set_threshold(objects)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time

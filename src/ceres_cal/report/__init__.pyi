@@ -1,3 +1,4 @@
+from ceres_cal.report import grounds as grounds
 from ceres_cal.report import page as page
 from ceres_cal.report.findings import diagnosis_sections as diagnosis_sections
 from ceres_cal.report.grounds import is_against as is_against
