@@ -277,7 +277,8 @@ def eliminate_placements(
 
     Args:
         newton: whether the equations take rho'' along, for a step, or rho' alone.
-        tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
+        tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement;
+            infinite: poses follow the change, and nothing else is done.
         change: (free + structure,) by how much these have moved since the poses and gains of `sweep` were made.
         sweep: poses, moved (left alone where an observation cannot be projected), gains, renewed, costs, filled, and
             reduced, the complement, added up.

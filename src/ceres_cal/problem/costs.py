@@ -183,13 +183,16 @@ def robust_weights(weighting: Weighting, squared: Array) -> Array:
 
 
 class _Evaluation(Frozen):
-    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`)."""
+    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`), and
+    how long the step to it was, in standard deviations.
+    """
 
     at: Array
     residuals: Array
     jacobian: Array
     poses: Array
     gains: Array
+    step: float = 0.0
 
 
 class EliminatedCost(_SightsCost):
@@ -208,7 +211,7 @@ class EliminatedCost(_SightsCost):
         self._chain, lead = self._structure.chain(len(free), 1), len(free) + self._unknowns.structure
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
-        self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
+        self._accepted = _Evaluation(start, kernels.NOTHING, np.zeros((1, self._size)), poses, gains)
         self._last = self._accepted
         self._smooth, self._stated = _smoothness(problem, estimate, self.camera, self._size), stated
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
@@ -216,7 +219,9 @@ class EliminatedCost(_SightsCost):
         self._take({owner: size for owner, size in sizes.items() if size}, self._size + 1)
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
-        last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
+        along = self._accepted.jacobian @ (at - self._accepted.at)
+        step = float(np.linalg.norm(along))
+        last = self._followed(at, along, step) or self._eliminated(at, _LEFT_TO_THE_COMPLEMENT, step)
         if last is None:
             return None
         self._last = last
@@ -226,7 +231,17 @@ class EliminatedCost(_SightsCost):
     def _accept(self) -> None:
         self._accepted = self._last
 
-    def _eliminated(self, at: Array, tolerance: float) -> _Evaluation | None:
+    def _followed(self, at: Array, along: Array, step: float) -> _Evaluation | None:
+        """Where so short a step from the last accepted place leads by that one's equations; None where more than
+        rounding may be missing, as long as steps shrink no slower than they did.
+        """
+        nothing, before = 1e-6, self._accepted  # standard deviations
+        if step * step >= nothing * before.step:
+            return None
+        poses = self._swept(at, np.inf).poses
+        return replace(before, at=at, residuals=before.residuals + along, poses=poses, step=step)
+
+    def _eliminated(self, at: Array, tolerance: float, step: float = 0.0) -> _Evaluation | None:
         """The cost in a place, or None where an observation cannot be projected from there."""
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
@@ -241,7 +256,7 @@ class EliminatedCost(_SightsCost):
                 break
         residuals[-1] = np.sqrt(max(missing, 0.0))
         upper[-1] = 0.0
-        return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
+        return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains, step)
 
     def _add_known(self, at: Array, reduced: Array) -> float:
         """What is stated of the camera and its lens's roughness cost, once their normal equations are added."""

@@ -29,6 +29,7 @@ class Elimination {
             for (int j = 0; j < count_; ++j) step[k] -= gains[count_ * k + j] * change[j];
         }
         move(kept, step, moved);
+        if (std::isinf(tolerance)) return static_cast<void>(std::copy_n(moved, 12, kept));
         double cost = INFINITY, promise = INFINITY, damping = 0.0;
         for (int trial = 0; trial < MOST_STEPS; ++trial) {
             const double found = sums_.normal_equations(sight, moved, newton_, trial_.data());
