@@ -131,8 +131,10 @@ class EffectSums(Frozen):
         order = np.argsort(key, kind="stable")
         key, held = key[order], held[order]
         starts = np.flatnonzero(np.diff(key, prepend=-1))
-        products = self.columns[held, :, None] * model.private[self.rows[held], None, :]
-        inside = np.add.reduceat(products, starts, axis=0)
+        own, private = (np.ascontiguousarray(x.T) for x in (self.columns[held], model.private[self.rows[held]]))
+        inside = np.add.reduceat(own[:, None] * private, starts, axis=2).transpose(
+            2, 0, 1
+        )  # rows last: in half the time
         sight, group = np.divmod(key[starts], count)
         if not self.effect.onwards:
             np.add.at(squares, group, inside @ inside.transpose(0, 2, 1))
@@ -297,38 +299,44 @@ class ScoreTest(Frozen):
         return self.effect.of(self.number)
 
 
-def score_all(model: Linearised, alternatives: Sequence[EffectSums], inflation: float = 1.0) -> list[ScoreTest]:
+def score_all(
+    model: Linearised, alternatives: Sequence[EffectSums], inflation: float = 1.0, *, by_chance: bool = True
+) -> list[ScoreTest]:
     """The tests of every alternative that the free numbers leave testable.
 
     Args:
         alternatives: of each effect, beyond the free numbers of this model.
         inflation: how many observations weigh as much as one independent one, where neighbours agree.
+        by_chance: whether log_p is asked, which takes as long as the rest; else it is 0.
     """
     squares, equations = float(model.left_over @ model.left_over), model.spare + model.known_noise
     slope = _robust_slope(model)
-    testable: list[tuple[EffectColumns, int, Array, Array]] = []
-    all_ranks, all_z = [], []
+    found: list[tuple[EffectColumns, Indices, Array, Array]] = []
+    all_ranks, all_z = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
     for sums in alternatives:
         roots, ranks = inverse_roots(sums.normals, sums.sizes, LEAST_LEFT)
         z = np.einsum("gqk,gq->gk", roots, sums.scores)
-        amounts, spreads = np.einsum("gqk,gk->gq", roots, z), np.sqrt(np.sum(roots**2, axis=2))
+        amounts, spreads = np.einsum("gqk,gk->gq", roots, z) / -slope, np.sqrt(np.sum(roots**2, axis=2))
         spreads[sums.sizes == 0.0] = np.inf
         numbers = np.flatnonzero((ranks > 0) & (equations - ranks >= 1.0))
-        testable += [(sums.effect, number, -amounts[number], spreads[number]) for number in numbers.tolist()]
+        found.append((sums.effect, numbers, amounts[numbers], spreads[numbers]))
         all_ranks.append(ranks[numbers])
         all_z.append(np.sum(z[numbers] ** 2, axis=1))
-    if not testable:
-        return []
     ranks, statistics = np.concatenate(all_ranks), np.concatenate(all_z)
     spare = equations - ranks
     variance = (np.maximum(squares - statistics, 1e-12 * squares) + model.known_noise) / spare
-    log_p = log_f_tail(statistics / (inflation * ranks * np.maximum(variance, 1e-300)), ranks, spare)
+    ratio = statistics / (inflation * ranks * np.maximum(variance, 1e-300))
+    log_p = log_f_tail(ratio, ranks, spare) if by_chance else np.zeros(len(ratio))
     sd = np.sqrt(variance * inflation) / slope
-    of_each = zip(testable, (statistics / variance).tolist(), ranks.tolist(), log_p.tolist(), sd.tolist(), strict=True)
-    return [
-        ScoreTest(effect, number, statistic, rank, one_log_p, amount / slope, spread * one_sd)
-        for (effect, number, amount, spread), statistic, rank, one_log_p, one_sd in of_each
-    ]
+    of_each = zip((statistics / variance).tolist(), ranks.tolist(), log_p.tolist(), sd.tolist(), strict=True)
+    tests = []
+    for effect, numbers, amounts, spreads in found:
+        rows = zip(numbers.tolist(), amounts, spreads, strict=True)
+        tests += [
+            ScoreTest(effect, number, statistic, rank, one_log_p, amount, spread * one_sd, ())
+            for (number, amount, spread), (statistic, rank, one_log_p, one_sd) in zip(rows, of_each, strict=False)
+        ]
+    return tests
 
 
 def _robust_slope(model: Linearised) -> float:

@@ -359,11 +359,12 @@ def _over_cameras(displacement: Displaces, case: Case) -> Iterator[EffectColumns
     equations, group, parts = case.equations, case.camera.copy(), []
     for number, name in enumerate(case.cameras):
         own = np.flatnonzero(case.camera == number)
-        displaced = displacement(case, name, equations.pixel[own])
+        first = np.diff(equations.observation[own], prepend=-1) != 0  # both equations of a point are at one pixel
+        displaced = displacement(case, name, equations.pixel[own[first]])
         if displaced is None:
             group[own] = -1
         else:
-            parts.append((own, np.sum(equations.direction[own, :, None] * displaced, axis=1)))
+            parts.append((own, np.einsum("ei,eik->ek", equations.direction[own], displaced[np.cumsum(first) - 1])))
     columns = np.zeros((len(equations), max((part.shape[1] for _, part in parts), default=1)))
     for own, part in parts:
         columns[own, : part.shape[1]] = part

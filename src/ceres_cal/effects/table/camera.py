@@ -5,7 +5,7 @@ shifted.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
     several = np.array([bool(np.any(frame[start:stop] != frame[start])) for start, stop in bounds])
     tied = np.array([key.placement not in case.problem.private for key in equations.sights.keys])
     of_station = np.array([key.station for key in equations.sights.keys])
-    columns = motion_columns(case)
+    columns = cache(partial(motion_columns, case))  # which most cases need for no station
     for station in case.problem.observations.stations:
         present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
         names, last = tuple(known[number][1] for number in present), len(present) - 1
@@ -37,7 +37,7 @@ def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:
         tested = last > 0 if onwards else (group > 0) & (group < last)
         group = np.where(tested, group, -1)
         if np.any(group >= 0):
-            yield EffectColumns(columns, group, (station,) * len(names), names, onwards)
+            yield EffectColumns(columns(), group, (station,) * len(names), names, onwards)
 
 
 def _of_move(evidence: Evidence) -> Words:

@@ -208,12 +208,12 @@ def _where_likely(case: Case, every: EffectColumns) -> Iterator[EffectColumns]:
     than the noise does. So the change is judged by the scatter of frames about it, Fisher's F, and not by the noise.
     """
     rate = 0.001  # of a false alarm over all frames: of nine real sets of boards none has one
-    changes = score_all(case.model, [EffectSums.of(case.model, every)])
+    changes = score_all(case.model, [EffectSums.of(case.model, every)], by_chance=False)
     if not changes:
         return
     best = max(changes, key=lambda change: change.statistic)
     beside = case.model.with_columns(best.columns)
-    single = score_all(beside, [EffectSums.of(beside, replace(every, onwards=False))])
+    single = score_all(beside, [EffectSums.of(beside, replace(every, onwards=False))], by_chance=False)
     freedom = float(sum(one.rank for one in single)) - 2.0 * best.rank
     if freedom < 1.0:
         return
