@@ -103,7 +103,7 @@ def test_it_is_in_the_command_s_answer_and_in_the_report(
     files = [str(tmp_path / "calibration.json"), str(tmp_path / "observations.json")]
     assert main(["diagnose", *files]) == 1
     text = " ".join(capsys.readouterr().out.split())
-    assert "its rows of pixels sway by" in text and "-> have the sensor looked at" in text
+    assert "its rows of pixels sway by" in text and "-> Have the sensor looked at" in text
     assert main(["diagnose", *files, "--json"]) == 1
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert finding["kind"] == "wave" and finding["wrong"] == "model" and finding["amounts"][0]["unit"] == "px"

@@ -207,13 +207,13 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert [prior["sigma_m"] for prior in priors] == [None, None]
     assert main(["calibrate", observed, "-o", out, "--lens", "radial"]) == 0
     printed = capsys.readouterr().out
-    assert "lengths   field/field_length_m" in printed and "mm (solved for)" in printed
+    assert "lengths   that were solved for" in printed and "field/field_length_m" in printed
     dimensions = Calibration.load(out).targets["field"].dimensions
     for name, true in TRUE.items():
         assert abs(dimensions[name] - true) < 0.003  # 0.5 mm
     quality = quality_of(Calibration.load(out), Observations.load(observed))
     tables = [piece for piece in numbers_chapter(quality, ()).pieces if isinstance(piece, Table)]
-    assert "Dimensions that were solved for" in [table.caption for table in tables]
+    assert "Lengths that were solved for" in [table.caption for table in tables]
 
 
 @pytest.mark.parametrize(("aspect", "is_said"), [(1.004, False), (1.0085, True)])

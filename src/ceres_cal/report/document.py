@@ -47,6 +47,7 @@ class Table(NamedTuple):
     """Columns under their heads, which say the unit; the first column names its row.
 
     Of more than `most` rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
+    `printed`: the columns that a terminal has room for, by default all.
     """
 
     head: tuple[str, ...]
@@ -54,14 +55,16 @@ class Table(NamedTuple):
     caption: str = ""
     stacked: bool = False
     most: int = 200
+    printed: tuple[int, ...] = ()
 
     def lines(self) -> list[str]:
-        """The same for a terminal, the first column to the left."""
-        columns = list(zip(self.head, *self.rows, strict=True))
-        widths = [max(map(len, column)) for column in columns]
-        every = (self.head, *self.rows)
+        """The same for a terminal, the first column to the left; columns in which no row says anything are left out."""
+        every = self.printed or range(len(self.head))
+        printed = [n for n in every if not (n and self.rows) or any(row[n] for row in self.rows)]
+        cells = [[row[n] for n in printed] for row in (self.head, *self.rows)]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         return [
-            "  ".join(f"{cell:{'>' if n else '<'}{widths[n]}}" for n, cell in enumerate(row)).rstrip() for row in every
+            "  ".join(f"{cell:{'>' if n else '<'}{widths[n]}}" for n, cell in enumerate(row)).rstrip() for row in cells
         ]
 
 
@@ -128,6 +131,10 @@ class Card(NamedTuple):
     advice: str
     facts: tuple[str, ...]
     link: str = ""
+
+    def lines(self) -> list[str]:
+        """The same for a terminal."""
+        return wrapped(self.sentence, *([f"-> {self.advice}"] if self.advice else []), f"   {'; '.join(self.facts)}")
 
 
 Piece = Text | BulletList | Table | Gallery | Folded | Tiles | Card

@@ -35,7 +35,7 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: LensChoice | None, options:
     yield Section("verdict", said, {"verdict": said, **{name: getattr(diagnosis, name) for name in own}})
     yield from (Section("conflict", wrapped(conflict.words)) for conflict in diagnosis.conflicts)
     for number, finding in enumerate(diagnosis.findings, start=1):
-        yield Section(f"finding {number}", _finding(finding))
+        yield Section(f"finding {number}", _card(finding).lines())
     yield _noise(diagnosis.noise)
     yield _held_out(choice, options) if choice is not None else Section(data={"held_out": None})
     yield _outliers(diagnosis.table)
@@ -81,17 +81,6 @@ def _verdict(diagnosis: Diagnosis) -> list[str]:
 # ---- findings -------------------------------------------------------------------------------------------------------
 
 
-def _finding(finding: Finding) -> list[str]:
-    most_said = 3  # amounts that the sentence of a finding says itself
-    lines = wrapped(finding.sentence, f"-> {finding.advice}")
-    moved = plural(finding.observations, "observation")
-    size = f"{finding.effect_px:.2f} px, {fixed(finding.effect_mm, 2)} mm; {moved}"
-    lines.append(f"   {size}; false alarm: {chance(finding.log10_p)}")
-    if len(finding.amounts) > most_said:
-        lines += [f"   {one.name:28}{one.value:9.3f} ± {one.sd:.3f} {one.unit}" for one in finding.amounts]
-    return lines
-
-
 def _card(finding: Finding) -> Card:
     facts = [f"{short(finding.effect_px)} px"]
     if np.isfinite(finding.effect_mm):
@@ -118,17 +107,19 @@ def _others(others: Sequence[Finding]) -> Iterator[Piece]:
 
 
 def _noise(every: Sequence[Noise]) -> Section:
-    lines, rows = [], []
-    for one in every:
-        stated = np.isfinite(one.stated_px)
-        said = f"{one.scale:.3f} times what was stated" if stated else "no sigma stated"
-        near = f", neighbours correlated {one.correlation:+.2f}" if np.isfinite(one.correlation) else ""
-        lines.append(f"{one.kind}  {one.sigma_px:.4f} px over {one.observations}, {said}{near}")
-        of_stated = f"{one.scale:.2f} times" if stated else "none stated"
-        numbers = (grouped(one.observations), fixed(one.sigma_px, 3), of_stated, fixed(one.correlation, 2, "+"))
-        rows.append((one.kind, *numbers))
-    head = ("noise of", "observations", "sd, px", "of the stated", "neighbours' correlation")
-    return Section("noise", lines, {"noise": every}, (Table(head, tuple(rows), stacked=True),))
+    rows = tuple(
+        (
+            one.kind,
+            grouped(one.observations),
+            fixed(one.sigma_px, 4),
+            f"{one.scale:.3f} times" if np.isfinite(one.stated_px) else "none stated",
+            fixed(one.correlation, 2, "+"),
+        )
+        for one in every
+    )
+    head = ("", "observations", "sd, px", "of the stated", "neighbours' correlation")
+    table = Table(head, rows, "Noise", stacked=True)
+    return Section("noise", table.lines(), {"noise": every}, (table,))
 
 
 def _outliers(table: ResidualTable) -> Section:

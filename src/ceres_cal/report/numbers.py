@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from ceres_cal.base.words import (
     powered,
     sentence,
     short,
-    two_digits,
 )
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.observations import Observations
@@ -32,7 +31,7 @@ from ceres_cal.report.quality import Quality
 from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.camera import Camera
 
-_HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "verdict")
+_HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "how well")
 _MOST_FEATURES, _MOST_OFFSETS = 6, 40
 _ANGLES = ("alpha, the paper's", "beta, the paper's", "gamma, the paper's", "tilt from straight down")
 _PHI_FROM = {
@@ -74,16 +73,18 @@ def observed(observations: Observations) -> list[str]:
 
 
 def _fit(calibration: Calibration) -> Section:
-    fit, lines, rows = calibration.fit, [], []
-    for kind, used, rms, scale in (
+    fit = calibration.fit
+    kinds = (
         ("points", fit.points, fit.points_rms_px, fit.point_scale),
         ("curves", fit.curves, fit.curves_rms_px, fit.curve_scale),
-    ):
-        if used:
-            lines.append(f"{kind}  rms {rms:.4f} px over {used}, noise {scale:.3f} times the stated sigmas")
-            rows.append((kind, grouped(used), fixed(rms, 4), f"{scale:.3f} times the stated"))
-    table = Table(("fit", "took part", "rms px", "noise"), tuple(rows), "Fit", stacked=True)
-    return Section("fit", lines, {"rms_px": calibration.rms_px}, (table,))
+    )
+    rows = [
+        (kind, grouped(used), fixed(rms, 4), f"{scale:.3f} times the stated sigmas")
+        for kind, used, rms, scale in kinds
+        if used
+    ]
+    table = Table(("", "took part", "rms px", "noise"), tuple(rows), "Fit", stacked=True)
+    return Section("fit", table.lines(), {"rms_px": calibration.rms_px}, (table,))
 
 
 def outliers(calibration: Calibration) -> Section:
@@ -146,43 +147,28 @@ def _percent(share: float | None) -> str:
 
 
 def _camera(quality: Quality, name: str) -> Section:
-    clearly = 3.0  # standard deviations from what is usual of cameras: nearer it is not listed among the first numbers
-    camera, options = quality.calibration.cameras[name], quality.calibration.options
+    camera = quality.calibration.cameras[name]
     (width, height), (cx, cy) = camera.image_size, camera.principal_point
     units = {"phi": "px", "cx": "px", "cy": "px"}
     plain = {"aspect": 1.0, "skew": 0.0}  # of most cameras
     values = {"phi": camera.phi, "cx": cx, "cy": cy, "aspect": camera.aspect, "skew": camera.skew, **camera.lens.listed}
-
-    def known(quantity: str) -> Verdict | None:
-        return quality.verdicts.get(("camera", name, quantity))
-
-    def line(title: str, *quantities: str, held: bool = False) -> str:
-        shown = (with_sd(values[one], units.get(one, ""), known(one)) for one in quantities)
-        held = held or all(one in options.held for one in quantities)
-        return f"{title:16}{', '.join(shown)}{' (held)' if held else ''}"
-
-    def differs(one: str, usual: float) -> bool:
-        verdict = known(one)
-        return abs(values[one] - usual) > (clearly * verdict.sd if verdict else 0.0)
-
-    started = quality.calibration.phi_from.get(name, "")
-    freed = {"aspect": options.free_aspect, "skew": options.free_skew}
-    lines = [
-        f"{name}, {width} x {height} px",
-        f"{'phi':16}{with_sd(camera.phi, 'px', known('phi'))} ({_PHI_FROM.get(started, started)})",
-        *(line(one, one) for one, usual in plain.items() if freed[one] or differs(one, usual)),
-        line("principal point", "cx", "cy", held=not options.free_principal_point),
-        *(line(one, one) for one in camera.lens.listed),
-    ]
+    known = {one: quality.verdicts.get(("camera", name, one)) for one in values}
     rows = tuple(
-        _row(_named(camera, one), value, units.get(one, ""), known(one))
+        number_row(_named(camera, one), value, units.get(one, ""), known[one])
         for one, value in values.items()
-        if value != plain.get(one) or known(one) is not None
+        if value != plain.get(one) or known[one] is not None
     )
-    table = Table(_HEAD, rows, f"Camera {name}: {camera.lens.kind} lens, {width} × {height} px", stacked=True)
-    note = camera.lens.note
-    lines += [note] if note else []
-    return Section("camera", lines, pieces=(table, Text(f"{note}.")) if note else (table,))
+    started = quality.calibration.phi_from.get(name, "")
+    notes = [f"phi: {_PHI_FROM.get(started, started)}", *([camera.lens.note] if camera.lens.note else [])]
+    about = f"{name}: {camera.lens.kind} lens, {width} × {height} px"
+    return _listed("camera", about, rows, notes)
+
+
+def _listed(title: str, about: str, rows: Iterable[_Row], notes: Sequence[str] = ()) -> Section:
+    """Numbers, how well each is known, and notes below them."""
+    narrow = (0, 1, 2, 4, 5)  # without what the model alone says, which only the page has room for
+    table = Table(_HEAD, tuple(rows), f"{sentence(title)} {about}", stacked=True, printed=narrow)
+    return Section(title, [about, *table.lines(), *notes], pieces=(table, *(Text(f"{note}.") for note in notes)))
 
 
 def _named(camera: Camera, quantity: str) -> str:
@@ -193,7 +179,7 @@ def _named(camera: Camera, quantity: str) -> str:
     return words.get(quantity, quantity)
 
 
-def _row(name: str, value: float, unit: str, verdict: Verdict | None) -> _Row:
+def number_row(name: str, value: float, unit: str, verdict: Verdict | None) -> _Row:
     """A number; without a verdict it was held, or nothing was minimised."""
     space = f" {unit}" if unit else ""
     if verdict is None:
@@ -229,28 +215,14 @@ def _station(quality: Quality, name: str) -> Section:
     camera = quality.calibration.stations[name]
     owner = quality.calibration.estimate.stations[name].camera
     title = name if owner == name else f"{name}, camera {owner}"
-    caption, data = f"Station {title}", {"tilt_deg": {name: camera.tilt_deg}}
+    data = {"tilt_deg": {name: camera.tilt_deg}}
     if name in anchored_stations(quality.observations):
-        table = Table(("", "value"), (("pose", _ANCHORED),), caption, stacked=True)
+        table = Table(("", "value"), (("pose", _ANCHORED),), f"Station {title}", stacked=True)
         return Section("station", [title, _ANCHORED], data, (table,))
-    place = [
-        (word, float(value), quality.verdicts.get(("station", name, word)))
-        for word, value in zip(("x", "y", "height"), camera.position, strict=True)
-    ]
-    alpha, beta, gamma = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
-    turns = [quality.verdicts.get(("station", name, f"turn_{axis}")) for axis in "xyz"]
-    sds = [f"{np.degrees(turn.sd):.2g}" if np.isfinite(turn.sd) else "unknown" for turn in turns if turn is not None]
-    shown = (f"{word} {with_sd(value, 'm', verdict)}" for word, value, verdict in place)
-    lines = [
-        title,
-        f"{'position':16}{', '.join(shown)}",
-        f"{'angles':16}alpha {alpha:.3f}, beta {beta:.3f}, gamma {gamma:.3f} deg (the paper's)",
-        f"{'tilt':16}{camera.tilt_deg:.3f} deg from straight down",
-        *([f"{'turns':16}± {', '.join(sds)} deg about the camera's x, y and z"] if sds else []),
-    ]
-    rows = [_row(word if word == "height" else f"position {word}", value, "m", known) for word, value, known in place]
-    table = Table(_HEAD, (*rows, *_angles(quality, name, camera)), caption, stacked=True)
-    return Section("station", lines, data, (table,))
+    known = [quality.verdicts.get(("station", name, word)) for word in ("x", "y", "height")]
+    places = zip(("position x", "position y", "height"), camera.position.tolist(), known, strict=True)
+    rows = [number_row(word, value, "m", verdict) for word, value, verdict in places]
+    return _listed("station", title, [*rows, *_angles(quality, name, camera)])._replace(data=data)
 
 
 def _angles(quality: Quality, name: str, camera: Camera) -> Iterator[_Row]:
@@ -299,57 +271,29 @@ def _angles_deg(rotation: Array) -> Array:
 
 
 def _dimensions(quality: Quality) -> Section:
-    lines, rows = [], []
-    for name, length in quality.calibration.estimate.structure.dimensions.items():
-        verdict = quality.verdicts.get(("dimension", *name.partition("/")[::2]))
-        lines.append(f"{name:36}{with_sd(length, 'm', verdict)} (solved for)")
-        rows.append(_row(name, length, "m", verdict))
-    table = Table(_HEAD, tuple(rows), "Dimensions that were solved for", stacked=True)
-    return Section("lengths", lines, pieces=(table,))
+    lengths = quality.calibration.estimate.structure.dimensions.items()
+    known = {name: quality.verdicts.get(("dimension", *name.partition("/")[::2])) for name, _ in lengths}
+    return _listed(
+        "lengths", "that were solved for", [number_row(name, one, "m", known[name]) for name, one in lengths]
+    )
 
 
 def _as_built(quality: Quality) -> Section:
-    """What is off its drawing, the farthest first; a line of what was stated alone, the rest is in words."""
+    """What is off its drawing, the farthest first."""
     structure, as_built = quality.calibration.estimate.structure, quality.calibration.as_built
     order = np.argsort(-np.abs(structure.values[: structure.own]), kind="stable").tolist()
-    offset_mm = 1e3 * structure.values
-    estimated = {one.target for one in as_built}
-    stated = [i for i in order if structure.names[i].partition("/")[0] not in estimated]
-    lines = wrapped(*words_of(as_built))
-    lines += [f"{offset_mm[i]:8.2f} mm  {structure.names[i]}" for i in stated[:_MOST_FEATURES]]
-    if rest := len(stated[_MOST_FEATURES:]):
-        lines.append(f"and {plural(rest, 'smaller correction')}")
     rows = []
     for i in order[:_MOST_OFFSETS]:
         verdict = quality.verdicts.get(("structure", *structure.names[i].partition("/")[::2]))
         widths = (np.nan if verdict is None else verdict.sd, float(structure.sigma_m[i]))
-        rows.append((structure.names[i], f"{offset_mm[i]:+.2f} mm", *(f"{short(1e3 * sd)} mm" for sd in widths)))
-    pieces: list[Piece] = [Text(f"{sentence(words)}.") for words in words_of(as_built)]
-    pieces.append(Table(("", "off its drawing", "± sd", "tolerance"), tuple(rows), "Targets as built", stacked=True))
+        shown = f"{1e3 * structure.values[i]:+.2f} mm"
+        rows.append((structure.names[i], shown, *(f"{short(1e3 * sd)} mm" for sd in widths)))
+    table = Table(("", "off its drawing", "± sd", "tolerance"), tuple(rows), "Targets as built", stacked=True)
+    words = [f"{sentence(one)}." for one in words_of(as_built)]
+    lines = [*wrapped(*words), *table._replace(rows=table.rows[:_MOST_FEATURES]).lines()]
+    if rest := len(order[_MOST_FEATURES:]):
+        lines.append(f"and {plural(rest, 'smaller correction')}")
+    pieces: list[Piece] = [*map(Text, words), table]
     if rest := len(order[_MOST_OFFSETS:]):
         pieces.append(Text(f"And {grouped(rest)} smaller ones.", "note"))
     return Section("as built", lines, pieces=tuple(pieces))
-
-
-# ---- how well it is known -------------------------------------------------------------------------------------------
-
-
-def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
-    """A number and how well it is known: "869.0 ± 1.4 px", "4.022 m ± 6.6 mm", "745 px, unknown: below 1209 px".
-
-    Without a verdict it was held, or nothing was minimised. Coefficients have no unit.
-    """
-    places = 3 if unit == "m" else 0
-    if verdict is None:
-        return f"{value:.{places or 4}f} {unit}" if unit else f"{value:.8g}"
-    if not unit:
-        shown = at_precision(value, verdict.sd)
-        return f"{shown} ± {verdict.sd:.2g}" if np.isfinite(verdict.sd) else f"{shown}, unknown"
-    word = "" if verdict.verdict == "known" else f", {verdict.verdict}"
-    if verdict.by_profile and word:
-        return f"{value:.{places}f} {unit}{word}: {bounds_text(verdict.low, verdict.high, unit)}"
-    if not np.isfinite(verdict.sd):
-        return f"{value:.{places}f} {unit}{word}"
-    if unit == "m":
-        return f"{value:.3f} m ± {two_digits(1e3 * verdict.sd)} mm{word}"
-    return f"{at_precision(value, verdict.sd)} ± {two_digits(verdict.sd)} {unit}{word}"

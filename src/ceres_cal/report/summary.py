@@ -32,7 +32,7 @@ from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.report import grounds
 from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
-from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
+from ceres_cal.report.numbers import bounds, number_row, number_sections, observed, outliers, stopped, warnings
 from ceres_cal.report.quality import Material, Quality, Seam, paint_of
 
 if TYPE_CHECKING:
@@ -131,13 +131,9 @@ def _map_data(m: FieldMap) -> dict[str, Any]:
 
 def _seams(seams: Sequence[Seam]) -> Section:
     """By how much two cameras disagree about what both see."""
-    lines, data, rows = [], [], []
+    data, rows = [], []
     for seam in seams:
         rms, expected, count = seam.measured.rms_mm, seam.measured.expected_rms_mm, len(seam.measured.what)
-        lines.append(f"{' - '.join(seam.stations)}: {_sd_at_heights(seam.predicted)}")
-        if count:
-            found = f"found {two_digits(rms)} mm where {two_digits(expected)} were expected"
-            lines.append(f"{found} (rms of {count} points and stretches that both observed)")
         measured = {"found_mm": rms, "expected_mm": expected, "compared": count}
         predicted = [_map_data(one) for one in seam.predicted]
         data.append({"stations": seam.stations, "predicted": predicted, **measured})
@@ -146,7 +142,8 @@ def _seams(seams: Sequence[Seam]) -> Section:
         rows.append((f" {DASH} ".join(seam.stations), *means, f"{mm(rms)}{over}", mm(expected)))
     head = ("stations", *map(at_height, HEIGHTS_M), "found", "expected")
     table = Table(head, tuple(rows), "Where two cameras overlap: by how much they disagree", stacked=True)
-    return Section("seam", lines, {"uncertainty": {"seams": data}}, (table,) if rows else ())
+    shown = (table,) if rows else ()
+    return Section("seam", [line for one in shown for line in one.lines()], {"uncertainty": {"seams": data}}, shown)
 
 
 def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
@@ -260,18 +257,11 @@ def known_of(quality: Quality) -> dict[str, Any]:
 def _numbers(quality: Quality) -> Iterator[dict[str, str]]:
     """phi and height, and dimensions that were solved for."""
     for (kind, owner, quantity), verdict in quality.verdicts.items():
-        if quantity == "phi" or (kind == "station" and quantity == "height"):
-            unit, factor = ("px", 1.0) if quantity == "phi" else ("mm", 1e3)
-            yield _number(f"{quantity} of {owner}", verdict, factor, unit)
-        elif kind == "dimension":
-            yield _number(quantity.removesuffix("_m").replace("_", " "), verdict, 1e3, "mm")
-
-
-def _number(name: str, verdict: Verdict, factor: float, unit: str) -> dict[str, str]:
-    value, sd = factor * verdict.value, factor * verdict.sd
-    spread = f"± {two_digits(sd)} {unit}" if np.isfinite(sd) else "unknown"
-    shown = at_precision(value, sd) if np.isfinite(sd) else f"{value:.4g}"
-    return {"name": name, "value": f"{shown} {unit}", "sd": spread, "verdict": verdict.verdict}
+        if kind == "dimension" or quantity == "phi" or (kind == "station" and quantity == "height"):
+            name = quantity.removesuffix("_m").replace("_", " ") if kind == "dimension" else f"{quantity} of {owner}"
+            _, value, sd, *_ = number_row(name, verdict.value, "px" if quantity == "phi" else "m", verdict)
+            spread = f"± {sd}" if np.isfinite(verdict.sd) else sd
+            yield {"name": name, "value": value, "sd": spread, "verdict": verdict.verdict}
 
 
 def _map(one: FieldMap) -> dict[str, Any]:
