@@ -76,7 +76,10 @@ def handle(place: Path, source: Path, given: argparse.Namespace, suspected: bool
     except cc.CalibrationError as error:
         return {**event, "event": "refused", "reason": str(error)}
     explanation = new.refitted.explanation if new.refitted else ""
-    moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(old, new).items()}
+    moves = {
+        name: {"mm": None if math.isnan(shift_m) else 1e3 * shift_m, "deg": deg}  # NaN is no JSON
+        for name, (shift_m, deg) in movements(old, new, new.refitted.what if new.refitted else "pose").items()
+    }
     event |= {"explanation": explanation, "moved": moves, "warnings": list(new.warnings), "rms_px": new.rms_px}
     return {**event, "event": "refitted", "seconds": round(time.perf_counter() - begin, 3)}
 
@@ -183,7 +186,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--watch", type=Path, metavar="FOLDER", help="then wait for files that appear there")
     parser.add_argument("--every-s", type=float, default=0.5, help="how often to look (default 0.5 s)")
     parser.add_argument(
-        "--what", default="pose", choices=WHAT, help="what is free in a refit, see `ceres-cal refit --help`"
+        "--what", default="auto", choices=WHAT, help="what is free in a refit, see `ceres-cal refit --help`"
     )
     parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="refits of nothing (default 0.01)")
     parser.add_argument("--checks", type=int, default=720, help="in so many checks (default 720, hourly for a month)")

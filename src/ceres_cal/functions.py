@@ -226,7 +226,7 @@ def check(
 def refit(
     calibration: Calibration,
     observations: Observations | Images,
-    what: Literal["pose", "pose-only", "zoom", "iris", "everything"] = "pose",
+    what: Literal["auto", "pose", "pose-only", "zoom", "iris", "everything"] = "auto",
     *,
     moved: Sequence[str] | None = None,
     options: moves.RefitOptions | None = None,
@@ -239,7 +239,8 @@ def refit(
     Args:
         observations: new observations; or photographs of one station, searched for the targets of the calibration.
         what: what is free. "pose": poses, the intrinsics under what is known of them; "pose-only": poses alone; "zoom":
-            phi, too; "iris": the lens's coefficients, too; "everything": all intrinsics, too.
+            phi, too; "iris": the lens's coefficients, too; "everything": all intrinsics, too; "auto": as "pose", or as
+            "zoom" or "iris" where the observations say so.
         moved: observed stations that moved; by default all. progress: called at every iteration of every solve.
         station: that took the photographs. not_painted: lines that the photographed field does not have.
 

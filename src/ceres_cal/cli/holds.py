@@ -102,7 +102,7 @@ def _checked_station(one: moves.Agreement) -> Section:
         maps = [(over.height_m, over.mean_mm, over.worst_mm) for over in change.maps]
         lines += [
             f"{used} observations, {misfit.outliers} outliers, noise {noise:.2f} times as before",
-            f"moved {change.moved_mm:.3g} mm, turned {change.turned_deg:.3g} deg, {size}",
+            f"{moves.moved_words(1e-3 * change.moved_mm, change.turned_deg)}, {size}",
             *(
                 f"map {at_height(h)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
                 for h, mean, worst in maps
@@ -341,11 +341,12 @@ class RefitArguments(InputArguments, arguments.ReportArguments):
     """What was seen after a move, and what may have changed."""
 
     output: Path | None = arguments.output_option("the new calibration", None)
-    what: Literal["pose", "pose-only", "zoom", "iris", "everything"] = option(
-        "what is free: pose: poses, the intrinsics under what is known of them (default); pose-only: poses, the "
+    what: Literal["auto", "pose", "pose-only", "zoom", "iris", "everything"] = option(
+        "what is free: auto: as pose, or as zoom or iris where the observations say so (default); pose: poses, the "
+        "intrinsics under what is known of them, and refused where something else has changed; pose-only: poses, the "
         "intrinsics held; zoom: phi, too: nothing is known of it any more; iris: the lens's coefficients, too; "
         "everything: all intrinsics, too",
-        default="pose",
+        default="auto",
     )
     moved: tuple[str, ...] = option(
         "only this one moved (repeatable); default: all observed", "STATION", repeatable=True

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, median
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, evenly, median
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations.sights import Sights, bounds_of
@@ -94,12 +94,6 @@ def _along(places: Array) -> Array:
     """(3,) from the first place towards the farthest."""
     away = places - places[0]
     return np.asarray(away[np.argmax(np.sum(away**2, axis=1))])
-
-
-def evenly(count: int, most: int) -> Indices:
-    """At most so many of `count` numbers, evenly."""
-    taken = min(count, most)
-    return np.asarray((np.arange(taken) * (count - 1)) // max(taken - 1, 1))
 
 
 def distances_of(places: Array, others: Array) -> Array:

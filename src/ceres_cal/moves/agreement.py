@@ -73,7 +73,7 @@ class MapChange(Frozen):
     """A station from one camera to another.
 
     Attributes:
-        moved_mm, turned_deg: of its pose. phi_px: of both.
+        moved_mm, turned_deg: of its pose; how far is NaN where that is not known. phi_px: of both.
         shift_px: root mean square shift of the picture over the first map. maps: one a height.
     """
 
@@ -291,6 +291,13 @@ def _difference(grid: FieldGrid, pixels: Array, after: Camera, expected_mm: Arra
     off = 1e3 * (after.locate(pixels, grid.height_m) - grid.places)
     lost = (np.isfinite(pixels[:, 0]) & ~np.isfinite(off[:, 0])).reshape(grid.shape)
     return FieldDifference(grid.height_m, grid.x_m, grid.y_m, off.reshape(*grid.shape, 2), expected_mm, lost)
+
+
+def price_nats(let_go: int, count: int) -> float:
+    """By how much misfit must fall for so many numbers let go, of which nothing is known: half the logarithm of the
+    count of observations for each (the Bayesian information criterion; Schwarz, Annals of Statistics 6, 1978).
+    """
+    return 0.5 * let_go * math.log(count)
 
 
 # ---- two statements about the same numbers --------------------------------------------------------------------------

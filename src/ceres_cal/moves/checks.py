@@ -34,6 +34,7 @@ from ceres_cal.moves.agreement import (
     contrast,
     field_grids,
     matched,
+    price_nats,
     require_posterior,
     require_stations,
 )
@@ -57,8 +58,6 @@ from ceres_cal.start.world import chained_poses
 _INLIER_SIGMA = 3.5
 # Of observations that fit somewhere; with fewer than half nothing is understood. Nothing changes from 0.33 to 0.67.
 _LEAST_SHARE = 0.5
-# Fall of twice the cost that a phi at its place exceeds one time in a thousand. Nothing changes from half to double.
-_WILL_DO = 10.8
 # Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
 _USUAL_EQUATIONS = 4.0
 
@@ -176,9 +175,10 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
     noise, apart = _apart(case, used, *posed)
     holds = apart.probability >= level
     zoomed = None if holds else case.least(used, case.tested, near[0].pose)
-    will_do = zoomed is None or posed[0] - zoomed[0] < _WILL_DO * noise**2
+    will_do = zoomed is None or posed[0] - zoomed[0] < 2.0 * price_nats(1, inside) * noise**2
     anew, freed = (posed[1], ()) if will_do or zoomed is None else (zoomed[1], case.tested)
-    shift_m, turn = moved_from(case.prior.without(set(freed) - set(case.station_keys)), case.name, anew)
+    prior, posterior = case.prior.without(set(freed) - set(case.station_keys)), calibration.uncertainty.posterior
+    shift_m, turn = moved_from(prior, posterior, case.name, anew)
     grids = field_grids(calibration.targets)
     change = change_of(case.estimate, case.name, anew.camera_at(case.name), grids)
     change = replace(change, moved_mm=1e3 * shift_m, turned_deg=math.degrees(turn))
@@ -253,8 +253,7 @@ def _words(case: _CheckCase, holds: bool, probability: float, misfit: Misfit, ch
         words = f"holds: no movement beyond what is known ({at_most}probability {probability:.2g})"
     else:
         shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
-        before, camera = case.calibration.uncertainty.posterior, case.calibration.estimate.stations[case.name].camera
-        moved = moved_words(1e-3 * change.moved_mm, change.turned_deg, before, camera, "about ") + shifts
+        moved = moved_words(1e-3 * change.moved_mm, change.turned_deg, "about ") + shifts
         words = f"no longer holds: {moved} (probability {probability:.1g})"
     count = misfit.points + misfit.curves + misfit.outliers
     if misfit.outliers > many_outliers * count:

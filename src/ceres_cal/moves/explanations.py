@@ -16,6 +16,7 @@ from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.moves.agreement import price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
 from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations
@@ -38,7 +39,8 @@ _NOISIER = 1.5
 # Times the noise of the old calibration, from where on nothing is explained, unless most observations lie where they
 # should. Nothing changes from half to double.
 _TOO_NOISY = 4.0
-# Nats by which another explanation must be better: a factor of 20 000. Nothing changes from half to double.
+# Nats by which another explanation must be better than one that the user stated: a factor of 20 000. Nothing changes
+# from half to double. Where nothing was stated the better one is taken: a number let go has its price already.
 _SUPPORTED = 10.0
 # A camera whose labels are turned seems to have moved farther than the first (m); with labels turned back it stands
 # within the second of where it was (m), turned by less than the third (rad). Nothing changes from half to double.
@@ -46,6 +48,7 @@ _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
 _TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
 _WIDER = {
+    "auto": ("zoom", "iris", "everything"),
     "pose-only": ("zoom", "iris", "everything"),
     "pose": ("zoom", "iris", "everything"),
     "zoom": ("everything",),
@@ -57,6 +60,18 @@ WORDS = {
     "iris": "the lens's distortion has changed (another iris or focus)",
     "everything": "this is another lens or another camera",
 }
+
+
+class OtherChangeError(SolutionError):
+    """Something else has changed than what was let go.
+
+    Attributes:
+        what: one of `WHAT`, that explains the observations.
+    """
+
+    def __init__(self, message: str, what: str) -> None:
+        super().__init__(f"{message}: refit with --what {what}")
+        self.what = what
 
 
 def labels_turned(pose: Pose, old: Pose) -> tuple[float, float] | None:
@@ -93,7 +108,9 @@ def old_poses(plan: RefitPlan, search: PoseSearch) -> list[Pose]:
 
 
 def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError:
-    """What else the observations of the stations could be, as the error that refuses them."""
+    """What else the observations of the stations could be, as the error that refuses them; an OtherChangeError where
+    another refit explains them.
+    """
     names = ", ".join(repr(search.sight.key.station) for search in searches)
     return _other_explanation(plan, searches) or SolutionError(
         f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
@@ -103,36 +120,35 @@ def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solutio
 
 def _other_explanation(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError | None:
     """The first that fits better than what was known."""
-    for search in searches:
-        words = next(_others(plan, search), None)
-        station = search.sight.key.station
-        if words is not None:
-            return SolutionError(f"station {station!r}: its observations do not fit the known lens and field; {words}")
-    return None
+    return next((error for search in searches for error in _others(plan, search)), None)
 
 
-def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
-    """Explanations that fit, and better than what was known, in words, with what to do."""
+def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
+    """Explanations that fit, and better than what was known, with what to do."""
+    misfit = f"station {search.sight.key.station!r}: its observations do not fit the known lens and field; "
     old = old_poses(plan, search)
     known = min((one.misfit for one in pose_candidates(search, old, patience=0)), default=np.inf)
     mirrored = relabelled(search.sight.observations, MIRRORED)
     if mirrored is not None and _fits(_seen_as(search, mirrored), old, known):
-        yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
+        yield SolutionError(
+            f"{misfit}with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
+        )
     for name, observations in mistaken_targets(search.sight.observations).items():
         if _fits(_seen_as(search, observations), old, known):
-            yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
+            yield SolutionError(f"{misfit}on {name} they do: this is the wrong field: correct the target's dimensions")
     zoomed = zoomed_search(search, old)
     if zoomed is not None and _good(zoomed[1], known) and plan.what not in ("zoom", "everything"):
         phi = zoomed[0].camera.phi
         before = search.camera.phi
-        yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
+        message = f"{misfit}with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}"
+        yield OtherChangeError(message, "zoom")
     own = search.sight.observations.of_station(search.sight.key.station)
     fresh = attempt(lambda: calibrate(own, replace(plan.options, priors=())))  # quiet: one hint less in a refusal
     if isinstance(fresh, CalibrationError):
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
     if noise < _NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
-        yield f"with another lens they do: {WORDS['everything']}: calibrate it anew"
+        yield SolutionError(f"{misfit}with another lens they do: {WORDS['everything']}: calibrate it anew")
 
 
 def _fits(search: PoseSearch, old: list[Pose], known: float) -> bool:
@@ -210,7 +226,7 @@ def require_supported(
     searches: Sequence[PoseSearch],
     solved_with: Callable[[str, Estimate], Calibration],
 ) -> bool:
-    """Whether nothing fits; SolutionError where another explanation than the chosen one is supported.
+    """Whether nothing fits; OtherChangeError where another explanation than the chosen one is supported.
 
     Args:
         searches: of each station that moved. solved_with: solves again with another freedom, from an estimate.
@@ -225,12 +241,16 @@ def require_supported(
     quiet = {w: r for w, r in results.items() if judged(plan, w, r).noise < _TOO_NOISY or w == plan.what}
     scores = _scores(plan, quiet)
     # Of explanations that are about as good the one that lets least go is taken.
-    best = next(what for what in quiet if scores[what] < min(scores.values()) + _SUPPORTED)
+    margin = _SUPPORTED
+    if plan.what == "auto":  # another lens is never taken for granted
+        margin, scores = 0.0, {what: score + _SUPPORTED * (what == "everything") for what, score in scores.items()}
+    best = next(what for what in quiet if scores[what] <= min(scores.values()) + margin)
     if best != plan.what and judged(plan, best, results[best]).noise < _NOISIER:
         gain = scores[plan.what] - scores[best]
-        raise SolutionError(
+        raise OtherChangeError(
             f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "
-            f"(better by {gain:.0f} nats): refit with --what {best}"
+            f"(better by {gain:.0f} nats)",
+            best,
         )
     if best != plan.what or judged(plan, plan.what, result).noise < _TOO_NOISY:
         return best != plan.what
@@ -262,7 +282,7 @@ def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
 
 
 def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
-    """Misfit of observations and prior, and half the logarithm of the count for every number let go; in nats."""
+    """Misfit of observations and prior, and the price of every number let go; in nats."""
     sights = plan.sights
     fits = [result.fit for result in results.values()]
     scales = (
@@ -273,7 +293,7 @@ def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, fl
     scores = {}
     for what, result in results.items():
         there = residuals(sights, result.estimate)
-        total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
+        total = 0.5 * judged(plan, what, result).strain + price_nats(len(plan.loosened(what)), count)
         for name in sights.cameras:
             total += there.misfit(sights.of_camera(name), result.cameras[name], scales)
         scores[what] = float(total)

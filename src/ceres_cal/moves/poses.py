@@ -201,18 +201,20 @@ def movement(a: Pose, b: Pose) -> tuple[float, float]:
     return float(np.linalg.norm(a.position - b.position)), float(angle)
 
 
-def moved_from(known: GaussianPrior, station: str, now: Estimate) -> tuple[float, float]:
+def moved_from(known: GaussianPrior, before: Posterior, station: str, now: Estimate) -> tuple[float, float]:
     """How far (m) and by what angle (rad) a station stands from where what was known puts it beside everything else as
-    it is seen now: its height changes with phi, and it has not moved for that.
+    it is seen now: its height changes with phi, and it has not moved for that. How far is NaN where no more is known of
+    phi than a valley that was followed.
     """
     keys = pose_keys("station", station)
     own = known.given(keys, now)
     shift_m, turn = np.split(over(own.offsets(now), own.keys, keys), 2)
-    return float(np.linalg.norm(shift_m)), float(np.linalg.norm(turn))
+    known_m = np.nan if now.stations[station].camera in before.followed else float(np.linalg.norm(shift_m))
+    return known_m, float(np.linalg.norm(turn))
 
 
-def moved_words(shift_m: float, turned_deg: float, before: Posterior, camera: str, about: str = "") -> str:
-    """How far a station of a camera moved, by what was known of it before."""
-    if camera in before.followed:  # its height goes with phi, which is known to 5 % at most
+def moved_words(shift_m: float, turned_deg: float, about: str = "") -> str:
+    """How far a station moved."""
+    if np.isnan(shift_m):
         return f"turned by {about}{turned_deg:.3f} deg (how far it moved is not known: its phi is not)"
     return f"moved by {about}{1e3 * shift_m:.1f} mm and {turned_deg:.3f} deg"

@@ -63,7 +63,7 @@ def mistaken_targets(observations: Observations) -> dict[str, Observations]:
     }
 
 
-WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
+WHAT = ("auto", "pose", "pose-only", "zoom", "iris", "everything")
 LABELS = ("check", "as-given", "turned")
 
 
@@ -167,7 +167,7 @@ def make_plan(
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
-    prior = carried_prior(calibration, observations, stays, of_lens=what in ("pose", "pose-only"))
+    prior = carried_prior(calibration, observations, stays, of_lens=what in ("auto", "pose", "pose-only"))
     placed = {name: old[name] for name in old if name in stays}
     placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
     return RefitPlan(

@@ -18,6 +18,8 @@ from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
+    WORDS,
+    OtherChangeError,
     judged,
     old_poses,
     require_labels,
@@ -50,7 +52,7 @@ _SMALL = (0.3, np.deg2rad(15.0))
 def refit(
     calibration: Calibration,
     observations: Observations,
-    what: str = "pose",
+    what: str = "auto",
     *,
     moved: Collection[str] | None = None,
     options: RefitOptions | None = None,
@@ -65,9 +67,10 @@ def refit(
     before them is the prior then, and nothing counts twice.
 
     Args:
-        what: "pose" (intrinsics under their posterior), "pose-only" (intrinsics held; how well they are known still
-            counts in the new posterior), "zoom" (nothing is known of phi any more), "iris" (nothing of the lens's
-            coefficients), "everything" (nothing of the intrinsics).
+        what: "auto" ("pose", or "zoom" or "iris" where the observations say so), "pose" (intrinsics under their
+            posterior), "pose-only" (intrinsics held; how well they are known still counts in the new posterior), "zoom"
+            (nothing is known of phi any more), "iris" (nothing of the lens's coefficients), "everything" (nothing of
+            the intrinsics).
         moved: observed stations that moved; by default all. The other observed ones stay under their posterior.
 
     Raises:
@@ -76,6 +79,19 @@ def refit(
         SolutionError: no explanation fits, or another one than `what` allows for does; the message says which.
     """
     plan = make_plan(calibration, observations, what, moved, options)
+    try:
+        return _refitted(plan, observations, progress)
+    except OtherChangeError as change:
+        if what != "auto" or change.what == "everything":
+            raise
+        plan = make_plan(calibration, observations, change.what, moved, options)
+        return _refitted(plan, observations, progress, f"{WORDS[change.what]}, the observations say; ")
+
+
+def _refitted(
+    plan: RefitPlan, observations: Observations, progress: SolveProgress | None, because: str = ""
+) -> Calibration:
+    calibration, what = plan.calibration, plan.what
     estimate = _start(plan)
     zoomed = plan.moved_cameras if what in ("zoom", "everything") else ()
     phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
@@ -96,11 +112,12 @@ def refit(
             raise
         raise SolutionError(f"{stated[0]}; or else {error}") from None
     _require_known(plan, result)
-    result, explanation = _as_known(plan, _with_other_lenses(plan, result)), _explained(plan, result)
+    result, explanation = _as_known(plan, _with_other_lenses(plan, result)), because + _explained(plan, result)
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
     if calibration.digest == observations.digest:
         seen = calibration.refitted.digests if calibration.refitted else ()
-    refitted = Refitted(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
+    freed = "pose" if what == "auto" else what
+    refitted = Refitted(freed, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
     warnings = (*_warnings(plan, result), *([_TWICE] if observations.digest in seen else []))
     return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
 
@@ -259,9 +276,9 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:
-    words, moves, known = [], movements(plan.calibration, result, plan.what), plan.calibration.uncertainty.posterior
+    words, moves = [], movements(plan.calibration, result, plan.what)
     for name in sorted(plan.moved):
-        how = moved_words(*moves[name], known, plan.stations[name]) if name in moves else "is new"
+        how = moved_words(*moves[name]) if name in moves else "is new"
         words.append(f"station {name!r} {how}")
     if plan.what in ("zoom", "everything"):
         for name in sorted(plan.moved_cameras):
@@ -271,14 +288,16 @@ def _explained(plan: RefitPlan, result: Calibration) -> str:
 
 
 def movements(before: Calibration, after: Calibration, what: str = "pose") -> dict[str, tuple[float, float]]:
-    """How far (m) and by how much (degrees) each station that both have was moved, by a refit of `what`."""
+    """How far (m; NaN where that is not known) and by how much (degrees) each station that both have was moved, by a
+    refit of `what`.
+    """
     known, old = before.uncertainty.posterior, before.estimate
     moves = {}
     for name in filter(old.stations.__contains__, after.estimate.stations):
         camera = old.stations[name].camera
         let_go = loosened(what, camera, old.cameras[camera].lens)
         shift_m, turn = (
-            moved_from(before.prior_of(tuple(set(known.keys_of(old, name)) - let_go)), name, after.estimate)
+            moved_from(before.prior_of(tuple(set(known.keys_of(old, name)) - let_go)), known, name, after.estimate)
             if known.knows_station(name)
             else movement(after.estimate.stations[name].cam_from_world, old.stations[name].cam_from_world)
         )

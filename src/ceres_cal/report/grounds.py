@@ -225,8 +225,12 @@ class Reach(Struct, frozen=True):
     is_worse: bool
 
     @property
+    def plane(self) -> str:
+        return "on the floor" if self.height_m == 0.0 else "at robot height"
+
+    @property
     def where(self) -> str:
-        return "on the floor" if self.height_m == 0.0 else f"at robot height ({mm(1e3 * self.height_m)})"
+        return self.plane if self.height_m == 0.0 else f"{self.plane} ({mm(1e3 * self.height_m)})"
 
 
 def reaches(quality: Quality) -> tuple[Reach, ...]:
@@ -299,8 +303,8 @@ def _except_at(every: Sequence[Reach]) -> str:
     if not worse:
         return ""
     farthest = max(worse, key=lambda one: one.worst_mm)
-    how = f"to {mm(farthest.worst_mm)} only" if np.isfinite(farthest.worst_mm) else "not known"
-    return f" (at {farthest.worst_at} {how})"
+    how = f"only to {mm(farthest.worst_mm)}" if np.isfinite(farthest.worst_mm) else "not known"
+    return f", but {how} {farthest.plane} at {farthest.worst_at}"
 
 
 def _short_of(reach: Reach) -> str:
