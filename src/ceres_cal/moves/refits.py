@@ -81,7 +81,7 @@ def refit(
     plan = make_plan(calibration, observations, what, moved, options)
     try:
         return _refitted(plan, observations, progress)
-    except OtherChangeError as change:
+    except OtherChangeError as change:  # reads: "the zoom was changed, the observations say", or the error
         if what != "auto" or change.what == "everything":
             raise
         plan = make_plan(calibration, observations, change.what, moved, options)
