@@ -281,11 +281,19 @@ class Poses(Frozen, Mapping[str, Pose]):
 
     def of_names(self, names: Sequence[str | None]) -> Array:
         """(N, 3, 4) the poses of these names, None being the identity."""
+        if self._are_all(names):
+            return self.stack
         every = np.concatenate([self.stack, _IDENTITY])
         return np.asarray(every[[len(self.stack) if name is None else self.numbers[name] for name in names]])
 
+    def _are_all(self, names: Sequence[str | None]) -> bool:
+        """Whether these are the names of all, in their order: then nothing is looked up."""
+        return len(names) == len(self.numbers) and list(self.numbers) == names
+
     def updated(self, names: Sequence[str], stack: Array) -> Poses:
         """The same poses but for those of these names."""
+        if self._are_all(names):
+            return Poses(self.numbers, stack)
         changed = self.stack.copy()
         changed[[self.numbers[name] for name in names]] = stack
         return Poses(self.numbers, changed)

@@ -131,14 +131,12 @@ class Sights(Frozen, Sequence["Sights"]):
             camera = None
         if camera is station is placements is None:
             return np.arange(len(self))
-        numbers = [
-            number
-            for number, key in enumerate(self.keys)
-            if (camera is None or key.camera == camera)
-            and (station is None or key.station == station)
-            and (placements is None or key.placement in placements)
-        ]
-        return np.array(numbers, dtype=np.int64)
+        chosen = np.ones(len(self), dtype=bool)
+        asked = (camera and (camera,), station and (station,), placements)
+        for place, among in enumerate(asked):
+            if among is not None:
+                chosen &= np.array([name in among for name in map(itemgetter(place), self.keys)], dtype=bool)
+        return np.flatnonzero(chosen)
 
     def of_camera(self, name: str) -> Sights:
         """The sights of one camera."""

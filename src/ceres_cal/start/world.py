@@ -227,14 +227,14 @@ def chained_poses(
     stations = {name: station.cam_from_world.matrix for name, station in (standing or {}).items()}
     stations = stations or {name: np.eye(3, 4) for name in anchored_stations(sights.observations)}
     placements: dict[str | None, Array] = {None: np.eye(3, 4)}
-    stacks, known = [np.empty((0, 3, 4))], -1
+    stacks, known, left = [np.empty((0, 3, 4))], -1, list(enumerate(keys))
     while len(stations) + len(placements) > known:
         known = len(stations) + len(placements)
-        for key, pose in zip(keys, seen, strict=True):
+        for row, key in left:
             if key.station not in stations and key.placement in placements:
-                stations[key.station] = chained(pose, inverted(placements[key.placement]))
+                stations[key.station] = chained(seen[row], inverted(placements[key.placement]))
         fresh: dict[str | None, int] = {}
-        for row, key in enumerate(keys):
+        for row, key in left:
             if key.placement not in placements and key.station in stations:
                 fresh.setdefault(key.placement, row)
         if fresh:
@@ -242,11 +242,16 @@ def chained_poses(
             world_from_cam = inverted(np.array(list(stations.values())))[[number[keys[row].station] for row in rows]]
             stacks.append(chained(world_from_cam, seen[rows]))
             placements |= dict(zip(fresh, stacks[-1], strict=True))
+        left = [(row, key) for row, key in left if not (key.station in stations and key.placement in placements)]
     _require_all(sights, stations, placements, open_numbers or {})
-    cameras = sights.observations.stations
+    cameras, placed = (
+        sights.observations.stations,
+        Poses.stacked([name for name in placements if name is not None], np.concatenate(stacks)),
+    )
+    own = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     return (
         {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
-        Poses.stacked([name for name in placements if name is not None], np.concatenate(stacks)),
+        Poses.stacked(own, placed.of_names(own)),
     )
 
 
