@@ -233,13 +233,16 @@ class EliminatedCost(_SightsCost):
 
     def _followed(self, at: Array, along: Array, step: float) -> _Evaluation | None:
         """Where so short a step from the last accepted place leads by that one's equations; None where more than
-        rounding may be missing, as long as steps shrink no slower than they did.
+        rounding may be missing, as long as steps shrink no slower than they did, where it is not all that these
+        equations ask for, or led there already.
         """
         nothing, before = 1e-6, self._accepted  # standard deviations
-        if step * step >= nothing * before.step:
+        if step * step >= nothing * (before.step - step):
             return None
-        poses = self._swept(at, np.inf).poses
-        return replace(before, at=at, residuals=before.residuals + along, poses=poses, step=step)
+        residuals = before.residuals + along
+        if np.linalg.norm(residuals[:-1]) > nothing:
+            return None
+        return replace(before, at=at, residuals=residuals, poses=self._swept(at, np.inf).poses, step=0.0)
 
     def _eliminated(self, at: Array, tolerance: float, step: float = 0.0) -> _Evaluation | None:
         """The cost in a place, or None where an observation cannot be projected from there."""
