@@ -1,11 +1,13 @@
-from ceres_cal.base.arrays import Array as Array
-from ceres_cal.base.arrays import Image as Image
-from ceres_cal.base.executing import processes as processes
-from ceres_cal.base.files import json_text as json_text
-from ceres_cal.base.files import make_folder as make_folder
-from ceres_cal.base.files import parse_json as parse_json
-from ceres_cal.base.files import read_bytes as read_bytes
-from ceres_cal.base.files import read_json as read_json
-from ceres_cal.base.files import write_bytes as write_bytes
-from ceres_cal.base.files import write_json as write_json
-from ceres_cal.base.threads import interruptibly as interruptibly
+from ceres_cal.base.archives import *
+from ceres_cal.base.arrays import *
+from ceres_cal.base.errors import *
+from ceres_cal.base.executing import *
+from ceres_cal.base.files import *
+from ceres_cal.base.frozen import *
+from ceres_cal.base.images import *
+from ceres_cal.base.shown import *
+from ceres_cal.base.tails import *
+from ceres_cal.base.threads import *
+from ceres_cal.base.transforms import *
+from ceres_cal.base.typed import *
+from ceres_cal.base.words import *

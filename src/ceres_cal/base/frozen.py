@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 import sys
 from collections import UserDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, fields
 from dataclasses import field as field
 from functools import cache
@@ -156,21 +156,32 @@ _Row = TypeVar("_Row")
 
 def names_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package: what its stub `__init__.pyi` imports, names and modules in
-    it, is loaded when it is first asked for.
+    it, and with * all that a module defines, is loaded when it is first asked for.
     """
-    stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
-    homes = {name: home for home, name in re.findall(r"^from (\S+) import \w+ as (\w+)$", stub, re.MULTILINE)}
+    stub = Path(str(sys.modules[package].__file__)).with_suffix(".pyi")
+    lines = stub.read_text(encoding="utf-8")
+    homes = {name: home for home, name in re.findall(r"^from (\S+) import \w+ as (\w+)$", lines, re.MULTILINE)}
+    for home in re.findall(r"^from (\S+) import \*$", lines, re.MULTILINE):
+        homes |= dict.fromkeys(_defined_in(stub.with_name(f"{home.rpartition('.')[2]}.py")), home)
 
     def of_name(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}{did_you_mean(name, homes)}")
-        home = homes[name]
-        return import_module(f"{package}.{name}") if home == package else getattr(import_module(home), name)
+        home, here = homes[name], vars(sys.modules[package])
+        here[name] = import_module(f"{package}.{name}") if home == package else getattr(import_module(home), name)
+        return here[name]
 
     def names() -> list[str]:
         return sorted({*vars(sys.modules[package]), *homes})
 
     return of_name, names, [name for name, home in homes.items() if home != package]
+
+
+def _defined_in(module: Path) -> Iterator[str]:
+    """The public names that a module defines, by its text: to load it takes longer."""
+    define = r"^(?:(?:    )?class|def) (\w+)|^(\w+)(?::[^=\n]*)? = |^from \S+ import \w+ as (\w+)$"
+    for names in re.findall(define, module.read_text(encoding="utf-8"), re.MULTILINE):
+        yield from (name for name in names if name and name[0] != "_")
 
 
 class LazyTable(UserDict[str, _Row]):

@@ -8,12 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ceres_cal.base.arrays import numerical
+from ceres_cal.base import at_most, checked, counted, for_small_matrices, meanwhile, numerical, replace
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.threads import at_most, for_small_matrices, meanwhile
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import counted
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through

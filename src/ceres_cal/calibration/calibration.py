@@ -9,12 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base import Frozen, InputError, Mask, Pose, cached_property, field, html_of, naming, replace
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, decode_json, read_bytes, write_json
-from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.shown import html_of
-from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
     COPY,
     FORMAT,

@@ -10,9 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import PixelOrigin, Units, convert
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base import Frozen, InputError, PixelOrigin, Units, convert, field, naming, replace
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.base.version import __version__
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate

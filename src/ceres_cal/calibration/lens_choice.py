@@ -14,9 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.frozen import Frozen, cached_property, replace
+from ceres_cal.base import CalibrationError, DegenerateError, Frozen, Mask, attempt, cached_property, or_none, replace
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort

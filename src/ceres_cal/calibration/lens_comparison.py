@@ -19,10 +19,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.transforms import Poses
+from ceres_cal.base import CalibrationError, DegenerateError, Mask, Poses, attempt, or_none, replace
 from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
 from ceres_cal.calibration.lens_seen import (
     MOST_ROUNDS,

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, DegenerateError, Frozen, replace
 from ceres_cal.problem.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
 from ceres_cal.scene.lens import LENSES, Lens, make_lens
 

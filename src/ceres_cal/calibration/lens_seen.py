@@ -9,10 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import CalibrationError, DegenerateError, attempt, or_none
+from ceres_cal.base import Array, CalibrationError, DegenerateError, Mask, attempt, or_none, upper_tail
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals

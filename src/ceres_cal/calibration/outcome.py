@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.words import bounds_text, two_digits
+from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, replace, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejected
 from ceres_cal.effects.aside import Explanation

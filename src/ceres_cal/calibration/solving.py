@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import attempt
-from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.base.threads import meanwhile
+from ceres_cal.base import Array, Frozen, Mask, attempt, cached_property, meanwhile, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
     came_out,

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from ceres_cal import observations, scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import did_you_mean, printable
+from ceres_cal.base import InputError, did_you_mean, printable
 from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal import base, cli, report
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import DASH, counted, mm, plural, printable
+from ceres_cal.base import DASH, InputError, counted, mm, plural, printable
 from ceres_cal.cli.arguments import jobs_option, output_option
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
 from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile, Tiles

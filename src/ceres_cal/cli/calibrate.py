@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import diagnostics, scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import InputError, replace
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.terminal import ProgressBar, progress_bar

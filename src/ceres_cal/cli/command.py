@@ -17,9 +17,7 @@ from dataclasses import MISSING, Field, fields
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, LazyTable, cached_property, field
-from ceres_cal.base.words import did_you_mean, sentence
+from ceres_cal.base import Frozen, InputError, LazyTable, cached_property, did_you_mean, field, sentence
 from ceres_cal.report.document import Document
 
 _T = TypeVar("_T")

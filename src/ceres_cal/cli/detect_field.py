@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal import calibration, detect, report, scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.images import images_and_videos
-from ceres_cal.base.words import plural
+from ceres_cal.base import InputError, images_and_videos, plural
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import QuietArguments, argument, command, option, switch
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median

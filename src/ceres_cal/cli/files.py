@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal import base, detect, diagnostics, observations, report, scene
-from ceres_cal.base.errors import CalibrationError, InputError, attempt
-from ceres_cal.base.images import image_files
-from ceres_cal.base.words import no_such
+from ceres_cal.base import CalibrationError, InputError, attempt, image_files, no_such
 from ceres_cal.cli.arguments import ReportArguments, parse_board, parse_priors
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section

@@ -22,11 +22,9 @@ from typing import Any
 import msgspec
 
 from ceres_cal import observations
-from ceres_cal.base.errors import CalibrationError, InputError, answer_or_reason, attempt, note
+from ceres_cal.base import CalibrationError, Frozen, InputError, answer_or_reason, attempt, note, printable, replace
 from ceres_cal.base.files import convert, parse_json, read_bytes
-from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.version import __version__
-from ceres_cal.base.words import printable
 
 RESULTS = "results.jsonl"
 LEVELS = ("failed", "no", "care", "good")

@@ -7,9 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ceres_cal import cli, detect
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.images import image_files
-from ceres_cal.base.words import plural
+from ceres_cal.base import InputError, image_files, plural
 from ceres_cal.cli.arguments import output_option, prior_option, whole
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import json_object, require_folder, require_shown

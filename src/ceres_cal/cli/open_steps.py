@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import read_bytes, write_bytes, write_json
+from ceres_cal.base import InputError, read_bytes, write_bytes, write_json
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.page.state import Made, Region, Sitting, State, target_words

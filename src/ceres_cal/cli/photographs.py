@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from ceres_cal import base, detect, scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.images import image_files, images_and_videos
-from ceres_cal.base.words import plural
+from ceres_cal.base import InputError, image_files, images_and_videos, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.arguments import frames_option, length, number, parse_length, parse_lengths
 from ceres_cal.cli.command import REQUIRED, Arguments, QuietArguments, argument, command, flag, option, switch

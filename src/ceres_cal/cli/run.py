@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal import base, detect, formats
-from ceres_cal.base.errors import InputError, NothingShownError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.images import IMAGE_ENDINGS, each_camera, images_and_videos
+from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError, each_camera, images_and_videos, replace
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.images import Images
-from ceres_cal.base.typed import checked
+from ceres_cal.base import Images, InputError, checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.run import RunArguments

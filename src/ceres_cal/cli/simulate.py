@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal import simulate
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import plural
+from ceres_cal.base import InputError, plural
 from ceres_cal.cli.arguments import output_option, whole
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import finishing, require_folder

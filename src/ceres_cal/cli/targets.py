@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ceres_cal import base, observations, report, scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import no_such
+from ceres_cal.base import InputError, no_such
 from ceres_cal.cli.arguments import output_option, parse_board
 from ceres_cal.cli.command import argument, command, option
 from ceres_cal.cli.files import require_output, save, spelled_target

@@ -22,8 +22,7 @@ from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO, cast
 
 from ceres_cal import base, calibration
-from ceres_cal.base.errors import CalibrationError, InputError, SolutionError, noting
-from ceres_cal.base.words import did_you_mean, first_of
+from ceres_cal.base import CalibrationError, InputError, SolutionError, did_you_mean, first_of, noting
 from ceres_cal.cli.command import COMMANDS, Command
 from ceres_cal.report.document import Document
 

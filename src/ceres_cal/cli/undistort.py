@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import detect, posterior, report, scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.images import image_files
-from ceres_cal.base.words import frame_of
+from ceres_cal.base import InputError, frame_of, image_files
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, argument, command, flag, given, option, switch
 from ceres_cal.cli.files import read_calibration, read_observations, require_folder, save, station_of

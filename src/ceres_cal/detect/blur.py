@@ -6,8 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.frozen import Rows, replace
+from ceres_cal.base import Array, Indices, Rows, replace
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import (
     LEAST_BLUR_PX,

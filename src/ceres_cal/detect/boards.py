@@ -12,10 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
-from ceres_cal.base.errors import ImageProgress, InputError, NothingShownError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.threads import in_turn
+from ceres_cal.base import AnyArray, Array, Frozen, Image, Image8, ImageProgress, InputError, NothingShownError, in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import REACH, Saddles, is_begun_dark, measure_saddles, steps_px

@@ -6,8 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices32
-from ceres_cal.base.frozen import Rows
+from ceres_cal.base import Array, Indices32, Rows
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, along_curve, along_track, curve_points, nearest_on_curve
 from ceres_cal.scene.targets import Target

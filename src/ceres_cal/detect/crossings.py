@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import Array, Frozen, Indices, Mask
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.observations import Points

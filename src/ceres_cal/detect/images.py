@@ -9,9 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array32, Image, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import read_bytes, require_room
+from ceres_cal.base import Array32, Image, InputError, Mask, read_bytes, require_room
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3

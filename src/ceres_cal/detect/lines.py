@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask, median, medians, medians_known
-from ceres_cal.base.frozen import Rows
+from ceres_cal.base import Array, Array32, Indices, Indices32, Mask, Rows, median, medians, medians_known
 from ceres_cal.detect.blur import blur_of, from_middle, no_blur, with_coma
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows

@@ -13,9 +13,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Image, Image8
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import Array, Array32, Frozen, Image, Image8, InputError
 from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.marker_targets import CORNERS

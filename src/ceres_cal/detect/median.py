@@ -12,10 +12,7 @@ from collections.abc import Iterable, Sequence
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Image
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import most_bytes
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import Array, Array32, Frozen, Image, InputError, most_bytes
 from ceres_cal.detect.images import light
 
 MOST_PICTURES = 25

@@ -10,8 +10,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Mask
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import Array, Array32, Frozen, Mask
 from ceres_cal.detect.courses import Course
 
 _REDUCED = 4

@@ -13,10 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.frozen import Frozen, Rows
-from ceres_cal.base.words import frame_of
+from ceres_cal.base import Array, Array32, Frozen, Indices32, InputError, Mask, Rows, frame_of, naming
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
 from ceres_cal.observations import NO_POINTS, Curves, Observations, View

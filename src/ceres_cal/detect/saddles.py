@@ -29,8 +29,7 @@ import cv2
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import AnyArray, Array, Mask, medians_known
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import AnyArray, Array, Frozen, Mask, medians_known
 
 REACH = 0.6
 """Radius of the disc around a corner as a part of the distance to the next edges: further, they would be in it."""

@@ -9,8 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
-from ceres_cal.base.frozen import Rows
+from ceres_cal.base import AnyArray, Array, Array32, Indices, Mask, Rows
 from ceres_cal.detect.images import negative
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide

@@ -8,10 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Image
-from ceres_cal.base.errors import ImageProgress, InputError
-from ceres_cal.base.files import make_folder, require_room, write_bytes
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import Frozen, Image, ImageProgress, InputError, make_folder, require_room, write_bytes
 from ceres_cal.detect.images import encoded
 
 MOST_FRAMES = 200_000

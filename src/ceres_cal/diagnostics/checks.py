@@ -10,9 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, rms
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.tails import log_chi2_tail, log_f_tail
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, log_chi2_tail, log_f_tail, rms
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.table import ResidualTable

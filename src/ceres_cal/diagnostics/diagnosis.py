@@ -7,13 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, numerical
-from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base import Array, DegenerateError, Indices, InputError, Mask, Pose, checked, numerical, plural
 from ceres_cal.base.frozen import Frozen, cached_property, replace
 from ceres_cal.base.shown import Shown, drawn, html_of, text_of
-from ceres_cal.base.transforms import Pose
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import plural
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResults, measure_noise, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled

@@ -15,9 +15,7 @@ from functools import cache
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.base.tails import log_binomial_tail
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, distinct, log_binomial_tail, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Curves, Observations
 from ceres_cal.problem.parameters import Estimate

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, numbers_of
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import Array, Frozen, Indices, Mask, numbers_of
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects.effect import Case
 from ceres_cal.effects.linearised import Linearised

@@ -10,11 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask, numbers_of
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import write_bytes, write_json
+from ceres_cal.base import AnyArray, Array, Codes, Indices, InputError, Mask, brief, numbers_of, write_bytes, write_json
 from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.shown import brief
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import column_of

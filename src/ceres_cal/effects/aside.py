@@ -14,9 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct, median
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.words import two_digits
+from ceres_cal.base import Array, Frozen, Indices, Indices32, Mask, distinct, median, replace, two_digits
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.evidence import (
     FEATURE_ASIDE,

@@ -17,9 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.tails import log_f_tail
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, field, log_f_tail, replace
 from ceres_cal.effects.linearised import LEAST_LEFT, Linearised, inverse_roots
 
 

@@ -11,9 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.base.words import first_of, two_digits
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, distinct, first_of, replace, two_digits
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised

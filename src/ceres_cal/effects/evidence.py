@@ -28,8 +28,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, Indices, median, replace
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.linearised import Linearised
 

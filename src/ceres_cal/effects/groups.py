@@ -23,8 +23,7 @@ from collections.abc import Iterator, Mapping, Set
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, known_inverses
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import Array, Frozen, Indices, cached_property, known_inverses
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
 from ceres_cal.observations.sights import Owner, SightKey, Sights

@@ -13,8 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, cached_property, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, replace
 from ceres_cal.observations.sights import STRUCTURE, ranges
 from ceres_cal.problem.costs import robust_weights
 from ceres_cal.problem.information import Information, Key, columns_by_owner

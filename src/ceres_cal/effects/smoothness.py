@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import NOTHING, Array, is_diagonal
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import NOTHING, Array, is_diagonal, replace
 from ceres_cal.effects.linearised import inverse_root
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate

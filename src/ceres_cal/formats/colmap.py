@@ -12,11 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import read_bytes
-from ceres_cal.base.threads import kept_signals
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, InputError, Pose, kept_signals, read_bytes
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera, camera_matrix

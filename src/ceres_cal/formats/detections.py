@@ -13,10 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base.archives import read_foreign_npz
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import require_room
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import InputError, read_foreign_npz, replace, require_room
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of

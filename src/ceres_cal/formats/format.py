@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 from msgspec import Struct
 
 from ceres_cal import scene
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import make_folder, write_bytes
-from ceres_cal.base.frozen import Frozen, field
+from ceres_cal.base import Frozen, InputError, field, make_folder, write_bytes
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration

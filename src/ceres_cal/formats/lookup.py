@@ -15,12 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal import posterior, scene
-from ceres_cal.base.archives import Column, read_npz
-from ceres_cal.base.arrays import AnyArray, Array, grid_places
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import HEIGHTS_M, AnyArray, Array, Column, Frozen, InputError, grid_places, read_npz, replace
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
 from ceres_cal.scene.camera import in_image

@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from ceres_cal import posterior, scene
-from ceres_cal.base.arrays import Array, grid_places, rms_and_largest
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import HEIGHTS_M, at_height
+from ceres_cal.base import HEIGHTS_M, Array, InputError, at_height, grid_places, rms_and_largest
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import require_room
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import InputError, Pose, require_room
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at

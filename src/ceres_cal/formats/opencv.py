@@ -11,10 +11,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, InputError, Pose, replace
 from ceres_cal.formats.format import (
     Exported,
     ExportFormat,

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Pose, euler_from_rotation
+from ceres_cal.base import Array, InputError, Pose, euler_from_rotation
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at

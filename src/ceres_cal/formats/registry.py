@@ -6,10 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import read_bytes
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import no_such
+from ceres_cal.base import InputError, checked, naming, no_such, read_bytes
 from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest
 

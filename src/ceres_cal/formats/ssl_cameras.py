@@ -12,11 +12,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import HEIGHTS_M, Array, InputError, Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.base.least_squares import least_squares
-from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
-from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels, nearest_foreign
 from ceres_cal.formats.opencv import parse_size

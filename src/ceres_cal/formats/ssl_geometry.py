@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ceres_cal.base.errors import InputError, attempt
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import InputError, attempt, replace
 from ceres_cal.formats.format import (
     Exported,
     ExportFormat,

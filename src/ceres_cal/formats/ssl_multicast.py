@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 
-from ceres_cal.base.errors import InputError, naming, note
-from ceres_cal.base.files import read_bytes
-from ceres_cal.base.words import first_of, plural
+from ceres_cal.base import InputError, first_of, naming, note, plural, read_bytes
 from ceres_cal.formats.format import Exported, ExportRequest
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import geometry_of, read_geometry

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import require_room
+from ceres_cal.base import Array, InputError, require_room
 from ceres_cal.scene.camera import LARGEST
 
 

@@ -14,13 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, numerical
-from ceres_cal.base.errors import CalibrationError, InputError, attempt
+from ceres_cal.base import Array, CalibrationError, InputError, Pose, at_height, attempt, checked, numerical, upper_tail
 from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Pose
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import at_height
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids

@@ -9,10 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, grid_places, median, numerical
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import nearest_rotation, rotation_log
+from ceres_cal.base import Array, InputError, grid_places, median, nearest_rotation, numerical, rotation_log, upper_tail
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import (

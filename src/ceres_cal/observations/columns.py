@@ -11,12 +11,8 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
+from ceres_cal.base import Frozen, InputError, Rows, convert, parts_of, run_parts, take_types
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.base.frozen import Frozen, Rows
-from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.typed import take_types
 
 
 class View(Frozen, eq=True):

@@ -12,9 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.archives import Column, read_npz, require_columns
-from ceres_cal.base.arrays import AnyArray, Codes
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import AnyArray, Codes, Column, Frozen, InputError, field, read_npz, replace, require_columns
 from ceres_cal.base.files import (
     PIXEL_ORIGIN,
     UNITS,
@@ -25,7 +23,6 @@ from ceres_cal.base.files import (
     read_bytes,
     write_bytes,
 )
-from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.words import did_you_mean, no_such
 from ceres_cal.observations.columns import (
     NO_CURVES,

@@ -8,10 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.typed import numbers_in, rows, size_in
-from ceres_cal.base.words import no_such
+from ceres_cal.base import Array, InputError, no_such, numbers_in, rows, size_in
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Curves, Points, View
 from ceres_cal.observations.files import Content
 from ceres_cal.scene.curves import SIDES

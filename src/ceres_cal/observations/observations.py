@@ -15,10 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Indices, Indices32, Mask
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.frozen import cached_property, field, replace
-from ceres_cal.base.typed import checked
+from ceres_cal.base import Indices, Indices32, InputError, Mask, cached_property, checked, field, naming, replace
 from ceres_cal.base.words import no_such, printable
 from ceres_cal.observations.columns import (
     Columns,

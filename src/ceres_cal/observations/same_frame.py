@@ -6,8 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import InputError, replace
 from ceres_cal.observations.columns import View
 from ceres_cal.observations.observations import Observations
 

@@ -19,9 +19,7 @@ from collections.abc import Hashable, Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.base.arrays import Array, Indices, Mask, median
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, median
 from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, view_label
 from ceres_cal.observations.files import Content
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, numerical
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import Array, numerical, replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.dependence import Scatter
 from ceres_cal.effects.effect import ShiftsAt

@@ -18,10 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import SolutionError, or_none
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.base import NORMAL_95, Array, Frozen, SolutionError, or_none, replace
 from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.problem.bundle import Solution, solve

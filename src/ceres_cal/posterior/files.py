@@ -13,10 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.arrays import Indices
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import Indices, InputError, convert, replace
 from ceres_cal.effects.dependence import Dependence
 from ceres_cal.posterior.bent import Ends
 from ceres_cal.posterior.mixture import Chain, Mixture

@@ -18,12 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, grid_places, largest
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import NORMAL_95, Array, InputError, Mask, Pose, brief, drawn, grid_places, largest
 from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.base.shown import brief, drawn
-from ceres_cal.base.tails import NORMAL_95
-from ceres_cal.base.transforms import Pose
 from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.bent import weak_axes
 from ceres_cal.posterior.mixture import FARTHER, Mixture, quantiles, radii

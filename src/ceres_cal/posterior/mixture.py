@@ -13,9 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
+from ceres_cal.base import NORMAL_95, NORMAL_95_ONE_SIDED, Array, Frozen, Indices, cached_property, field, replace
 from ceres_cal.kernels import normal_cdf
 from ceres_cal.problem.information import Information, Key, over
 

@@ -23,10 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, grid_places
-from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.transforms import Pose
-from ceres_cal.base.words import HEIGHTS_M
+from ceres_cal.base import HEIGHTS_M, Array, Frozen, Indices, Mask, Pose, cached_property, grid_places
 from ceres_cal.effects.evidence import agreement as agreement_of
 from ceres_cal.effects.evidence import shifts_by
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within

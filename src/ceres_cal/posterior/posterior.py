@@ -7,10 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Spread, without
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.shown import brief
+from ceres_cal.base import Array, Frozen, InputError, Spread, brief, cached_property, field, replace, without
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import Mixture

@@ -9,9 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct, rms
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import rotation_log
+from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, replace, rms, rotation_log
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.posterior.maps import (
     FieldGrid,

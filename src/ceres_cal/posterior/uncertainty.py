@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, are_known, median
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.shown import Shown, html_of, text_of
-from ceres_cal.base.typed import rows
+from ceres_cal.base import Array, Frozen, InputError, Shown, are_known, cached_property, html_of, median, rows, text_of
 from ceres_cal.base.words import at_precision, two_digits
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
 from ceres_cal.posterior.mixture import FARTHER

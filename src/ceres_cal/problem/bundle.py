@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 import pyceres
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.threads import at_most, available
+from ceres_cal.base import Array, DegenerateError, Frozen, Indices, InputError, SolutionError, at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import STRUCTURE, Owner, Sights
 from ceres_cal.problem.costs import (

@@ -13,10 +13,7 @@ import numpy as np
 import pyceres
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Pose, left_jacobian, rotation_log, skew
+from ceres_cal.base import Array, Frozen, Pose, left_jacobian, parts_of, replace, rotation_log, run_parts, skew
 from ceres_cal.observations.sights import STRUCTURE, Owner, SightKey, Sights
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales

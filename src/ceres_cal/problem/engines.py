@@ -15,11 +15,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, Indices, InputError, Poses, SolutionError, replace
 from ceres_cal.base.threads import at_most, available, for_small_matrices
-from ceres_cal.base.transforms import Poses
 from ceres_cal.observations.sights import Owner, SightKey
 from ceres_cal.problem.costs import CachedCost, CostValue, Run
 from ceres_cal.problem.parameters import Estimate

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Spread, known_inverses, without
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, known_inverses, without
 from ceres_cal.observations.sights import STRUCTURE, Owner
 
 _TURNS = ("turn_x", "turn_y", "turn_z")

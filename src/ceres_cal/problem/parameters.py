@@ -13,13 +13,8 @@ from operator import itemgetter
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import Array, Indices, InputError, Pose, Poses, brief, chained, inverted, no_such, take_types
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.shown import brief
-from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.base.typed import take_types
-from ceres_cal.base.words import no_such
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.problem.structure import Structure, Tolerance, make_structure

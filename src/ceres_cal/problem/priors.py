@@ -11,10 +11,7 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.transforms import rotation_log
+from ceres_cal.base import Array, Frozen, InputError, field, replace, rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Options, intrinsic_names

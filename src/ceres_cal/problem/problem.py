@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, cached_property, field, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, field, replace
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import Information

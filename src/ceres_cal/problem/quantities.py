@@ -13,10 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log, skew
+from ceres_cal.base import Array, Frozen, InputError, Pose, replace, rotation_exp, rotation_log, skew
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import POSE_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
 from ceres_cal.problem.parameters import (

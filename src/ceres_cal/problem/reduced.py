@@ -13,10 +13,7 @@ from operator import add
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices, known_inverses
-from ceres_cal.base.errors import SolutionError
-from ceres_cal.base.frozen import Frozen, cached_property
-from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.base import Array, Frozen, Indices, SolutionError, cached_property, known_inverses, parts_of, run_parts
 from ceres_cal.observations.sights import STRUCTURE, Owner, SightKey, Sights
 from ceres_cal.problem.costs import NORMAL_NS, kernel_loss
 from ceres_cal.problem.information import Information, Key, columns_by_owner, pose_keys, sigma_limits

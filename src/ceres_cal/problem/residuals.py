@@ -14,9 +14,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
-from ceres_cal.base.errors import SolutionError
-from ceres_cal.base.frozen import Frozen, cached_property, replace
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, SolutionError, cached_property, replace
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet

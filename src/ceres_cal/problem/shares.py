@@ -15,8 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
-from ceres_cal.base.frozen import Frozen
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Indices32, Mask
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content

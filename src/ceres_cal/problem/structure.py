@@ -16,11 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import Array, Indices, Indices32, InputError, Mask, distinct, no_such, take_types
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.typed import take_types
-from ceres_cal.base.words import no_such
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.scene.curves import Curve

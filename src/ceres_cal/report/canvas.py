@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, replace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

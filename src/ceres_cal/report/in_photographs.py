@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ceres_cal.base.arrays import rms
-from ceres_cal.base.words import counted, first_of, fixed
+from ceres_cal.base import counted, first_of, fixed, rms
 from ceres_cal.calibration import Calibration
 from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
 from ceres_cal.report.pictures.frames import Frame, frames_of, jpeg_of_at_most, marks_of, model_of, read_photograph

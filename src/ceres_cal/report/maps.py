@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, evenly, grid_places, largest
-from ceres_cal.base.words import at_height, mm, sentence, short
+from ceres_cal.base import Array, at_height, evenly, grid_places, largest, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.posterior.maps import FieldMap, ImageMap, image_grid
 from ceres_cal.report import canvas

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
+from ceres_cal.base import Array, euler_from_rotation, rotation_exp
 from ceres_cal.base.words import (
     DASH,
     at_precision,

@@ -15,10 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, Mask, largest
-from ceres_cal.base.errors import CalibrationError, attempt
-from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.base.words import HEIGHTS_M
+from ceres_cal.base import HEIGHTS_M, Array, CalibrationError, Frozen, Mask, attempt, cached_property, largest, replace
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis, diagnose

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from ceres_cal.base.errors import StepProgress
-from ceres_cal.base.files import write_bytes
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import counted, first_of
+from ceres_cal.base import StepProgress, checked, counted, first_of, write_bytes
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.observations import Observations

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import fixed, grouped, no_such, short
+from ceres_cal.base import Array, Indices, InputError, Mask, fixed, grouped, no_such, short
 from ceres_cal.diagnostics import Diagnosis, ResidualTable
 from ceres_cal.diagnostics.summaries import RadiusTrend, Summary
 from ceres_cal.report import canvas

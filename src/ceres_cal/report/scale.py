@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.words import short
+from ceres_cal.base import Array, short
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM
 
 if TYPE_CHECKING:

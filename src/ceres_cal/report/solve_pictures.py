@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.words import counted, fixed, powered, short
+from ceres_cal.base import Array, counted, fixed, powered, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.problem.information import Key
 from ceres_cal.report import canvas

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import rms
-from ceres_cal.base.errors import answer_or_reason
+from ceres_cal.base import answer_or_reason, rms
 from ceres_cal.base.words import (
     DASH,
     HEIGHTS_M,

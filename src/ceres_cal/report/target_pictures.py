@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import Array, InputError
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, PAINT, POINT, WIDE_IN
 from ceres_cal.scene.curves import Arc, Curve, crossings, curve_points

@@ -19,9 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, rms
-from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import Frozen, field, replace
+from ceres_cal.base import Array, DegenerateError, Frozen, Indices, field, replace, rms
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt

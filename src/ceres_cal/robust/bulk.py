@@ -13,8 +13,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, shown_rows, some_views

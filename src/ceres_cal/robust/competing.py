@@ -16,9 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median, medians_known
-from ceres_cal.base.errors import or_none
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, median, medians_known, or_none, replace
 from ceres_cal.effects.aside import (
     DOUBTFUL,
     Explanation,

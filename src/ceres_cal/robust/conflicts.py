@@ -19,10 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, numerical
-from ceres_cal.base.errors import CalibrationError, attempt, or_none
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import log_f_tail
+from ceres_cal.base import Array, CalibrationError, Frozen, attempt, log_f_tail, numerical, or_none, replace
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.effects.evidence import FEATURE_ASIDE

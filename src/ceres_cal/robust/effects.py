@@ -13,8 +13,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.frozen import Frozen, cached_property, replace
+from ceres_cal.base import Array, Frozen, Indices, cached_property, replace
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.evidence import FLOOR_OFF, LIKELY, RepeatedAmounts, shifts_by

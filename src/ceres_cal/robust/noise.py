@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, replace
 from ceres_cal.effects.linearised import equation_weights, shared_columns, studentised
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Estimate, Options

@@ -17,9 +17,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.base.errors import or_none
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import Array, Indices, median, or_none, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.bundle import Solution, placement_costs, solve
 from ceres_cal.problem.information import Information

@@ -8,10 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, is_diagonal
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import log_chi2_tail
-from ceres_cal.base.words import two_digits
+from ceres_cal.base import Array, Frozen, is_diagonal, log_chi2_tail, replace, two_digits
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.priors import GaussianPrior

@@ -21,9 +21,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.words import first_of, two_digits
+from ceres_cal.base import Array, Frozen, Mask, first_of, replace, two_digits
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
 from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RepeatedAmounts, shifts_by

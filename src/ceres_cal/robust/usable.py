@@ -13,8 +13,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, distinct
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base import Array, Mask, SolutionError, distinct
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Estimate

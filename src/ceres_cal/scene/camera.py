@@ -17,10 +17,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Array32, Mask
-from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.shown import drawn, html_of
+from ceres_cal.base import Array, Array32, DegenerateError, Frozen, InputError, Mask, drawn, field, html_of, replace
 from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.base.typed import numbers_in, rows, size_in
 from ceres_cal.scene.lens import Lens, make_lens

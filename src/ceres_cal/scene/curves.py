@@ -19,8 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import Array, InputError, Mask
 
 SIDES = {"centre": 0, "left": 1, "right": -1}
 """Which part of a painted curve was observed. Left and right are those of someone walking along it: from `start` to

@@ -11,9 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Mask, grid_places, rms_and_largest
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, InputError, Mask, grid_places, replace, rms_and_largest
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, require_rotation, rotation_log
 from ceres_cal.scene.camera import LARGEST, LARGEST_PX, Camera, OpenCvCamera

@@ -6,8 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Codes, Indices32
-from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.base import Array, Codes, Indices32, Pose, rotation_exp
 from ceres_cal.scene.curves import Arc, Curve, curve_points, distance_to_curve
 from ceres_cal.scene.targets import Target
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.base import Array, Mask, Pose, rotation_exp
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 from importlib.resources import files
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import parse_json
-from ceres_cal.base.words import no_such
+from ceres_cal.base import InputError, no_such, parse_json
 from ceres_cal.simulate.files import scene_from_json
 from ceres_cal.simulate.scene import Disturbance, Scene
 

@@ -11,9 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import body_of, convert, make_folder, read_json, write_json
+from ceres_cal.base import Array, InputError, body_of, convert, make_folder, naming, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera, CameraFile, Vector, camera_to_json

@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, field
-from ceres_cal.base.transforms import Pose
-from ceres_cal.base.words import did_you_mean
+from ceres_cal.base import Frozen, InputError, Pose, did_you_mean, field
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import SIDES, Target

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Codes, Frozen, Indices, Indices32, Mask, replace
 from ceres_cal.observations import Curves, Observations, Points, View, joined, taken
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve, is_crossing

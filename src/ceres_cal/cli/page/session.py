@@ -12,10 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal import detect, diagnostics, formats, moves, report, scene
-from ceres_cal.base.errors import InputError, answer_or_reason
-from ceres_cal.base.files import make_folder
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.words import frame_of, mm
+from ceres_cal.base import Frozen, InputError, answer_or_reason, frame_of, make_folder, mm, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.files import read_target

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import body_of, convert, json_text, read_json, write_json
+from ceres_cal.base import InputError, body_of, convert, json_text, read_json, write_json
 from ceres_cal.scene.targets import Target
 
 FORMAT, VERSION = "ceres-cal/page", 1

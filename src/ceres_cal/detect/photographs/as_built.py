@@ -12,9 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, Indices, SolutionError, attempt, replace
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects

@@ -12,10 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError, answer_or_reason, naming
-from ceres_cal.base.files import body_of, convert, read_json
-from ceres_cal.base.frozen import replace
+from ceres_cal.base import Array, InputError, answer_or_reason, body_of, convert, naming, read_json, replace
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.detect.photographs.refit import CAMERA, ROBUST, FreeIntrinsics, PointHints, refit_camera
 from ceres_cal.observations import Prior

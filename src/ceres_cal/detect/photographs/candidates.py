@@ -8,9 +8,7 @@ from time import thread_time
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Mask
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.transforms import Pose, chained, inverted
+from ceres_cal.base import Array, Array32, Frozen, Mask, Pose, chained, field, inverted, replace
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.grid import Facing, LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, StrokeMap, lines_seen, match

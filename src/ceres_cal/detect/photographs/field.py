@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array32, Mask
+from ceres_cal.base import Array32, Frozen, Mask, brief, for_small_matrices, frame_of, replace
 from ceres_cal.base.errors import (
     CalibrationError,
     ImageProgress,
@@ -19,10 +19,6 @@ from ceres_cal.base.errors import (
     naming,
     or_none,
 )
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.shown import brief
-from ceres_cal.base.threads import for_small_matrices
-from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, negative, read_colour, read_light
 from ceres_cal.detect.lines import Lines

@@ -9,11 +9,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.base.words import no_such
+from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, no_such, rotation_log
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Segment, curve_points
 from ceres_cal.scene.symmetry import middle_of, size_of, turns_of

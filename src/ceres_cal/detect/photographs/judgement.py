@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array, Frozen, Mask, replace
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.photographs.candidates import FieldSearch
 from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed

@@ -6,9 +6,7 @@ from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 
-from ceres_cal.base.errors import ImageProgress, InputError, NothingShownError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.shown import brief
+from ceres_cal.base import Frozen, ImageProgress, InputError, NothingShownError, brief, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.detect.photographs.field import FieldDetections, FieldOptions, detect_field

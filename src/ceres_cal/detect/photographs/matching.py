@@ -12,9 +12,7 @@ from math import gcd
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, Frozen, Mask, Pose, cached_property, replace
 from ceres_cal.detect.photographs.grid import LineGrid, places_along
 from ceres_cal.detect.photographs.upright import Upright
 from ceres_cal.detect.registration import Nearness

@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices32
-from ceres_cal.base.errors import or_none
-from ceres_cal.base.frozen import Frozen, field
+from ceres_cal.base import Array, Frozen, Indices32, field, or_none
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.bundle import solve

@@ -6,9 +6,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array32
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import Array32, Frozen, InputError, replace
 from ceres_cal.detect.photographs.by_hand import SIGMA_PX, unknown_optics
 from ceres_cal.detect.photographs.candidates import (
     BUDGET_S,

@@ -15,9 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.base import Array, Frozen, replace, rotation_exp
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45, -0.6, -0.75)

@@ -6,10 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, Frozen, InputError, Pose, SolutionError, field, replace
 from ceres_cal.diagnostics.advice.outlook import Outlook
 from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior
 from ceres_cal.observations.sights import gather_sights

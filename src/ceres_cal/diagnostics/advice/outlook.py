@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Spread, evenly, thin_root
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, evenly, thin_root
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior

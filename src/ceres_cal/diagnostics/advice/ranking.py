@@ -8,14 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import numerical
+from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_matrices, numerical, replace, text_of
 from ceres_cal.base.errors import InputError, StepProgress
-from ceres_cal.base.executing import each
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.shown import brief, text_of
-from ceres_cal.base.threads import for_small_matrices
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import ROBOT_TOP_M
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, still
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook

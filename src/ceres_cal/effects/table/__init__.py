@@ -11,8 +11,7 @@ from pkgutil import iter_modules
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import Array, Frozen, cached_property
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.effect import Case, Effect
 from ceres_cal.observations import Observations

@@ -9,9 +9,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, numbers_of
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.transforms import Pose, skew
+from ceres_cal.base import Array, Pose, numbers_of, replace, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.effects.evidence import AS_STATED

@@ -8,9 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, numbers_of
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.tails import log_f_tail
+from ceres_cal.base import Array, log_f_tail, numbers_of, replace
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_all
 from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.problem.parameters import OF_PIXELS, unit_px

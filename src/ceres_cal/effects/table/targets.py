@@ -9,9 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.words import first_of
+from ceres_cal.base import Array, Indices, first_of, replace
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.effects.evidence import FLOOR_OFF

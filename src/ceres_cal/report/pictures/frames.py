@@ -11,10 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Image, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.words import frame_of
+from ceres_cal.base import Frozen, Image, InputError, Mask, frame_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.images import encoded, read_colour
 from ceres_cal.observations import Columns, Observations

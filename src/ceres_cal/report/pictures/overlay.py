@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, Image, Image8, Indices32, Mask
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, Image, Image8, Indices32, Mask, Pose
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.diagnostics.advice import Measurement

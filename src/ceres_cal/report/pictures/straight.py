@@ -9,9 +9,7 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, Mask, grid_places
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, InputError, Mask, Pose, grid_places
 from ceres_cal.report.pictures.warp import Warp, make_warp, require_size
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import Brown

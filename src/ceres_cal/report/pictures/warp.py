@@ -16,8 +16,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Array32, Image, Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import Array, Array32, Image, InputError, Mask
 from ceres_cal.scene.camera import Camera
 
 MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767

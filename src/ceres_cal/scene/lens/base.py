@@ -22,10 +22,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import cached_property, replace
-from ceres_cal.base.words import no_such
+from ceres_cal.base import Array, Indices, InputError, Mask, cached_property, no_such, replace
 
 LinearEquations = tuple[dict[str, Array], Array]
 _BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache

@@ -13,8 +13,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import AnyArray, Array, Frozen, cached_property
 from ceres_cal.kernels import Optics, lens_images
 from ceres_cal.scene.lens.base import Lens, unit_rays
 

@@ -10,9 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import cached_property
+from ceres_cal.base import Array, Indices, InputError, cached_property
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, horner, invert_increasing
 

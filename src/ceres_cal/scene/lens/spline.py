@@ -11,9 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, grid_places, rms
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, grid_places, rms
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 

@@ -8,8 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.typed import checked
+from ceres_cal.base import InputError, checked
 from ceres_cal.scene.curves import Curve, Segment
 from ceres_cal.scene.targets.target import Disc, Grid, Paper, Square, Target, TargetKind, from_arguments, require_size
 

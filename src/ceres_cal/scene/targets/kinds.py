@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.frozen import LazyTable
+from ceres_cal.base import InputError, LazyTable, naming
 from ceres_cal.scene.targets.painted_fields import templates
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 

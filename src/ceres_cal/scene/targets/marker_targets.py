@@ -8,9 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.base.typed import checked
+from ceres_cal.base import InputError, checked, convert
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
 CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")

@@ -17,10 +17,7 @@ from typing import Any
 
 import msgspec
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import no_such
+from ceres_cal.base import InputError, checked, convert, no_such
 from ceres_cal.scene.curves import Arc, Curve, Segment, with_crossings
 from ceres_cal.scene.targets.target import LARGEST_M, Target, TargetKind
 

@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.typed import checked
+from ceres_cal.base import InputError, checked
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.target import Disc, Paper, Square, Target, TargetKind, from_arguments
 

@@ -14,10 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.base.frozen import Frozen, cached_property, field
+from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, convert, field
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
