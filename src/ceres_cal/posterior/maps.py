@@ -249,6 +249,12 @@ class Picture(Frozen):
         camera = camera.at(Pose.identity())
         return self if camera == self.camera else replace(self, camera=camera)
 
+    def weighted(self, weights: Array) -> Picture:
+        """The same with other weights."""
+        picture = replace(self, weights=weights)
+        vars(picture).update({"_rays": self._rays, "_by": self._by})  # which take long
+        return picture
+
     @property
     def shown(self) -> Mask:
         """(N,) which pixels the lens has an answer for."""
@@ -305,7 +311,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
 
     picture = Picture(own, pixels, 0.0)
     with_turns = read(posterior, estimate, shown_by(camera, picture), camera).sd
-    picture = replace(picture, weights=1.0 / np.maximum(with_turns, exact_px))
+    picture = picture.weighted(1.0 / np.maximum(with_turns, exact_px))
     radius = read(posterior, estimate, shown_by(camera, picture), camera).radius_95
     return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
 
