@@ -125,7 +125,7 @@ def test_normal_step() -> None:
     scipy = pytest.importorskip("scipy.stats")
     x = np.linspace(-6.0, 6.0, 1001)
     step, bell = normal_step(x)
-    assert np.max(np.abs(step - scipy.norm.cdf(x))) < 2e-7
+    assert np.max(np.abs(step - scipy.norm.cdf(x))) < 1e-15
     assert np.max(np.abs(bell - scipy.norm.pdf(x))) < 1e-15
 
 

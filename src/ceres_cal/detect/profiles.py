@@ -22,6 +22,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.frozen import Frozen, Rows
+from ceres_cal.kernels import normal_cdf
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
@@ -207,12 +208,8 @@ def fit_shape(
 
 
 def normal_step(x: Array) -> tuple[Array, Array]:
-    """The normal distribution's Phi(x), to 1e-7 (Abramowitz and Stegun 7.1.26), and its density."""
-    t = 1.0 / (1.0 + 0.3275911 * np.sqrt(0.5) * np.abs(x))
-    bell = np.exp(-0.5 * x * x)
-    series = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
-    tail = 0.5 * series * bell
-    return np.where(x > 0.0, 1.0 - tail, tail), bell * (1.0 / np.sqrt(2.0 * np.pi))
+    """The normal distribution's Phi(x), and its density."""
+    return normal_cdf(x), np.exp(-0.5 * x * x) * (1.0 / np.sqrt(2.0 * np.pi))
 
 
 # ---- least squares over many small problems -------------------------------------------------------------------------

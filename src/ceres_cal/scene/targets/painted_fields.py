@@ -80,7 +80,8 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
     Attributes:
         source: the rules: document, edition, clause, and what is from memory of them. measured: to which edges.
         dimensions, parts: name -> value, or the value of each variant. lengths: name -> expression, in order.
-        optional: parts that a field may lack without being another one.
+        optional: parts that a field may lack without being another one. tolerance_m: by how much its lines may lie
+            aside, where that is not as usual of its size.
     """
 
     kind: str
@@ -93,6 +94,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
     variants: _Variants | None = None
     parts: dict[str, bool | dict[str, bool]] = {}
     optional: tuple[str, ...] = ()
+    tolerance_m: float | None = None
     lengths: dict[str, Expression] = {}
     arcs: dict[str, _ArcSpec] = {}
     points: dict[str, _Point] = {}
@@ -133,7 +135,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             optional=tuple(
                 tuple(name for name, _, shape in shapes if part in shape.parts) for part in self.optional if parts[part]
             ),
-            tolerance_m=given.get(TOLERANCE),
+            tolerance_m=given.get(TOLERANCE, self.tolerance_m),
         )
 
     def _require_known(self, variant: str | None, given: Mapping[str, float | bool]) -> None:
