@@ -449,5 +449,5 @@ def test_several_stations_must_be_named(
         asked.append(station)
         return advised("two cameras")
 
-    monkeypatch.setattr("ceres_cal.diagnostics.advice.advise", answered)
+    monkeypatch.setattr("ceres_cal.diagnostics.advise", answered)
     assert main(["advise", str(tmp_path / "two.json"), "--station", "right"]) == 0 and asked == ["right"]

@@ -45,7 +45,7 @@ IN_PYTHON: list[tuple[Mistake, str]] = [
     (lambda c, o: any_cc.Options(lens="radial", powers=2), "Options(powers=...): Expected a list, got a whole number"),
     (lambda c, o: any_cc.check(o, c), "calibration must be a Calibration, not an Observations: exchange calibration"),
     (lambda c, o: any_cc.refit("old.json", o), "read the file with Calibration.load"),
-    (lambda c, o: any_cc.refit(c, o, "zom"), "what must be 'pose' or 'pose-only' or 'zoom'"),
+    (lambda c, o: any_cc.refit(c, o, "zom"), "what must be 'auto' or 'pose' or 'pose-only'"),
     (lambda c, o: any_cc.compare(c, "b.json"), "b must be a Calibration, not str 'b.json': read the file"),
     (lambda c, o: any_cc.score(o, c), "exchange calibration and observations"),
     (lambda c, o: any_cc.diagnose(c, "o.json"), "observations must be an Observations"),

@@ -11,15 +11,11 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 from ceres_cal import detect, moves, start
-from ceres_cal.base.errors import ImageProgress, InputError
-from ceres_cal.base.images import Images, image_files, images_and_videos
-from ceres_cal.base.typed import checked
-from ceres_cal.base.words import no_such
+from ceres_cal.base import ImageProgress, Images, InputError, checked, image_files, images_and_videos, no_such
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements
 from ceres_cal.observations import Observations, Prior, combine
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 if TYPE_CHECKING:
     from ceres_cal.problem.bundle import SolveProgress

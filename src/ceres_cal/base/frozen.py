@@ -162,7 +162,9 @@ def names_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]
     lines = stub.read_text(encoding="utf-8")
     homes = {name: home for home, name in re.findall(r"^from (\S+) import \w+ as (\w+)$", lines, re.MULTILINE)}
     for home in re.findall(r"^from (\S+) import \*$", lines, re.MULTILINE):
-        homes |= dict.fromkeys(_defined_in(stub.with_name(f"{home.rpartition('.')[2]}.py")), home)
+        module = stub.parent / home.rpartition(".")[2]
+        text = module / "__init__.pyi" if module.is_dir() else module.with_suffix(".py")
+        homes |= dict.fromkeys(_defined_in(text), home)
 
     def of_name(name: str) -> Any:
         if name not in homes:
@@ -179,9 +181,9 @@ def names_of(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]
 
 def _defined_in(module: Path) -> Iterator[str]:
     """The public names that a module defines, by its text: to load it takes longer."""
-    define = r"^(?:(?:    )?class|def) (\w+)|^(\w+)(?::[^=\n]*)? = |^from \S+ import \w+ as (\w+)$"
+    define = r"^(?:(?:    )?class|def) (\w+)|^(\w+(?:, \w+)*)(?::[^=\n]*)? = |^from \S+ import \w+ as (\w+)$"
     for names in re.findall(define, module.read_text(encoding="utf-8"), re.MULTILINE):
-        yield from (name for name in names if name and name[0] != "_")
+        yield from (name for name in "".join(names).split(", ") if name and name[0] != "_")
 
 
 class LazyTable(UserDict[str, _Row]):

@@ -15,8 +15,7 @@ from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import of_closed_form
 from ceres_cal.calibration.solving import Explained, Task, explained, known_of, solved_from
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights, is_bulk
+from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import unfilled
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.problem.bundle import SolveProgress

@@ -27,8 +27,7 @@ from ceres_cal.calibration.file import (
     package_versions,
 )
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.files import PosteriorFile
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.uncertainty import Uncertainty
@@ -40,8 +39,7 @@ from ceres_cal.problem.quantities import every_key
 from ceres_cal.problem.structure import redrawn
 from ceres_cal.robust.stated import Conflict, agreed
 from ceres_cal.robust.unsteady import without_unsteadiness
-from ceres_cal.scene.camera import Camera, CameraFile, PoseFile
-from ceres_cal.scene.targets import Target, targets_from_specs
+from ceres_cal.scene import Camera, CameraFile, PoseFile, Target, targets_from_specs
 
 if TYPE_CHECKING:
     from ceres_cal.posterior.seam import Disagreement

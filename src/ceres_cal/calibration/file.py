@@ -22,8 +22,7 @@ from ceres_cal.problem.parameters import Estimate, Options, Station
 from ceres_cal.problem.priors import GaussianPrior
 from ceres_cal.problem.structure import EXACT, WARP, make_structure
 from ceres_cal.robust.stated import Conflict
-from ceres_cal.scene.camera import CameraFile, Matrix, PoseFile, Vector
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import CameraFile, Matrix, PoseFile, Target, Vector
 
 COPY = "a copy"
 """How the reason begins of an observation that repeats another one, and was not taken out for its residual."""

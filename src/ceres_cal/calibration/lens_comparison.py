@@ -30,8 +30,7 @@ from ceres_cal.calibration.lens_seen import (
     require_groups,
     seen_through,
 )
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights, thinned
+from ceres_cal.observations import Observations, Sights, gather_sights, thinned
 from ceres_cal.posterior.other_lenses import cells_of
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.problem import problem_of

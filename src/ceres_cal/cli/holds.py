@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import base, detect, formats, moves, report
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.words import HEIGHTS_M, at_height, fixed
+from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
 from ceres_cal.cli.foreign import from_option, import_options, typed_options

@@ -7,9 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from ceres_cal.base import Array, Indices32, Rows
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Arc, along_curve, along_track, curve_points, nearest_on_curve
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Arc, Camera, Target, along_curve, along_track, curve_points, nearest_on_curve
 
 
 class Course(Rows):

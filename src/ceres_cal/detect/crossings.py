@@ -8,9 +8,7 @@ from ceres_cal.base import Array, Frozen, Indices, Mask
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.observations import Points
-from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.curves import distance_to_curve, nearest_on_curve
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target, distance_to_curve, in_image, nearest_on_curve
 
 # Places that scatter as stated, beside those of a branch, which are few: where these scatter more (worn paint ends in
 # one, a shadow in another), so does where it leads. From 0 to 8 nothing changes but the largest errors.

@@ -22,9 +22,7 @@ from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.robust.noise import Inliers
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_on
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Curve, Target, curve_points, nearest_to_rays, turned_on
 
 
 class Mislabelled(Frozen):

@@ -13,8 +13,7 @@ import numpy as np
 from ceres_cal.base import AnyArray, Array, Codes, Indices, InputError, Mask, brief, numbers_of, write_bytes, write_json
 from ceres_cal.base.frozen import Frozen
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import column_of
+from ceres_cal.observations import Observations, column_of
 from ceres_cal.problem.residuals import Equations, plane_shift
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera

@@ -26,8 +26,7 @@ from ceres_cal.effects.evidence import (
     logsum,
 )
 from ceres_cal.effects.linearised import Linearised
-from ceres_cal.observations import Observations, View
-from ceres_cal.observations.sights import Sights, column_of
+from ceres_cal.observations import Observations, Sights, View, column_of
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.residuals import Equations
 from ceres_cal.scene.targets import Arc

@@ -9,8 +9,7 @@ import numpy as np
 from ceres_cal import posterior, scene
 from ceres_cal.base import HEIGHTS_M, Array, InputError, at_height, grid_places, rms_and_largest
 from ceres_cal.formats.format import ExportLoss, ExportRequest
-from ceres_cal.scene.camera import in_image
-from ceres_cal.scene.foreign import ForeignCamera, image_grid
+from ceres_cal.scene import ForeignCamera, image_grid, in_image
 
 Box = tuple[Array, Array]
 

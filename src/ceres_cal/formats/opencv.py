@@ -23,8 +23,7 @@ from ceres_cal.formats.format import (
     calibration_of,
 )
 from ceres_cal.formats.loss import as_foreign, loss_words
-from ceres_cal.scene.camera import LARGEST
-from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid, opencv_models
+from ceres_cal.scene import FISHEYE, LARGEST, ForeignCamera, image_grid, opencv_models
 
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")

@@ -11,9 +11,7 @@ from ceres_cal.base import Array, InputError, Pose, euler_from_rotation
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.foreign import nearest
-from ceres_cal.scene.lens import Radial
+from ceres_cal.scene import Camera, Radial, nearest
 
 
 def _export(request: ExportRequest) -> Exported:

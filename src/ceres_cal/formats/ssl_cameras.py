@@ -17,9 +17,7 @@ from ceres_cal.base.least_squares import least_squares
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels, nearest_foreign
 from ceres_cal.formats.opencv import parse_size
-from ceres_cal.scene.camera import LARGEST, Camera
-from ceres_cal.scene.foreign import opencv_models
-from ceres_cal.scene.lens import Radial
+from ceres_cal.scene import LARGEST, Camera, Radial, opencv_models
 
 _QUATERNION, _SHIFT = ("q0", "q1", "q2", "q3"), ("tx", "ty", "tz")
 NAMES = ("focal_length", "principal_point_x", "principal_point_y", "distortion", *_QUATERNION, *_SHIFT)

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.scene.curves import Arc, Curve, Segment
-from ceres_cal.scene.targets import Target, custom, ssl_field
+from ceres_cal.scene import Arc, Curve, Segment, Target, custom, ssl_field
 
 _SIZES = {  # of the message: the target's
     "field_length": "field_length_m",

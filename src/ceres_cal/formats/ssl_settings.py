@@ -26,8 +26,7 @@ from ceres_cal.formats.format import (
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import NAMES, CameraIds, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import target_of
-from ceres_cal.scene.camera import LARGEST
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import LARGEST, Target
 
 _CAMERA, _PARAMETERS, _FIELD = "Camera Calibrator", "Camera Parameters", "Field Configuration"
 _INDEX, _OPENCV = "camera index", "use openCV camera model"

@@ -11,12 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, rms
-from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base import HEIGHTS_M, Array, InputError, Mask, SolutionError, brief, rms, text_of
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.base.shown import brief, text_of
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
-from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations
@@ -24,8 +21,7 @@ from ceres_cal.posterior.maps import ErrorMap, FieldGrid, visible_pixels
 from ceres_cal.posterior.uncertainty import field_grid
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 # How often a calibration that holds is said not to, where nobody states another rate. At half of it nothing changes, at
 # double one of six pairs of calibrations of one camera differs.

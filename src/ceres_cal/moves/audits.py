@@ -19,8 +19,7 @@ from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids
-from ceres_cal.observations import Columns, Observations
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations import Columns, Observations, gather_sights
 from ceres_cal.posterior.maps import FieldGrid, field_map
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station

@@ -14,10 +14,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask, numerical, rms
-from ceres_cal.base.errors import DegenerateError, InputError, or_none
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, DegenerateError, Frozen, InputError, Mask, Pose, numerical, or_none, replace, rms
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.solving import Task, solved_from
@@ -39,8 +36,7 @@ from ceres_cal.moves.agreement import (
     require_stations,
 )
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_from, moved_words, pose_candidates
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout

@@ -10,17 +10,13 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base.errors import CalibrationError, SolutionError, attempt
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import CalibrationError, Frozen, Pose, SolutionError, attempt, replace, upper_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
 from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import make_structure

@@ -11,9 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, distinct, median
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, Frozen, Pose, distinct, median, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import placement_costs

@@ -1,17 +1,6 @@
 from ceres_cal.observations import same_frame as same_frame
-from ceres_cal.observations.columns import COMA as COMA
-from ceres_cal.observations.columns import NO_CURVES as NO_CURVES
-from ceres_cal.observations.columns import NO_POINTS as NO_POINTS
-from ceres_cal.observations.columns import Columns as Columns
-from ceres_cal.observations.columns import Curves as Curves
-from ceres_cal.observations.columns import Points as Points
-from ceres_cal.observations.columns import Prior as Prior
-from ceres_cal.observations.columns import View as View
-from ceres_cal.observations.columns import joined as joined
-from ceres_cal.observations.columns import prior_from_json as prior_from_json
-from ceres_cal.observations.columns import prior_to_json as prior_to_json
-from ceres_cal.observations.columns import taken as taken
+from ceres_cal.observations.columns import *
 from ceres_cal.observations.files import FORMAT as FORMAT
 from ceres_cal.observations.files import VERSION as VERSION
-from ceres_cal.observations.observations import Observations as Observations
-from ceres_cal.observations.observations import combine as combine
+from ceres_cal.observations.observations import *
+from ceres_cal.observations.sights import *

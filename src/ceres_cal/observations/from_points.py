@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, InputError, no_such, numbers_in, rows, size_in
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Curves, Points, View
 from ceres_cal.observations.files import Content
-from ceres_cal.scene.curves import SIDES
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import SIDES, Target
 
 
 def points_by_frame(

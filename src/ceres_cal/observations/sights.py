@@ -21,11 +21,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, evenly
-from ceres_cal.base.frozen import Frozen, cached_property, replace
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Indices32, Mask, cached_property, distinct, evenly, replace
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import nearest_to_rays
+from ceres_cal.scene import Camera, nearest_to_rays
 
 _RUN = 256  # rows between two that go, from which on those between are moved together
 _Rows: TypeAlias = "Indices | slice | list[slice]"

@@ -15,12 +15,10 @@ import numpy as np
 
 from ceres_cal.base import Array, Indices, InputError, Pose, Poses, brief, chained, inverted, no_such, take_types
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import SightKey
+from ceres_cal.observations import Observations, Prior, SightKey
 from ceres_cal.problem.structure import Structure, Tolerance, make_structure
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene import Camera, Target
 from ceres_cal.scene.lens import Lens, lens_class, make_lens
-from ceres_cal.scene.targets import Target
 
 AUTO = "auto"
 """The lens that the data ask for: which it is, a calibration says in its options (`calibration.lens_choice`)."""

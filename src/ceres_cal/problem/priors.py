@@ -17,8 +17,7 @@ from ceres_cal.problem.information import Information, Key, pose_keys
 from ceres_cal.problem.parameters import Estimate, Options, intrinsic_names
 from ceres_cal.problem.quantities import intrinsic_keys, values_of
 from ceres_cal.problem.structure import Structure
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Lens
+from ceres_cal.scene import Camera, Lens
 
 USUAL_CENTRE = 0.015
 """Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the

@@ -9,8 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, field, replace
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.observations import Observations, SightKey, Sights
 from ceres_cal.problem.information import Information
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, make_layout
 from ceres_cal.problem.priors import GaussianPrior, gather_priors

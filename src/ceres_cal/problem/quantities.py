@@ -29,8 +29,7 @@ from ceres_cal.problem.parameters import (
 )
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import Tolerance, dimensions_of
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Lens
+from ceres_cal.scene import Camera, Lens
 
 
 class PixelSlopes(NamedTuple):

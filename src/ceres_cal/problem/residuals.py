@@ -20,10 +20,7 @@ from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.problem.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.problem.structure import Structure, Tolerance, make_structure
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import along_track
-from ceres_cal.scene.lens import LENSES
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import LENSES, Camera, Target, along_track
 
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
 # scripts/accuracy/moves.py. Nothing changes from half to double.

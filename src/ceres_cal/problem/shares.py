@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base import AnyArray, Array, Frozen, Indices, Indices32, Mask
-from ceres_cal.observations import Observations
-from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
+from ceres_cal.observations import Curves, FileRows, Observations, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Owner, SightKey, Sights, column_of, shown_rows, sights_of
 from ceres_cal.problem.costs import Run, SightCost

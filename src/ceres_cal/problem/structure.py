@@ -20,8 +20,7 @@ from ceres_cal.base import Array, Indices, Indices32, InputError, Mask, distinct
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
-from ceres_cal.scene.curves import Curve
-from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
+from ceres_cal.scene import Arc, Curve, Segment, Target, target_from_spec
 from ceres_cal.scene.targets.target import WARP as WARP
 
 Kind = Literal["lines", "points", "warp", "heights"]

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from ceres_cal.moves.agreement import Agreement
-    from ceres_cal.scene.camera import Camera
-    from ceres_cal.scene.targets import Target
+    from ceres_cal.scene import Camera, Target
 
 _SERIES = (
     (1.0, 2.0, 5.0),

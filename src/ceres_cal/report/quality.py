@@ -21,16 +21,13 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.table import EFFECTS, JointStep
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import gather_sights, thinned
+from ceres_cal.observations import Observations, gather_sights, thinned
 from ceres_cal.posterior.maps import FieldMap, ImageMap, locate_slopes, visible_pixels
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import OF_PIXELS
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import curve_points
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target, curve_points
 
 if TYPE_CHECKING:
     from ceres_cal.posterior.seam import Disagreement

@@ -14,8 +14,7 @@ import numpy as np
 from ceres_cal.base import Array, InputError
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, PAINT, POINT, WIDE_IN
-from ceres_cal.scene.curves import Arc, Curve, crossings, curve_points
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Arc, Curve, Target, crossings, curve_points
 from ceres_cal.scene.targets.target import Disc, Paper
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
-from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations import Observations, Prior, Sights
 from ceres_cal.problem.parameters import Estimate, Options, unit_px
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem

@@ -15,8 +15,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, replace
 from ceres_cal.effects.aside import Explanation
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import SightKey, shown_rows, some_views
+from ceres_cal.observations import Observations, SightKey, shown_rows, some_views
 from ceres_cal.problem.bundle import Solution, SolveProgress, solve
 from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
 from ceres_cal.problem.parameters import Estimate, Layout

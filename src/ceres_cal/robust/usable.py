@@ -14,8 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Mask, SolutionError, distinct
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations import Observations, Sights
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals

@@ -1,18 +1,9 @@
-from ceres_cal.scene.camera import Camera as Camera
-from ceres_cal.scene.camera import camera_to_json as camera_to_json
-from ceres_cal.scene.camera import in_image as in_image
-from ceres_cal.scene.foreign import ForeignCamera as ForeignCamera
+from ceres_cal.scene.camera import *
+from ceres_cal.scene.curves import *
+from ceres_cal.scene.foreign import *
 from ceres_cal.scene.lens import LENSES as LENSES
-from ceres_cal.scene.targets import TARGET_KINDS as TARGET_KINDS
-from ceres_cal.scene.targets import Curve as Curve
-from ceres_cal.scene.targets import Segment as Segment
-from ceres_cal.scene.targets import Target as Target
-from ceres_cal.scene.targets import TargetKind as TargetKind
-from ceres_cal.scene.targets import april_grid as april_grid
-from ceres_cal.scene.targets import checkerboard as checkerboard
-from ceres_cal.scene.targets import circle_grid as circle_grid
-from ceres_cal.scene.targets import custom as custom
-from ceres_cal.scene.targets import target_from_spec as target_from_spec
-from ceres_cal.scene.targets import target_named as target_named
-from ceres_cal.scene.targets import targets_by_name as targets_by_name
-from ceres_cal.scene.targets import targets_from_specs as targets_from_specs
+from ceres_cal.scene.lens import Lens as Lens
+from ceres_cal.scene.lens import Radial as Radial
+from ceres_cal.scene.lens import make_lens as make_lens
+from ceres_cal.scene.symmetry import *
+from ceres_cal.scene.targets import *

@@ -1,7 +1,7 @@
 """A camera: image size, intrinsics, lens and pose, the maps between world, rays and pixels, and how files have it.
 
-Pixel (0, 0) is the centre of the top-left pixel. The camera frame has x right, y down, z forward, and
-x_cam = R (x_world - t) with t the camera's position (paper, section 3).
+Pixel (0, 0) is the centre of the top-left pixel. The camera frame has x right, y down, z forward,
+and x_cam = R (x_world - t) with t the camera's position (paper, section 3).
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ceres_cal.base import Array, Mask, Pose, rotation_exp
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 
 def board_pose(board: Target, line_of_sight: Array, distance_m: float, turn_rad: tuple[float, float, float]) -> Pose:

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, InputError, body_of, convert, make_folder, naming, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.problem.parameters import Station
-from ceres_cal.scene.camera import Camera, CameraFile, Vector, camera_to_json
-from ceres_cal.scene.targets import targets_from_specs
+from ceres_cal.scene import Camera, CameraFile, Vector, camera_to_json, targets_from_specs
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from ceres_cal.base import Frozen, InputError, Pose, did_you_mean, field
 from ceres_cal.problem.parameters import Station
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import SIDES, Target
+from ceres_cal.scene import SIDES, Camera, Target
 
 
 class ViewPlan(Frozen, eq=True):

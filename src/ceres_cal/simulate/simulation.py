@@ -8,9 +8,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Codes, Frozen, Indices, Indices32, Mask, replace
 from ceres_cal.observations import Curves, Observations, Points, View, joined, taken
-from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve, is_crossing
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import SIDES, Camera, Target, along_curve, distance_to_curve, in_image, is_crossing
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2

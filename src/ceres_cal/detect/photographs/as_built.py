@@ -21,8 +21,7 @@ from ceres_cal.observations import Prior
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.residuals import residuals, whole_structure, write_equations
 from ceres_cal.problem.structure import dimension_slopes, dimensions_of
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 # Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
 # lie aside, root sum of squares: farther, they are others.

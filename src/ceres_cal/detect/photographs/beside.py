@@ -15,8 +15,7 @@ from ceres_cal.base.arrays import Array, Array32, Indices, Mask, median
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import peaks
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observations_of, refit_camera
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 # Of half the image's diagonal, how far to either side others are looked for.
 _REACH = 0.06

@@ -18,10 +18,7 @@ from ceres_cal.detect.photographs.refit import CAMERA, ROBUST, FreeIntrinsics, P
 from ceres_cal.observations import Prior
 from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.problem.problem import Weighting
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import curve_points
-from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Radial, Target, curve_points
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.start.search import searched
 from ceres_cal.start.sightlines import Beforehand, Sightlines

@@ -18,10 +18,7 @@ from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_narrow_strokes, find_strokes
 from ceres_cal.observations import Prior
 from ceres_cal.problem.structure import redrawn
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import curve_points
-from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Radial, Target, curve_points
 
 _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
 # The score of a match after which no other lens and tilt is tried: it only saves time. Nothing changes from 0.79 to

@@ -34,8 +34,7 @@ from ceres_cal.detect.strokes import Strokes, strokes_of_signs
 from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Prior, View, combine
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 TARGET_NAME = "field"
 Start = Camera | Clicks | Auto

@@ -8,8 +8,7 @@ from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 # Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
 LEAST_SHARE = 0.5

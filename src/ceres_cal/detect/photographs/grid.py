@@ -10,10 +10,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, no_such, rotation_log
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Arc, Segment, curve_points
-from ceres_cal.scene.symmetry import middle_of, size_of, turns_of
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Arc, Camera, Segment, Target, curve_points, middle_of, size_of, turns_of
 
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
 _DIGITS = 6  # of metres, after which two offsets are one

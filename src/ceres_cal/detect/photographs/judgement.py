@@ -11,8 +11,7 @@ from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
 from ceres_cal.detect.photographs.matching import divergence
 from ceres_cal.detect.photographs.painted import BY_CHANCE
 from ceres_cal.problem.quantities import PHI_RANGE
-from ceres_cal.scene.curves import Arc
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Arc, Target
 
 # Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
 # double.

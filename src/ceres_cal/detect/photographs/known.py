@@ -14,8 +14,7 @@ from ceres_cal.detect.photographs.follow import FAR_PX
 from ceres_cal.moves.agreement import FALSE_ALARMS, Agreements, require_posterior
 from ceres_cal.moves.checks import check, not_found
 from ceres_cal.observations import Observations, combine
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 _REACH = f"{FAR_PX:.0f} px or 5 degrees"
 

@@ -10,8 +10,7 @@ from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import search
 from ceres_cal.detect.photographs.matching import divergence
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 # Where lines are sought: px apart, and to either side as a share of half the image's diagonal.
 _SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12

@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices32, field, or_none
-from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, gather_sights
 from ceres_cal.problem.bundle import solve
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.problem.priors import stated_prior
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import make_structure, redrawn
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
 NOTHING: tuple[Indices32, Array, Array] = (np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))

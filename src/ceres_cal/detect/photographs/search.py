@@ -31,8 +31,7 @@ from ceres_cal.detect.photographs.grid import (
 from ceres_cal.detect.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.detect.strokes import Strokes
-from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target, in_image
 
 # Of the strokes explained, by the first without an objection: no other is followed, nor after one whose lines lie as
 # drawn to millimetres. It only saves time. Nothing changes from 0.82 to 0.95.

@@ -8,8 +8,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, InputError, Pose, SolutionError, field, replace
 from ceres_cal.diagnostics.advice.outlook import Outlook
-from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior, gather_sights
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.priors import stated_prior, tolerances
@@ -18,9 +17,7 @@ from ceres_cal.problem.quantities import layout_of
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import equations_of, residuals
 from ceres_cal.problem.structure import Tolerance, make_structure
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Arc, curve_points
-from ceres_cal.scene.targets import Target, checkerboard, custom
+from ceres_cal.scene import Arc, Camera, Target, checkerboard, curve_points, custom
 from ceres_cal.simulate import Scene, ViewPlan, board_pose, simulate, well_inside
 
 POLE_M, POLE_SIGMA_M = 1.0, 0.005

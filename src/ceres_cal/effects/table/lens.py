@@ -13,8 +13,7 @@ from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_
 from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.problem.parameters import OF_PIXELS, unit_px
 from ceres_cal.problem.priors import USUAL_DECENTRING
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import LENSES, Lens
+from ceres_cal.scene import LENSES, Camera, Lens
 
 # Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few
 # observations.

@@ -21,9 +21,7 @@ from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.diagnostics.advice import Measurement
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.structure import BuiltTarget
-from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.curves import along_track, curve_points
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene import Camera, Target, along_track, curve_points, in_image
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""
