@@ -51,6 +51,11 @@ _OBLONG = (
     "camera {!r}: fy / fx comes out as {:.4f}. Few cameras have pixels so far from square. If its pixels are "
     "square, the length or the width of the target is wrong by {} %: measure it, or state --fix aspect=1"
 )
+_SQUARED = (
+    "camera {!r}: its pixels are taken for square, but the observations alone say fy / fx = {:.3f} ± {:.3f}. If its "
+    "pictures were stretched, its height and places above the floor are wrong: state --fix aspect=1 if they were not, "
+    "--free-aspect if they were"
+)
 _BEHIND = (
     "camera {!r} sees all {} checkerboards from behind: its pictures are mirrored, x and y of its pixels or rows and "
     "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
@@ -101,16 +106,40 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
                 yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
 
 
-def unusual_pixels(end: RobustSolution, problem: Problem) -> Iterator[str]:
+def unusual_pixels(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
     """Words about cameras whose pixels come out far from square, where only targets of the world tell so: a length that
-    is not the target's looks the same. A board that is turned from view to view would contradict it.
+    is not the target's looks the same. A board that is turned from view to view would contradict it. And about those
+    whose pixels are square by what is usual of cameras alone.
     """
     unusual = 0.007  # of fy / fx: of the public cameras tried it is up to 0.006 off
+    surely = 2.5  # standard deviations: 2.9 to 9.5 of pictures stretched by 5 to 7 %, 1.9 at most of thirty others
     turned = {view.camera for view in problem.observations.views if view.placement is not None}
     for name, camera in end.estimate.cameras.items():
         free = problem.layout.free.get(name, ())
-        if OF_PIXELS.index("aspect") in free and name not in turned and abs(camera.aspect - 1.0) > unusual:
+        if OF_PIXELS.index("aspect") not in free or name in turned:
+            continue
+        if abs(camera.aspect - 1.0) > unusual:
             yield _OBLONG.format(name, camera.aspect, two_digits(100.0 * abs(camera.aspect - 1.0)))
+            continue
+        value, sd = _aspect_by_itself(name, end, problem, posterior)
+        if abs(value - 1.0) > max(unusual, surely * sd):
+            yield _SQUARED.format(name, value, sd)
+
+
+def _aspect_by_itself(camera: str, end: RobustSolution, problem: Problem, posterior: Posterior) -> tuple[float, float]:
+    """fy / fx by the observations alone, to first order, and its standard deviation: infinite where nobody asks."""
+    for prior in problem.priors_at(end.estimate):
+        keys = [key for key in prior.keys if prior.is_usual and key.owner == camera and key.quantity == "aspect"]
+        if not keys or end.reduced is None:
+            continue
+        own, off = prior.information.given(keys), prior.offsets(end.estimate)[prior.information.columns(keys)]
+        known = end.reduced.shared.less(own), posterior.information.less(own)
+        # What errors that go together, or other lenses, widen beyond what is usual cannot be told without it.
+        sds = [sd for one in known if np.isfinite(sd := float(one.spread.sd[one.columns(keys)][0]))]
+        if sds:
+            value = end.estimate.cameras[camera].aspect + sds[0] ** 2 * float(own.matrix[0, 0] * off[0])
+            return value, max(sds)
+    return 1.0, np.inf
 
 
 def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:

@@ -183,7 +183,7 @@ def known_of(seen: Explained) -> Calibration:
         seen, posterior = _known(seen, conflicts)
         alike = dict(seen_alike(seen.others, seen.end.estimate, posterior.half_width))
         strange = (
-            *unusual_pixels(seen.end, seen.problem),
+            *unusual_pixels(seen.end, seen.problem, posterior),
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
