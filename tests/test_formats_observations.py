@@ -52,13 +52,24 @@ TABLE = """frame,point,curve,side,x_px,y_px,sigma_px
 """
 
 
-def test_named_columns(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(TABLE)
+SPREADSHEET = TABLE.replace(",", ";").replace(".", ",").replace("100;50", "100,0;50,00")
+
+
+@pytest.mark.parametrize(
+    "table", [TABLE, "\ufeff" + TABLE.replace("\n", "\r\n"), SPREADSHEET, SPREADSHEET.replace(";", "\t")]
+)
+def test_named_columns(tmp_path: Path, table: str) -> None:
+    """Whatever a spreadsheet puts between them."""
+    (tmp_path / "a.csv").write_text(table, newline="")
     seen = import_observations(tmp_path / "a.csv", target="ssl-b", image_size="640x480")
     assert [view.frame for view in seen.views] == ["1", "2"] and seen.views[0].placement is None
     assert [seen.feature_name("point", row) for row in (0, 1)] == ["TopLeftCorner", "BottomLeftCorner"]
     assert seen.curves.side.tolist() == [1] and seen.curves.sigma_px.tolist() == [0.2]
     assert seen.points.sigma_px.tolist() == [0.3, 1.0]
+    assert seen.points.pixels.tolist() == [[100.0, 50.0], [100.0, 400.0]]
+
+
+def test_named_arrays(tmp_path: Path) -> None:
     columns: dict[str, Any] = {
         "x_px": [1.0, 2.0, 3.0],
         "y_px": [4.0, 5.0, 6.0],

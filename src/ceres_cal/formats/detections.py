@@ -72,15 +72,23 @@ _ZIP = b"PK"  # how an NPZ file begins
 
 
 def _csv_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
-    """Rows by names, and the names."""
-    marks = request.content.count(b",") + request.content.count(b"\n")
+    """Rows by names, and the names; with semicolons or tabs between them, as spreadsheets write where decimals have a
+    comma, which is read as a point then.
+    """
+    head = request.content.partition(b"\n")[0]
+    between = next((mark for mark in (",", ";", "\t") if mark.encode() in head), ",")
+    marks = request.content.count(between.encode()) + request.content.count(b"\n")
     require_room(_BYTES_PER_CELL * marks + 2.0 * len(request.content), str(request.path))
-    reader = csv.DictReader(io.StringIO(request.text))
+    reader = csv.DictReader(io.StringIO(request.text, newline=None), restval="", delimiter=between)
     try:
-        rows = list(reader)
+        rows, names = list(reader), tuple(reader.fieldnames or ())
     except csv.Error as error:
         raise InputError(f"not a CSV file (line {reader.line_num}): {error}") from None
-    return rows, tuple(reader.fieldnames or ())
+    for name in names if between != "," else ():
+        if name.endswith(("_px", "_m")):
+            for row in rows:
+                row[name] = row[name].replace(",", ".")
+    return rows, names
 
 
 def _npz_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tuple[str, ...]]:
