@@ -328,7 +328,7 @@ def _explained(one: moves.Agreement) -> str:
     return {
         True: f"explained by their uncertainties (probability {one.probability:.2g})",
         False: f"more than their uncertainties explain (probability {one.probability:.1g})",
-        None: "no statement on uncertainty: one of the calibrations does not have it",
+        None: "no statement on uncertainty: their lenses have other numbers, or one calibration has no uncertainty",
     }[one.holds]
 
 
