@@ -18,12 +18,8 @@ from ceres_cal.calibration.solving import Explained, Task, explained, known_of, 
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import unfilled
 from ceres_cal.posterior.assess import with_other_lenses
-from ceres_cal.problem.bundle import SolveProgress
+from ceres_cal.problem import EXACT, SolveProgress, gather_priors, make_structure, problem_of, require_possible_numbers
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
-from ceres_cal.problem.priors import gather_priors
-from ceres_cal.problem.problem import problem_of
-from ceres_cal.problem.quantities import require_possible_numbers
-from ceres_cal.problem.structure import EXACT, make_structure
 from ceres_cal.robust.as_built import Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
 from ceres_cal.robust.noise import noise_of_cameras

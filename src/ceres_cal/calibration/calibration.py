@@ -31,12 +31,8 @@ from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.files import PosteriorFile
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.uncertainty import Uncertainty
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate, Options, make_layout
-from ceres_cal.problem.priors import GaussianPrior, gather_priors
+from ceres_cal.problem import Estimate, GaussianPrior, Key, Options, every_key, gather_priors, make_layout, redrawn
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.quantities import every_key
-from ceres_cal.problem.structure import redrawn
 from ceres_cal.robust.stated import Conflict, agreed
 from ceres_cal.robust.unsteady import without_unsteadiness
 from ceres_cal.scene import Camera, CameraFile, PoseFile, Target, targets_from_specs

@@ -16,10 +16,7 @@ from ceres_cal.base.version import __version__
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.posterior.files import PosteriorFile, information_from, lower_triangle, require_keys
-from ceres_cal.problem import solver_version
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate, Options, Station
-from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem import Estimate, GaussianPrior, Key, Options, Station, solver_version
 from ceres_cal.problem.structure import EXACT, WARP, make_structure
 from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene import CameraFile, Matrix, PoseFile, Target, Vector

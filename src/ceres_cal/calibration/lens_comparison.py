@@ -32,9 +32,7 @@ from ceres_cal.calibration.lens_seen import (
 )
 from ceres_cal.observations import Observations, Sights, gather_sights, thinned
 from ceres_cal.posterior.other_lenses import cells_of
-from ceres_cal.problem.parameters import Estimate, Options
-from ceres_cal.problem.problem import problem_of
-from ceres_cal.problem.structure import EXACT
+from ceres_cal.problem import EXACT, Estimate, Options, problem_of
 from ceres_cal.robust.as_built import AS_DRAWN, Built, estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise

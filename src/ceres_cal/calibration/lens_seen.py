@@ -15,11 +15,7 @@ from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate, Options
-from ceres_cal.problem.problem import Problem, problem_of
-from ceres_cal.problem.quantities import moved, values_of
+from ceres_cal.problem import Estimate, Key, Options, Problem, moved, problem_of, solve, values_of
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.as_built import Built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly

@@ -18,9 +18,7 @@ from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations
-    from ceres_cal.problem.bundle import Progress, SolveProgress
-    from ceres_cal.problem.parameters import Options
-    from ceres_cal.problem.structure import Tolerance
+    from ceres_cal.problem import Options, Progress, SolveProgress, Tolerance
 
 
 _AUTO = "auto"

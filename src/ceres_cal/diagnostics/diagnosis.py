@@ -20,8 +20,7 @@ from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_
 from ceres_cal.effects.table import EFFECTS, JointStep, columns_of_all, joint_step
 from ceres_cal.effects.table.targets import CURVE_ASIDE, POINT_ASIDE
 from ceres_cal.observations import Observations
-from ceres_cal.problem.parameters import Estimate, Layout
-from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem import Estimate, Layout, Problem, Weighting
 from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals, write_equations
 from ceres_cal.robust.noise import USUAL_EQUATIONS, Inliers, judge
 from ceres_cal.robust.other_minima import with_lost_boards_posed

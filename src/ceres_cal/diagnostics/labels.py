@@ -18,9 +18,7 @@ from ceres_cal import kernels
 from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, distinct, log_binomial_tail, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Curves, Observations
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.residuals import camera_optics
-from ceres_cal.problem.structure import EXACT
+from ceres_cal.problem import EXACT, Estimate, camera_optics
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene import Camera, Curve, Target, curve_points, nearest_to_rays, turned_on
 

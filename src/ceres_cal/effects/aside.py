@@ -27,8 +27,7 @@ from ceres_cal.effects.evidence import (
 )
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations, Sights, View, column_of
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.residuals import Equations
+from ceres_cal.problem import Equations, Estimate
 from ceres_cal.scene.targets import Arc
 
 FEWEST_VIEWS = 4  # of which one may not belong

@@ -16,12 +16,8 @@ from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate, intrinsic_names, unit_px
-from ceres_cal.problem.priors import GaussianPrior
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem import Estimate, GaussianPrior, Key, Kind, Problem, Structure, intrinsic_names, unit_px
 from ceres_cal.problem.residuals import Equations, plane_shift, whole_structure
-from ceres_cal.problem.structure import Kind, Structure
 from ceres_cal.scene.camera import Camera
 
 SMALL = 0.4

@@ -27,10 +27,7 @@ from ceres_cal.base import Array, Frozen, Indices, cached_property, known_invers
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
 from ceres_cal.observations.sights import Owner, SightKey, Sights
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import free_keys
+from ceres_cal.problem import Estimate, Key, Problem, free_keys
 from ceres_cal.problem.reduced import normals_with_residuals, owned_columns, steps_of
 
 _RIDGE = 1e-3  # of everything's information: a group that tells a direction alone cannot be left out

@@ -15,10 +15,8 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, replace
 from ceres_cal.observations.sights import STRUCTURE, ranges
-from ceres_cal.problem.costs import robust_weights
-from ceres_cal.problem.information import Information, Key, columns_by_owner
+from ceres_cal.problem import Information, Key, Problem, Weighting, columns_by_owner, robust_weights
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
-from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.quantities import free_keys, from_placement, from_station
 from ceres_cal.problem.residuals import Equations, Residuals, of_observations, pairs_of
 

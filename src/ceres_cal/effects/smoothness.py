@@ -8,11 +8,7 @@ import numpy as np
 
 from ceres_cal.base import NOTHING, Array, is_diagonal, replace
 from ceres_cal.effects.linearised import inverse_root
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import values_of
-from ceres_cal.problem.reduced import ReducedInformation
+from ceres_cal.problem import Estimate, Information, Key, Problem, ReducedInformation, values_of
 from ceres_cal.scene.lens.base import Roughness
 
 

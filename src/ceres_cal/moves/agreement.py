@@ -19,8 +19,7 @@ from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.maps import ErrorMap, FieldGrid, visible_pixels
 from ceres_cal.posterior.uncertainty import field_grid
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem import Estimate, Information, Key
 from ceres_cal.scene import Camera, Target
 
 # How often a calibration that holds is said not to, where nobody states another rate. At half of it nothing changes, at

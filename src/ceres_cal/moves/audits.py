@@ -21,9 +21,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids
 from ceres_cal.observations import Columns, Observations, gather_sights
 from ceres_cal.posterior.maps import FieldGrid, field_map
-from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
-from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem import Estimate, Layout, Options, Problem, Station, Weighting, solve
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 

@@ -37,15 +37,11 @@ from ceres_cal.moves.agreement import (
 )
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_from, moved_words, pose_candidates
 from ceres_cal.observations import Observations, Sights, gather_sights
-from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.problem import EXACT, Estimate, Information, Key, Options, Station, layout_of, make_layout, solve
 from ceres_cal.problem.priors import GaussianPrior, gather_priors, tolerances
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.quantities import layout_of
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.problem.structure import EXACT
 from ceres_cal.start.initialise import Start
 from ceres_cal.start.world import chained_poses
 

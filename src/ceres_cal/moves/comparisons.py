@@ -23,10 +23,7 @@ from ceres_cal.moves.agreement import (
 )
 from ceres_cal.posterior.maps import FieldGrid, field_map
 from ceres_cal.posterior.uncertainty import field_grid
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.quantities import difference
-from ceres_cal.problem.structure import EXACT
+from ceres_cal.problem import EXACT, Estimate, Key, difference
 
 
 @checked

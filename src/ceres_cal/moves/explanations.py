@@ -17,9 +17,8 @@ from ceres_cal.moves.agreement import price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
 from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations, gather_sights
-from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem import Estimate, make_structure
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.structure import make_structure
 
 # Share of the observations that another zoom must explain to be looked at. Nothing changes from 0.33 to 0.67.
 _HALF = 0.5

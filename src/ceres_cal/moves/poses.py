@@ -14,11 +14,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Pose, distinct, median, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.bundle import placement_costs
-from ceres_cal.problem.information import over, pose_keys
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.priors import GaussianPrior
-from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem import Estimate, GaussianPrior, Weighting, over, placement_costs, pose_keys
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import fit_lines, pose_from_homography

@@ -18,11 +18,7 @@ from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
-from ceres_cal.problem.bundle import Solution
-from ceres_cal.problem.information import Information, over
-from ceres_cal.problem.parameters import Estimate, unit_px
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import PHI_RANGE, difference, moved
+from ceres_cal.problem import PHI_RANGE, Estimate, Information, Problem, Solution, difference, moved, over, unit_px
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.robust.conflicts import Conflicts
 from ceres_cal.robust.other_minima import minima_of

@@ -21,11 +21,7 @@ import numpy as np
 from ceres_cal.base import NORMAL_95, Array, Frozen, SolutionError, or_none, replace
 from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.mixture import Mixture
-from ceres_cal.problem.bundle import Solution, solve
-from ceres_cal.problem.information import Information, Key, over
-from ceres_cal.problem.parameters import Estimate, unit_px
-from ceres_cal.problem.priors import GaussianPrior
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Problem, Solution, over, solve, unit_px
 from ceres_cal.problem.quantities import PHI_RANGE, difference, moved, natural_sizes
 from ceres_cal.problem.reduced import information
 from ceres_cal.robust.other_minima import FEW, solved_soon

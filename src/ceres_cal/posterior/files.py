@@ -18,9 +18,7 @@ from ceres_cal.effects.dependence import Dependence
 from ceres_cal.posterior.bent import Ends
 from ceres_cal.posterior.mixture import Chain, Mixture
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import Information, Key, over, pose_keys
-from ceres_cal.problem.parameters import Estimate, Station
-from ceres_cal.problem.structure import EXACT
+from ceres_cal.problem import EXACT, Estimate, Information, Key, Station, over, pose_keys
 from ceres_cal.scene.camera import CameraFile, PoseFile
 
 

@@ -30,10 +30,7 @@ from ceres_cal.effects.linearised import Linearised, equation_weights, linearise
 from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.quantities import natural_sizes
-from ceres_cal.problem.reduced import ReducedInformation
+from ceres_cal.problem import Estimate, Information, Key, ReducedInformation, natural_sizes
 from ceres_cal.problem.residuals import Equations, Residuals, equations_of
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera

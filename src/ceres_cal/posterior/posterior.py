@@ -11,9 +11,7 @@ from ceres_cal.base import Array, Frozen, InputError, Spread, brief, cached_prop
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import Mixture
-from ceres_cal.problem.information import Information, Key, over, pose_keys, sigma_limits
-from ceres_cal.problem.parameters import Estimate, Layout
-from ceres_cal.problem.quantities import layout_of
+from ceres_cal.problem import Estimate, Information, Key, Layout, layout_of, over, pose_keys, sigma_limits
 from ceres_cal.problem.reduced import Eliminated, ReducedInformation
 
 

@@ -23,9 +23,7 @@ from ceres_cal.posterior.maps import (
     visible_pixels,
 )
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.quantities import moved, natural_sizes
+from ceres_cal.problem import Estimate, Key, moved, natural_sizes
 from ceres_cal.scene import Camera, Target, along_track, nearest_on_track, turned_on
 
 _STEP = 1e-6  # of a number's natural size, either way, for derivatives

@@ -17,9 +17,7 @@ from ceres_cal.base.words import at_precision, two_digits
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
 from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import PLACEMENT_QUANTITIES, Key, sigma_limits
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.quantities import natural_sizes, values_of
+from ceres_cal.problem import PLACEMENT_QUANTITIES, Estimate, Key, natural_sizes, sigma_limits, values_of
 from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.targets import Target
 

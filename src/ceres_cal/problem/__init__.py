@@ -5,9 +5,9 @@ over its free intrinsics alone; every other sight is one compressed block over i
 and its placement; each prior is one small block. What Ceres minimises is the same function either way.
 """
 
-from ceres_cal.base.threads import kept_signals
+from ceres_cal.base import kept_signals, names_of
 
 with kept_signals():
-    from pyceres import __version__ as solver_version
+    from pyceres import __version__ as solver_version  # noqa: F401
 
-__all__ = ["solver_version"]
+__getattr__, __dir__, __all__ = names_of(__name__)

@@ -24,8 +24,7 @@ from ceres_cal.effects.table import EFFECTS, JointStep
 from ceres_cal.observations import Observations, gather_sights, thinned
 from ceres_cal.posterior.maps import FieldMap, ImageMap, locate_slopes, visible_pixels
 from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import OF_PIXELS
+from ceres_cal.problem import OF_PIXELS, Key
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene import Camera, Target, curve_points
 

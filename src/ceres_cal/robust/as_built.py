@@ -26,9 +26,7 @@ from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior, Sights
-from ceres_cal.problem.parameters import Estimate, Options, unit_px
-from ceres_cal.problem.priors import gather_priors
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem import Estimate, Options, Problem, gather_priors, unit_px
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import Equations, equations_of, whole_structure
 from ceres_cal.problem.structure import EXACT, Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn

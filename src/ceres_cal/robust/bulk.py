@@ -16,10 +16,8 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, replace
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations, SightKey, shown_rows, some_views
-from ceres_cal.problem.bundle import Solution, SolveProgress, solve
+from ceres_cal.problem import Estimate, Layout, Problem, Solution, SolveProgress, Weighting, solve
 from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
-from ceres_cal.problem.parameters import Estimate, Layout
-from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals
 from ceres_cal.problem.shares import Histogram, Looked, Share, ShareRequest, Used, cut

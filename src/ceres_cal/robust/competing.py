@@ -30,8 +30,7 @@ from ceres_cal.effects.aside import (
 from ceres_cal.effects.columns import least_absolute
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations.sights import column_of, shown_rows, some_views, thinned_by_key
-from ceres_cal.problem.bundle import with_placements_at_best
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem import Problem, with_placements_at_best
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.conflicts import without_suspicious
 from ceres_cal.robust.robust import RobustSolution

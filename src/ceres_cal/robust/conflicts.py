@@ -23,11 +23,7 @@ from ceres_cal.base import Array, CalibrationError, Frozen, attempt, log_f_tail,
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt
 from ceres_cal.effects.evidence import FEATURE_ASIDE
-from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.information import Information, Key, over
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.priors import GaussianPrior
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Problem, over, solve
 from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
 from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly

@@ -20,12 +20,7 @@ from ceres_cal.effects.evidence import FLOOR_OFF, LIKELY, RepeatedAmounts, shift
 from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.effects.strands import strand_names
 from ceres_cal.effects.table import estimated
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.priors import GaussianPrior
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import free_keys
-from ceres_cal.problem.residuals import write_equations
+from ceres_cal.problem import Estimate, GaussianPrior, Key, Problem, free_keys, write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
 _FEWEST_SIGHTS = 3  # that tell an effect from a lens that leaves something

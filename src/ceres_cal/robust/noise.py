@@ -14,10 +14,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Indices, Mask, replace
 from ceres_cal.effects.linearised import equation_weights, shared_columns, studentised
 from ceres_cal.observations import Observations
-from ceres_cal.problem.parameters import Estimate, Options
-from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.quantities import from_placement
-from ceres_cal.problem.reduced import ReducedInformation
+from ceres_cal.problem import Estimate, Options, Problem, ReducedInformation, Weighting, from_placement
 from ceres_cal.problem.residuals import (
     Equations,
     Residuals,

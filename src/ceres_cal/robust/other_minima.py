@@ -19,10 +19,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Indices, median, or_none, replace
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.bundle import Solution, placement_costs, solve
-from ceres_cal.problem.information import Information
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem import Estimate, Information, Problem, Solution, Weighting, placement_costs, solve
 from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera

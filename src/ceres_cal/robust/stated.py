@@ -9,11 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, is_diagonal, log_chi2_tail, replace, two_digits
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate, Options
-from ceres_cal.problem.priors import GaussianPrior
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import intrinsic_keys, values_of
+from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Options, Problem, intrinsic_keys, values_of
 
 LEVEL = 1e-3
 """Probability of a conflict where everything stated is right, over all that is stated: a conflict takes a calibration's

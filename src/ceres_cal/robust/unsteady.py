@@ -29,10 +29,7 @@ from ceres_cal.effects.groups import posed
 from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
 from ceres_cal.effects.table.lens import lens_changes
 from ceres_cal.observations import Observations
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import free_keys
+from ceres_cal.problem import Estimate, Key, Problem, free_keys
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, write_equations
 from ceres_cal.robust.as_built import smooth_image
 from ceres_cal.robust.robust import RobustSolution

@@ -15,9 +15,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Mask, SolutionError, distinct
 from ceres_cal.observations import Observations, Sights
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.residuals import Residuals
+from ceres_cal.problem import Estimate, Problem, Residuals
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera

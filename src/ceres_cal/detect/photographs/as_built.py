@@ -18,9 +18,8 @@ from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects
 from ceres_cal.effects.linearised import Weights, make_linear_model
 from ceres_cal.observations import Prior
-from ceres_cal.problem.parameters import intrinsic_names
+from ceres_cal.problem import dimension_slopes, dimensions_of, intrinsic_names
 from ceres_cal.problem.residuals import residuals, whole_structure, write_equations
-from ceres_cal.problem.structure import dimension_slopes, dimensions_of
 from ceres_cal.scene import Camera, Target
 
 # Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that

@@ -16,8 +16,7 @@ from ceres_cal.base import Array, InputError, answer_or_reason, body_of, convert
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.detect.photographs.refit import CAMERA, ROBUST, FreeIntrinsics, PointHints, refit_camera
 from ceres_cal.observations import Prior
-from ceres_cal.problem.parameters import intrinsic_names
-from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem import Weighting, intrinsic_names
 from ceres_cal.scene import Camera, Radial, Target, curve_points
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.start.search import searched

@@ -8,12 +8,9 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices32, field, or_none
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, gather_sights
-from ceres_cal.problem.bundle import solve
+from ceres_cal.problem import Problem, Weighting, make_structure, redrawn, solve, stated_prior
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.problem.priors import stated_prior
-from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.problem.structure import make_structure, redrawn
 from ceres_cal.scene import Camera, Target
 
 CAMERA, STATION, TARGET = "camera", "station", "field"

@@ -9,11 +9,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, InputError, Pose, SolutionError, field, replace
 from ceres_cal.diagnostics.advice.outlook import Outlook
 from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior, gather_sights
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.priors import stated_prior, tolerances
-from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.problem.quantities import layout_of
+from ceres_cal.problem import Estimate, Information, Key, Problem, Weighting, layout_of, stated_prior, tolerances
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import equations_of, residuals
 from ceres_cal.problem.structure import Tolerance, make_structure

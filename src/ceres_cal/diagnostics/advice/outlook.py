@@ -10,9 +10,7 @@ from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, even
 from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import Information, Key
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.quantities import moved
+from ceres_cal.problem import Estimate, Information, Key, moved
 
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`posterior.assess` leaves it there)
 

@@ -14,9 +14,7 @@ from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, still
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem.information import Information
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem import Estimate, Information, Weighting
 from ceres_cal.scene.targets import Target
 
 _LARGER, _LESS = 0.5, 0.2

@@ -15,8 +15,7 @@ from ceres_cal.base import Array, Frozen, cached_property
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.effect import Case, Effect
 from ceres_cal.observations import Observations
-from ceres_cal.problem.information import Key
-from ceres_cal.problem.quantities import free_keys
+from ceres_cal.problem import Key, free_keys
 
 
 def rows() -> dict[str, Effect]:

@@ -13,8 +13,7 @@ from ceres_cal.base import Array, Pose, numbers_of, replace, skew
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.effects.evidence import AS_STATED
-from ceres_cal.problem.parameters import intrinsic_names
-from ceres_cal.problem.quantities import pixel_slopes
+from ceres_cal.problem import intrinsic_names, pixel_slopes
 
 
 def _moves(case: Case, *, onwards: bool) -> Iterator[EffectColumns]:

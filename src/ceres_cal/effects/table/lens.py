@@ -11,8 +11,7 @@ import numpy as np
 from ceres_cal.base import Array, log_f_tail, numbers_of, replace
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_all
 from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
-from ceres_cal.problem.parameters import OF_PIXELS, unit_px
-from ceres_cal.problem.priors import USUAL_DECENTRING
+from ceres_cal.problem import OF_PIXELS, USUAL_DECENTRING, unit_px
 from ceres_cal.scene import LENSES, Camera, Lens
 
 # Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few

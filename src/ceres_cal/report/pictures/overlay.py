@@ -19,8 +19,7 @@ from ceres_cal.base import Array, Image, Image8, Indices32, Mask, Pose
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.diagnostics.advice import Measurement
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.structure import BuiltTarget
+from ceres_cal.problem import BuiltTarget, Estimate
 from ceres_cal.scene import Camera, Target, along_track, curve_points, in_image
 
 Colour = tuple[int, int, int]
