@@ -100,7 +100,8 @@ def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
 
 def evenly(count: int, most: int) -> Indices:
     """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
-    return np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64)
+    taken = min(count, most)
+    return np.asarray((np.arange(taken) * (count - 1)) // max(taken - 1, 1))
 
 
 @contextmanager

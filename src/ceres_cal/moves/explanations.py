@@ -237,7 +237,8 @@ def require_supported(
     scores = _scores(plan, quiet)
     # Of explanations that are about as good the one that lets least go is taken.
     margin = _SUPPORTED
-    if plan.what == "auto":  # another lens is never taken for granted
+    stated = any(conflict.kind == "prior" for conflict in result.conflicts)
+    if plan.what == "auto" and not stated:  # what absorbs a wrong statement, and another lens, are not taken so easily
         margin, scores = 0.0, {what: score + _SUPPORTED * (what == "everything") for what, score in scores.items()}
     best = next(what for what in quiet if scores[what] <= min(scores.values()) + margin)
     if best != plan.what and judged(plan, best, results[best]).noise < _NOISIER:
