@@ -80,12 +80,15 @@ def test_sizes_are_those_of_the_movement(calibration: Calibration, pose: Pose) -
 
 def test_a_height_that_is_seen_better_is_no_movement() -> None:
     """A calibration of a field alone, whose height goes with phi: poses of a camera 10 mm aside are 90 mm apart. From
-    straight above how far it moved is not known.
+    straight above, where phi may be much else, how far it moved is not known, but that it did.
     """
-    for home, moved_mm in ((overhead_pose(-2.27, -0.12, 4.02, 1.8, -8.0, 90.6), 10.0), (HOME, np.nan)):
+    tilted, above = (overhead_pose(-2.27, -0.12, 4.02, 0.0, tilt_deg, 90.6) for tilt_deg in (-8.0, 0.0))
+    for home, moved_mm in ((tilted, 10.0), (above, np.nan)):
         new = lines(Pose.looking(home.position + np.array([0.01, 0.0, 0.0]), home.rotation), 4)
         before = calibrate(lines(home, 3))
-        change = check(before, new)["overhead"].change
+        found = check(before, new)
+        change = found["overhead"].change
+        assert check(before, lines(home, 5)).holds and not found.holds  # which held, straight above, after any move
         assert change is not None
         assert change.moved_mm == pytest.approx(moved_mm, abs=4.0, nan_ok=True)  # 12.5
         shift_m, _ = movements(before, refit(before, new))["overhead"]

@@ -25,6 +25,9 @@ from ceres_cal.scene import Camera, Target
 # How often a calibration that holds is said not to, where nobody states another rate. At half of it nothing changes, at
 # double one of six pairs of calibrations of one camera differs.
 FALSE_ALARMS = 0.01
+# Times the noise of the old calibration, from where on the lens is doubted. Below 1 nothing is quiet enough to be
+# named; at double nothing changes.
+NOISIER = 1.5
 
 
 class FieldDifference(ErrorMap):

@@ -21,6 +21,7 @@ from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.agreement import (
     FALSE_ALARMS,
+    NOISIER,
     Agreement,
     Agreements,
     Contrast,
@@ -148,9 +149,15 @@ def _case(calibration: Calibration, sight: Sights) -> _CheckCase:
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
     structure = calibration.options.structure_of(sight.observations.targets).carrying(old.structure)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
-    tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.is_structure]
-    return _CheckCase(calibration, sight, estimate, calibration.prior_of(kept), tested)
+    # Another lens may be the right one, and from straight above another phi with another pose; but then the new
+    # observations are seen through that as well. By all that may be together no floor is known to a millimetre.
+    prior = calibration.prior_of(kept, of_lens=True)
+    if key.camera in posterior.followed:
+        across = posterior.of_lens.given([k for k in posterior.keys if k not in posterior.followed_phi])
+        prior = GaussianPrior.about(across.marginal(across.among(kept)), old)
+    tested = tuple(k for k in prior.keys if k.kind == "station" or k.quantity == "phi")
+    return _CheckCase(calibration, sight, estimate, prior, tested)
 
 
 def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement:
@@ -171,6 +178,7 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
     anew, freed = (posed[1], ()) if will_do or zoomed is None else (zoomed[1], case.tested)
     prior, posterior = case.prior.without(set(freed) - set(case.station_keys)), calibration.uncertainty.posterior
     shift_m, turn = moved_from(prior, posterior, case.name, anew)
+    misfit = replace(misfit, noise=(noise, noise))
     grids = field_grids(calibration.targets)
     change = change_of(case.estimate, case.name, anew.camera_at(case.name), grids)
     change = replace(change, moved_mm=1e3 * shift_m, turned_deg=math.degrees(turn))
@@ -182,7 +190,7 @@ def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement
         degrees=apart.degrees,
         words=_words(case, holds, apart.probability, misfit, change),
         change=change,
-        misfit=replace(misfit, noise=(noise, noise)),
+        misfit=misfit,
     )
 
 
@@ -243,6 +251,9 @@ def _words(case: _CheckCase, holds: bool, probability: float, misfit: Misfit, ch
     if holds:
         at_most = f"{worst_mm:.1f} mm on the floor at most, " if np.isfinite(worst_mm) else ""
         words = f"holds: no movement beyond what is known ({at_most}probability {probability:.2g})"
+        if misfit.noise[0] > NOISIER:
+            noisy = f"; but the noise is {misfit.noise[0]:.1f} times that of the calibration"
+            words += f"{noisy}: where the focus or the iris may have changed, `refit` says so"
     else:
         shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
         moved = moved_words(1e-3 * change.moved_mm, change.turned_deg, "about ") + shifts

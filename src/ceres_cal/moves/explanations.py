@@ -13,7 +13,7 @@ import numpy as np
 from ceres_cal.base import CalibrationError, Frozen, Pose, SolutionError, attempt, replace, upper_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.agreement import price_nats
+from ceres_cal.moves.agreement import NOISIER, price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
 from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations, gather_sights
@@ -28,9 +28,6 @@ _FEW = 0.2
 # How often an unchanged lens is doubted; a doubt costs only time, other explanations must be supported besides.
 # Nothing changes from half to double.
 _RARE = 1e-4
-# Times the noise of the old calibration, from where on the lens is doubted. Below 1 nothing is quiet enough to be
-# named; at double nothing changes.
-_NOISIER = 1.5
 # Times the noise of the old calibration, from where on nothing is explained, unless most observations lie where they
 # should. Nothing changes from half to double.
 _TOO_NOISY = 4.0
@@ -142,7 +139,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[SolutionError]:
     if isinstance(fresh, CalibrationError):
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
-    if noise < _NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
+    if noise < NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
         yield SolutionError(f"{misfit}with another lens they do: {WORDS['everything']}: calibrate it anew")
 
 
@@ -155,7 +152,7 @@ def _good(candidate: PoseCandidate, known: float) -> bool:
     """Whether a pose explains the observations about as well as the old calibration did its own, and better than the
     known lens and labels do, whose least misfit is `known`: strays fit neither.
     """
-    return candidate.fits and candidate.scale < _NOISIER and candidate.misfit < known - _SUPPORTED
+    return candidate.fits and candidate.scale < NOISIER and candidate.misfit < known - _SUPPORTED
 
 
 def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
@@ -198,7 +195,7 @@ class RefitVerdict(Frozen, eq=True):
     @property
     def noisy(self) -> bool:
         """Whether the noise is to be named."""
-        return self.noise > _NOISIER
+        return self.noise > NOISIER
 
     @property
     def doubtful(self) -> bool:
@@ -241,7 +238,7 @@ def require_supported(
     if plan.what == "auto" and not stated:  # what absorbs a wrong statement, and another lens, are not taken so easily
         margin, scores = 0.0, {what: score + _SUPPORTED * (what == "everything") for what, score in scores.items()}
     best = next(what for what in quiet if scores[what] <= min(scores.values()) + margin)
-    if best != plan.what and judged(plan, best, results[best]).noise < _NOISIER:
+    if best != plan.what and judged(plan, best, results[best]).noise < NOISIER:
         gain = scores[plan.what] - scores[best]
         raise OtherChangeError(
             f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "

@@ -156,8 +156,15 @@ class Posterior(Frozen):
         """The same where the chosen lens is the right one: for those who ask the other lenses themselves."""
         if len(self.lenses) < 2:
             return self.normal
+        return self._as_wide_as(self.of_lens, (mixture.chosen for mixture in self._read))
+
+    @property
+    def of_lens(self) -> Information:
+        """The normal equations where the chosen lens is the right one."""
+        if len(self.lenses) < 2:
+            return self.information
         alone = self.mixture().chosen
-        return self._as_wide_as(alone.information[alone.at[0]], (mixture.chosen for mixture in self._read))
+        return alone.information[int(alone.at[0])]
 
     def _as_wide_as(self, whole: Information, mixtures: Iterable[Mixture]) -> Information:
         for mixture in mixtures:
