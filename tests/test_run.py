@@ -66,7 +66,7 @@ def test_what_cannot_be_trusted_is_not_exported_and_advice_may_fail(
     def fails(*_: object) -> None:
         raise SolutionError("no advice can be given")
 
-    monkeypatch.setattr("ceres_cal.diagnostics.advice.advise", fails)
+    monkeypatch.setattr("ceres_cal.diagnostics.advise", fails)
     wrong = ("--lens", "radial", "--prior", "phi=700:1", "--to", "paper", "-o", str(tmp_path))
     assert main(["run", PHOTOGRAPH, *FIELD, *wrong]) == 1
     said = capsys.readouterr()
