@@ -384,7 +384,7 @@ def best_fit(camera: Camera, observations: Observations, lengths: tuple[Prior, .
     """
     # Times the noise with other pixels: 1.00 to 1.07 where a court was drawn a millimetre off, 1.18 where a photograph
     # of worn lines was stretched by 4 %, 7 where a clear one was by 7 %. With 1.12 a board painted by hand, whose other
-    # lines hide what a stretched picture does, was refused in 6 of 8 pictures that differ by their noise; 4 of 8 so.
+    # lines hide what a stretched picture does, was refused in 6 of 8 pictures that differ by noise; so in 5 of 12.
     nearly = 1.05
     fits = _fits(_squared(camera), observations, lengths)
     if camera.aspect != 1.0:
