@@ -12,7 +12,7 @@ import pytest
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.moves.checks import score
+from ceres_cal.moves.scores import score
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.structure import Tolerance

@@ -16,8 +16,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.moves.checks import score
 from ceres_cal.moves.comparisons import compare_cameras
+from ceres_cal.moves.scores import score
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.targets import checkerboard

@@ -19,7 +19,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main as run
-from ceres_cal.moves.checks import sights_as_built
+from ceres_cal.moves.scores import sights_as_built
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.problem.parameters import Options
 from ceres_cal.problem.quantities import camera_moved, values_of

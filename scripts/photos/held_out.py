@@ -19,7 +19,7 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.moves.checks import score, sights_as_built
+from ceres_cal.moves.scores import score, sights_as_built
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import taken
 from ceres_cal.problem.parameters import Options

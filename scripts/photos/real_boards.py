@@ -17,7 +17,7 @@ from runner import Row, script
 
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.moves.checks import score
+from ceres_cal.moves.scores import score
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import checkerboard
 from photos.real_data import ov_plane, real_folder

@@ -35,9 +35,9 @@ from ceres_cal.functions import detect_field as detect_field
 from ceres_cal.functions import join as join
 from ceres_cal.functions import refit as refit
 from ceres_cal.moves.audits import audit as audit
-from ceres_cal.moves.checks import score as score
 from ceres_cal.moves.comparisons import compare as compare
 from ceres_cal.moves.refit_plan import RefitOptions as RefitOptions
+from ceres_cal.moves.scores import score as score
 from ceres_cal.observations import Curves as Curves
 from ceres_cal.observations import Observations as Observations
 from ceres_cal.observations import Points as Points

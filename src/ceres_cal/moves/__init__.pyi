@@ -4,10 +4,10 @@ from ceres_cal.moves.agreement import require_posterior as require_posterior
 from ceres_cal.moves.audits import audit as audit
 from ceres_cal.moves.audits import excess_px as excess_px
 from ceres_cal.moves.checks import check as check
-from ceres_cal.moves.checks import score as score
 from ceres_cal.moves.comparisons import compare as compare
 from ceres_cal.moves.comparisons import compare_cameras as compare_cameras
 from ceres_cal.moves.poses import moved_words as moved_words
 from ceres_cal.moves.refit_plan import RefitOptions as RefitOptions
 from ceres_cal.moves.refits import movements as movements
 from ceres_cal.moves.refits import refit as refit
+from ceres_cal.moves.scores import score as score

@@ -3,21 +3,18 @@
 What was known and what the new observations say are two statements about the same numbers; whether they differ in pose
 and phi by more than both leave open is asked at the noise, and with the dependence, that the new observations show. The
 calibration's own error is the same in every check: it counts as large as it may be.
-
-And how well cameras explain observations that they were not calibrated from: intrinsics held, poses at their best.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base import Array, DegenerateError, Frozen, InputError, Mask, Pose, numerical, or_none, replace, rms
+from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, numerical, or_none, replace
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.agreement import (
     FALSE_ALARMS,
@@ -38,13 +35,11 @@ from ceres_cal.moves.agreement import (
 )
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_from, moved_words, pose_candidates
 from ceres_cal.observations import Observations, Sights, gather_sights
-from ceres_cal.problem import EXACT, Estimate, Information, Key, Options, Station, layout_of, make_layout, solve
-from ceres_cal.problem.priors import GaussianPrior, gather_priors, tolerances
+from ceres_cal.problem import Estimate, Information, Key, layout_of, solve
+from ceres_cal.problem.priors import GaussianPrior, tolerances
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import information
-from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.start.initialise import Start
-from ceres_cal.start.world import chained_poses
+from ceres_cal.problem.residuals import residuals
 
 # Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
 # -> 0.075 of 80 cases); at double nothing changes.
@@ -62,9 +57,10 @@ def check(
 ) -> Agreements:
     """Test whether a calibration still holds for new observations of its stations.
 
-    Seven numbers of each station that was observed are tested at once: its pose and its camera's phi. Noise and
-    dependence are those of the new observations. Outliers are those that no pose near by explains. A yes means that
-    these observations show no movement, not that there is none: see the sizes.
+    Seven numbers of each station that was observed are tested at once: its pose and its camera's phi; from straight
+    above, where phi is hardly known, six. The lens's distortion is not: another focus may show as more noise alone.
+    Noise and dependence are those of the new observations. Outliers are those that no pose near by explains. A yes
+    means that these observations show no movement, not that there is none: see the sizes.
 
     Args:
         false_alarms: how often an unmoved set of cameras may be said to have moved at least once in so many `checks`
@@ -253,7 +249,7 @@ def _words(case: _CheckCase, holds: bool, probability: float, misfit: Misfit, ch
         words = f"holds: no movement beyond what is known ({at_most}probability {probability:.2g})"
         if misfit.noise[0] > NOISIER:
             noisy = f"; but the noise is {misfit.noise[0]:.1f} times that of the calibration"
-            words += f"{noisy}: where the focus or the iris may have changed, `refit` says so"
+            words += f"{noisy}: the focus or the iris may have changed, `refit` says whether"
     else:
         shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
         moved = moved_words(1e-3 * change.moved_mm, change.turned_deg, "about ") + shifts
@@ -262,118 +258,3 @@ def _words(case: _CheckCase, holds: bool, probability: float, misfit: Misfit, ch
     if misfit.outliers > many_outliers * count:
         words += f"; but {misfit.outliers} of {count} observations fit nowhere: check labels"
     return words
-
-
-# ---- how well a calibration predicts --------------------------------------------------------------------------------
-
-
-@checked
-@numerical("the score")
-def score(
-    calibration: Calibration, observations: Observations, *, options: Options | None = None, hold_stations: bool = False
-) -> Agreements:
-    """How well new observations of fields or boards agree with a calibration: poses alone are solved for.
-
-    Targets are taken as the calibration says that they were built. A calibration of another program will do. The
-    answers are those of its cameras, with what each view leaves, the worst first, and the poses that suit the
-    observations best (`solution`). Whether the calibration holds is not decided: the noise says how well.
-
-    Args:
-        options: loss and rejection; those of the calibration by default.
-        hold_stations: stations stand where the calibration has them, so that only boards are posed: the poses of a
-            rig's cameras, or of a camera over its field, are tested, too.
-
-    Raises:
-        InputError: a camera, or a station that is held, which the calibration does not have.
-        DegenerateError: naming the sight whose pose the observations do not determine.
-        SolutionError: another camera or target than those calibrated, or intrinsics that do not explain them at all.
-    """
-    observed = matched(calibration, observations)
-    given = replace(options or calibration.options, lens=calibration.options.lens, tolerances={}, dimensions=())
-    sights = sights_as_built(observed, calibration)
-    if hold_stations:
-        require_stations(calibration, observed)
-    known = {name: calibration.estimate.stations[name] for name in observed.stations} if hold_stations else {}
-    layout = make_layout(observed, given)
-    layout = replace(
-        layout,
-        free={name: np.empty(0, dtype=np.int64) for name in layout.free},
-        stations=layout.stations - known.keys(),
-    )
-    if not layout.size:
-        raise InputError("with its stations held nothing is left to be posed: `ceres-cal check` is for that")
-    start = Start(_start(calibration, sights, known), calibration.phi_from)
-    priors = gather_priors(observed, given, EXACT)
-    posed = solved_from(Task(tested=False, before=layout), start, Problem(sights, layout, priors, options=given))
-    left = residuals(sights, posed.estimate)
-    noise = _noise_ratios(posed, calibration)
-    views = [(view.camera, _view(number, observed, left, posed, noise)) for number, view in enumerate(observed.views)]
-    views.sort(key=lambda one: -one[1].misfit.all_rms_px)
-    answers = {}
-    for name in posed.cameras:
-        own = np.array([view.camera == name for view in observed.views])
-        misfit = _misfit(own, observed, left, posed, noise)
-        its = tuple(view for camera, view in views if camera == name)
-        answers[name] = Agreement(name=name, misfit=misfit, views=its, pose_free=True, solution=posed)
-    return Agreements(answers)
-
-
-def sights_as_built(observations: Observations, calibration: Calibration) -> Sights:
-    """The sights of targets as the calibration says that they were built."""
-    sights = gather_sights(observations)
-    built = calibration.options.structure_of(observations.targets).carrying(calibration.estimate.structure)
-    return built.built_into(sights)
-
-
-def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station]) -> Estimate:
-    """Every sight's pose under the calibrated lens, chained into stations and placements."""
-    stations = {name: Station(camera, Pose.identity()) for name, camera in sights.observations.stations.items()}
-    cameras = {name: calibration.cameras[name] for name in sights.observations.cameras}  # some of a rig's
-    blank = Estimate(cameras, stations, {}, EXACT)
-    numbers, poses = [], []
-    for number, key in enumerate(sights.keys):
-        old = calibration.estimate.stations.get(key.station)
-        before = [old.cam_from_world] if old is not None and key.placement is None else []
-        candidates = pose_candidates(PoseSearch(sights[number], blank, (1.0, 1.0)), before)
-        if candidates:
-            numbers.append(number)
-            poses.append(candidates[0].pose.matrix)
-    if not poses:
-        raise DegenerateError(
-            f"{sights.keys[0]}: its pose is not determined: show four points or more, not on one line"
-        )
-    stations, placements = chained_poses(sights, np.array(numbers), np.array(poses), known)
-    return Estimate(cameras, stations, placements, EXACT)
-
-
-# ---- what is left ---------------------------------------------------------------------------------------------------
-
-
-def _noise_ratios(posed: Calibration, before: Calibration) -> tuple[float, float]:
-    """Noise of points and of curves over that of the calibration, px over px; NaN where either has none."""
-    pairs = zip(posed.fit.noise_px, before.fit.noise_px, strict=True)
-    points, curves = (new / old if new > 0.0 and old > 0.0 else float("nan") for new, old in pairs)
-    return points, curves
-
-
-def _view(
-    number: int, observations: Observations, left: Residuals, posed: Calibration, noise: tuple[float, float]
-) -> Agreement:
-    view = observations.views[number]
-    name = f"frame {view.frame!r} of station {view.station!r}, {view.target}"
-    here = np.arange(len(observations.views)) == number
-    return Agreement(name=name, misfit=_misfit(here, observations, left, posed, noise), pose_free=True)
-
-
-def _misfit(
-    views: Mask, observations: Observations, left: Residuals, posed: Calibration, noise: tuple[float, float]
-) -> Misfit:
-    own = views[observations.points.view], views[observations.curves.view]
-    kept = posed.inlier_masks(observations)
-    inside = [lengths[mine & used] for lengths, mine, used in zip(left.lengths, own, kept, strict=True)]
-    every = np.nan_to_num(
-        np.concatenate([lengths[mine] for lengths, mine in zip(left.lengths, own, strict=True)]), nan=np.inf
-    )
-    points, curves = inside
-    outliers = len(every) - len(points) - len(curves)
-    return Misfit(len(points), len(curves), outliers, rms(points, 0.0), rms(curves, 0.0), rms(every, 0.0), noise)

@@ -1,6 +1,6 @@
-"""Does a calibration hold? `ceres-cal check`, `score`, `audit` and `compare`: it is held against new observations, or
-against another calibration; exit code 0 yes, 1 no, so that cron may ask. And after a move `refit`: the poses anew from
-few observations and all that was known.
+"""What has become of a camera? `ceres-cal check`, `score`, `audit` and `compare`: it is held against new observations
+or another calibration; exit code 0 yes, 1 no, so that cron may ask. And after a move `refit`: the poses anew from few
+observations and all that was known.
 """
 
 from __future__ import annotations
