@@ -156,7 +156,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.strokes", "_LEAST_PX _STRAIGHT_PX _NOISE _NOISE_NEARBY _WIDEST _COARSER _OWN", "auto"),
     *_of("detect.saddles", "_LOST _FAINT", "boards"),
     *_of("detect.boards", "_MOST_PX _UNEVEN _LONG _LEAST_SIDE_PX", "boards"),
-    *_of("detect.partly", "_MISFIT _AS_STRONG _CLEAR", "boards"),
+    *_of("detect.partly", "_MISFIT _AS_STRONG _CLEAR _A_LINE", "boards"),
     *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),
     *_of("detect.photographs.by_hand", "SIGMA_PX _WRONG", "clicks"),
     *_of("detect.photographs.beside", "_REACH _FAINT _LEAST", "auto"),

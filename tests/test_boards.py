@@ -18,7 +18,7 @@ from ceres_cal.detect import boards
 from ceres_cal.detect.boards import BoardDetections, detect_boards, right_handed
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.markers import CharucoSpec
-from ceres_cal.detect.partly import part_of_board
+from ceres_cal.detect.partly import is_whole, part_of_board
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
@@ -311,6 +311,13 @@ def test_a_part_that_has_several_places_on_the_board_is_refused(tmp_path: Path) 
         detect_boards([write(tmp_path / "a.png", _moved_aside(220, 0)[0])], BOARD, corners="opencv")
 
 
+def test_a_part_of_a_board_is_no_whole_one(picture: Array, truth: Array) -> None:
+    image, grid = photograph(picture), truth.reshape(6, 7, 2)
+    larger = np.concatenate([grid, 2.0 * grid[-1:] - grid[-2:-1]])
+    for seen in (grid, grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1], larger):
+        assert is_whole(image, measure_saddles(image, seen)) == (seen is grid)
+
+
 def test_a_mirrored_grid_is_turned_over(truth: Array) -> None:
     grid = truth.reshape(6, 7, 2)
     assert np.array_equal(right_handed(grid), grid)
@@ -482,8 +489,10 @@ def test_another_size_is_another_camera(tmp_path: Path, picture: Array) -> None:
 
 def test_no_board_at_all(tmp_path: Path, picture: Array) -> None:
     path = write(tmp_path / "a.png", photograph(picture))
-    with pytest.raises(InputError, match=r"no board of 9 x 6 inner corners in any of 1 images .*a\.png: no chessboard"):
-        detect_boards([path], checkerboard(9, 6, 0.03))
+    with pytest.raises(
+        InputError, match=r"no board of 6 x 6 inner corners in any of 1 images .*a\.png: .* 7 x 6 corners"
+    ):
+        detect_boards([path], checkerboard(6, 6, 0.03))
     with pytest.raises(InputError, match="no images were given"):
         detect_boards([], BOARD)
     with pytest.raises(InputError, match=r"a\.png: given twice"):

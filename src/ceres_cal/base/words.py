@@ -55,12 +55,9 @@ def chance(log10_p: float) -> str:
     return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p >= -3.0 else f"1 in 10^{-log10_p:.0f}"
 
 
-_SMALL = 1e-3  # values below are written with a power of ten
-
-
 def at_precision(value: float, sd: float) -> str:
     """A value that ends where two digits of its sd end: 868.9 beside 1.4, -5.0e-05 beside 2.2e-06."""
-    small = abs(value) < _SMALL
+    small = abs(value) < 1e-3  # which is written with a power of ten
     if not (math.isfinite(sd) and sd > 0.0):
         return f"{value:.3e}" if small else f"{value:.4f}"
     places = 1 - math.floor(math.log10(sd))

@@ -15,6 +15,7 @@ import numpy as np
 from ceres_cal.base import AnyArray, Array, Frozen, Image, Image8, ImageProgress, InputError, NothingShownError, in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
 from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.partly import NO_PLACE, is_whole, part_of_board
 from ceres_cal.detect.saddles import REACH, Saddles, is_begun_dark, measure_saddles, steps_px
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
@@ -103,7 +104,9 @@ def detect_boards(
     # OpenCV's marker detectors keep a state that threads would share.
     side_by_side = board.kind == "checkerboard" and isinstance(corners, str)
     size, grids, missed = _find_all(paths, find, in_turn if side_by_side else map, progress)
-    if not grids:
+    refuting = [one for one in missed if NO_PLACE in one[1]]
+    if len(grids) <= len(refuting):  # what few images show of a board that others refute is no such board
+        missed = [*refuting, *(one for one in missed if one not in refuting)]
         reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}"
         raise NothingShownError(f"no {_what(board)} {reason}", tuple(missed))
     views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
@@ -196,12 +199,13 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
     for look in (_found_fast, _find_chessboard):
         if (seen := look(levels, columns, rows)) is None:
             continue
-        found.append((right_handed(seen), measure_saddles(image, right_handed(seen))))
+        one = right_handed(seen), measure_saddles(image, right_handed(seen))
+        if not (_is_even(seen) and is_whole(image, one[1])):
+            continue
+        found.append(one)
         if not np.isnan(found[-1][1].contrast).any():
             break
     if not found and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
-        from ceres_cal.detect.partly import part_of_board
-
         return _placing(part_of_board(image, seed, columns, rows))
     if not found:
         return f"no chessboard of {columns} x {rows} inner corners found"

@@ -21,6 +21,9 @@ _MISFIT = 0.25
 _AS_STRONG = 0.75
 _BORDER_PX = 3.0  # nearer to it a corner has too few pixels on one side
 _CLEAR = 0.2  # of the corners' distance, from the border: less may be the error of where a corner is foreseen
+# Share of a line's corners: of 88 real boards 0.5 and more are measured on the outer lines, 0.17 at most beyond them.
+_A_LINE = 0.25
+NO_PLACE = "no place on it"
 _SIDES = ((1, 0), (1, -1), (0, 0), (0, -1))  # left, right, top, bottom: axis of the picture's grid, and which end
 
 
@@ -35,11 +38,24 @@ def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array |
         return f"no chessboard of {columns} x {rows} inner corners found, but squares without neighbours"
     places = list(_places(grown, image.shape, columns, rows))
     if len({missing for missing, _ in places}) != 1:
-        height, width = grown.contrast.shape
-        why = "more than one" if places else "no"
-        found = f"but {width} x {height} corners, which have {why} place on it"
+        width, height = sorted(grown.contrast.shape, reverse=columns >= rows)
+        why = "more than one place on it" if places else NO_PLACE
+        found = f"but {width} x {height} corners, which have {why}"
         return f"no chessboard of {columns} x {rows} inner corners found, {found}"
     return places[0][1]
+
+
+def is_whole(image: Image, seen: Saddles) -> bool:
+    """Whether corners are those of a whole board: each outer line is one, and the next one beyond it is none. OpenCV
+    finds a board in a larger one, and lays a larger one over the margin of a smaller.
+    """
+    known = _clean(seen, image.shape)
+    on, beyond = ~np.isnan(known.contrast), _around(image, known)[2]
+    if np.mean(on) < 0.5:  # too noisy, or too blurred, to say
+        return True
+    return all(
+        np.mean(np.take(on, end, axis)) > _A_LINE > np.mean(np.take(beyond, end, axis)[1:-1]) for axis, end in _SIDES
+    )
 
 
 # ---- growing --------------------------------------------------------------------------------------------------------
@@ -49,17 +65,22 @@ def _grown(image: Image, seed: Array, most: int) -> Saddles:
     """All corners that the seed leads to, at most so many each way; measured once more when all are there."""
     known = _trimmed(_clean(measure_saddles(image, seed), image.shape))
     for _ in range(2 * most):
-        wider = _with_border(known)
-        unknown = np.isnan(wider.contrast)
-        foreseen = np.where(unknown[..., None], _foreseen(wider.grid), wider.grid)
-        measured = _clean(fit_saddles(image, foreseen, unknown), image.shape)
-        fresh = unknown & _strong(measured.contrast, wider.contrast)
+        wider, measured, fresh = _around(image, known)
         if not np.any(fresh):
             break
         pairs = ((getattr(measured, name), getattr(wider, name)) for name in ("contrast", "misfit"))
         grid = np.where(fresh[..., None], measured.grid, wider.grid)
         known = _trimmed(Saddles(grid, *(np.where(fresh, new, old) for new, old in pairs)))
     return _trimmed(_clean(measure_saddles(image, known.grid), image.shape))
+
+
+def _around(image: Image, known: Saddles) -> tuple[Saddles, Saddles, Mask]:
+    """What is known with a border, what is measured where nothing is known, and which of that are corners."""
+    wider = _with_border(known)
+    unknown = np.isnan(wider.contrast)
+    foreseen = np.where(unknown[..., None], _foreseen(wider.grid), wider.grid)
+    measured = _clean(fit_saddles(image, foreseen, unknown), image.shape)
+    return wider, measured, unknown & _strong(measured.contrast, wider.contrast)
 
 
 def _clean(saddles: Saddles, shape: tuple[int, ...]) -> Saddles:
