@@ -23,6 +23,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
 from ceres_cal.simulate import Disturbance, simulate
 
 
@@ -118,14 +119,21 @@ def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
     assert found.holds and "check labels" in found["overhead"].words
     far = Pose.looking(HOME.position + np.array([0.5, 0.2, 0.3]), rotation_exp((0.2, 0.1, np.pi)) @ HOME.rotation)
     assert not check(calibration, lines(far, 5)).holds
+
+
+def test_another_zoom_or_focus_is_named(calibration: Calibration) -> None:
+    """Another focus showed as more noise alone, and the camera held."""
     zoomed = replace(CAMERA, phi=1.05 * CAMERA.phi)
-    assert not check(calibration, lines(HOME, 6, NOISE, zoomed)).holds
+    assert not check(calibration, lines(HOME, 6, NOISE, zoomed)).holds  # from almost above, as good as a movement
+    focused = replace(CAMERA, lens=Radial((-4.2e-5, 6.1e-7)))
+    found = check(calibration, lines(HOME, 7, NOISE, focused))["overhead"]
+    assert not found.holds and found.cause == "iris" and "another iris or focus" in found.words
 
 
 def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibration) -> None:
     without = replace(calibration, targets={})
     for pose, words in (
-        (HOME, "holds: no movement beyond what is known (probability"),
+        (HOME, "holds: no change beyond what is known (probability"),
         (SMALL_TILT, "deg (probability"),
     ):
         found = check(without, lines(pose, 1))["overhead"]

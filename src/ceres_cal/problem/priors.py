@@ -96,6 +96,12 @@ class GaussianPrior(Frozen):
         """The prior with some numbers integrated out: nothing is known of them any more."""
         return self._with(self.information.without(keys)) if set(keys) & set(self.keys) else self
 
+    def widened(self, factors: Array) -> GaussianPrior:
+        """With standard deviations so many times (K,) as large."""
+        information = self.information
+        matrix = information.matrix / (factors[:, None] * factors)
+        return replace(self, information=replace(information, matrix=matrix))
+
     def _with(self, information: Information) -> GaussianPrior:
         return replace(self, information=information, mean=self.mean[self.information.columns(information.keys)])
 
