@@ -12,7 +12,7 @@ from photos.real_data import ov_plane
 from scenery import board_scene
 from test_cli import Say, refused, say
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -47,6 +47,15 @@ def test_new_boards_are_predicted_to_the_noise(calibration: Calibration) -> None
     assert answer.name == "camera" and answer.misfit.points == 12 * 54
     assert len(answer.views) == 12 and answer.views[0].misfit.all_rms_px >= answer.views[-1].misfit.all_rms_px
     assert answer.solution is not None and answer.solution.estimate.cameras["camera"] == calibration.cameras["camera"]
+
+
+def test_a_board_that_the_lens_cannot_show_is_named(calibration: Calibration) -> None:
+    """It was asked for four points where it had 54."""
+    seen = _boards(2, 3)
+    shuffled = np.random.default_rng(0).permutation(seen.points.pixels[:54])
+    pixels = np.vstack([shuffled, seen.points.pixels[54:]])
+    with pytest.raises(DegenerateError, match=r"board_01.*54 points.*none shows its points through this lens"):
+        score(calibration, replace(seen, points=replace(seen.points, pixels=pixels)))
 
 
 def test_one_camera_of_several_is_scored(calibration: Calibration) -> None:

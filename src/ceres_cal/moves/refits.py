@@ -38,6 +38,7 @@ from ceres_cal.problem.parameters import Estimate, Station
 from ceres_cal.problem.problem import Weighting
 from ceres_cal.robust.other_minima import solved_soon
 from ceres_cal.start.initialise import Start
+from ceres_cal.start.world import what_poses
 
 # Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
 _NATS_ALIKE = 10.0
@@ -190,9 +191,10 @@ def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
         candidates = pose_candidates(search, [], patience=0)
         if candidates:
             poses[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ candidates[0].pose
-    for key in plan.sights.keys:
+    for sight in plan.sights:
+        key = sight.key
         if key.placement is not None and key.placement not in poses:
-            raise DegenerateError(f"{key}: its pose is not determined: show four points or more, not on one line")
+            raise DegenerateError(f"{key}: its pose is not determined: {what_poses(sight)}")
     return poses
 
 

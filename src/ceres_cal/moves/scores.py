@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ceres_cal.base import DegenerateError, InputError, Mask, Pose, checked, numerical, replace, rms
+from ceres_cal.base import InputError, Mask, Pose, checked, numerical, replace, rms
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.agreement import Agreement, Agreements, Misfit, matched, require_stations
@@ -91,11 +91,8 @@ def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station
         if candidates:
             numbers.append(number)
             poses.append(candidates[0].pose.matrix)
-    if not poses:
-        raise DegenerateError(
-            f"{sights.keys[0]}: its pose is not determined: show four points or more, not on one line"
-        )
-    stations, placements = chained_poses(sights, np.array(numbers), np.array(poses), known)
+    found = np.array(numbers, dtype=np.int64), np.array(poses).reshape(-1, 3, 4)
+    stations, placements = chained_poses(sights, *found, known)
     return Estimate(cameras, stations, placements, EXACT)
 
 

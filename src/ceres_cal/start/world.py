@@ -255,6 +255,13 @@ def chained_poses(
     )
 
 
+def what_poses(sight: Sights) -> str:
+    """What to do where no pose of a sight is found."""
+    if len(sight.points) > 3 and np.linalg.matrix_rank(sight.points - sight.points[0]) > 1:
+        return "none shows its points through this lens: check its labels, try another lens"
+    return "give at least four points, not on one line, or straight lines in two directions, two of each"
+
+
 def _require_all(
     sights: Sights,
     stations: Container[str],
@@ -273,6 +280,6 @@ def _require_all(
             state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""
             what = f"{', '.join(names)} of the camera stay open: add a point or a line beside these{state}"
         else:
-            what = "give at least four points, not on one line, or straight lines in two directions, two of each"
+            what = what_poses(sight)
         text = f"frame {frames} ({key}): {said}: {what}, or remove the view"
         raise DegenerateError(text, sights.observations.stations[key.station])
