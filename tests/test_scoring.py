@@ -42,7 +42,7 @@ def calibration() -> Calibration:
 def test_new_boards_are_predicted_to_the_noise(calibration: Calibration) -> None:
     answers = score(calibration, _boards(12, 2))
     (answer,) = answers.values()
-    assert answers.holds is None and answers.exit_code == 0
+    assert answers.holds and "is good for these: it predicts them to 0.2" in answer.words
     assert answer.misfit.noise[0] == pytest.approx(1.0, abs=0.06)  # 1.00
     assert answer.name == "camera" and answer.misfit.points == 12 * 54
     assert len(answer.views) == 12 and answer.views[0].misfit.all_rms_px >= answer.views[-1].misfit.all_rms_px
@@ -83,7 +83,8 @@ def test_other_intrinsics_are_told_by_their_score(calibration: Calibration) -> N
     camera = calibration.cameras["camera"]
     wrong = replace(camera, principal_point=(camera.principal_point[0] + 40.0, camera.principal_point[1]))
     worse = replace(calibration, estimate=replace(calibration.estimate, cameras={"camera": wrong}), posterior=None)
-    assert score(worse, _boards(12, 2))["camera"].misfit.noise[0] > 1.3  # 1.51
+    answer = score(worse, _boards(12, 2))["camera"]
+    assert answer.misfit.noise[0] > 1.3 and not answer.holds  # 1.51
 
 
 def test_the_poses_of_a_rig_are_tested_where_they_are_held() -> None:
@@ -169,7 +170,7 @@ def test_score_and_compare_as_typed(say: Say, calibration: Calibration, tmp_path
     calibration.save(known)
     _boards(3, 8).save(new)
     said = say("score", known, new)
-    assert said.code == 0 and said.out.startswith("score     intrinsics held, poses alone solved for\n")
+    assert said.code == 0 and said.out.startswith("score     camera is good for these: it predicts")
     data = json.loads(say("score", known, new, "--loss", "trivial", "--reject-sigma", "inf", "--json").out)
     assert data["cameras"][0]["points"] == 162 and len(data["views"]) == 3
     said = say("compare", known, known)

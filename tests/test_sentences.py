@@ -20,6 +20,7 @@ def test_all_kinds_are_read() -> None:
     [
         ("errors go together along lines", "banned: go together"),
         ("moved by {x:.1f} since then", "no unit after {x:.1f}: since"),
+        ("off by {x:.2g} mm", "large ones come out as 2e+02, use two_digits: {x:.2g} mm"),
         ("word " * (MOST_WORDS + 1), f"{MOST_WORDS + 1} words in a sentence"),
     ],
 )

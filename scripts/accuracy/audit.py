@@ -58,6 +58,8 @@ FAULTS: dict[str, Callable[[Camera], Camera]] = {
     "another image size": lambda c: resized(c, 0.5, (640, 480)),
     "half a pixel": lambda c: replace(c, principal_point=(c.principal_point[0] + 0.5, c.principal_point[1] + 0.5)),
     "swapped focal lengths": lambda c: replace(c, phi=c.phi * c.aspect, aspect=1.0 / c.aspect),
+    "another unit": lambda c: c.at(Pose(c.cam_from_world.rotation, 1e3 * c.cam_from_world.translation)),
+    "another focal length": lambda c: replace(c, phi=1.002 * c.phi),
     "moved": lambda c: c,
     "too few coefficients": lambda c: c,
 }

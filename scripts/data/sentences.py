@@ -139,6 +139,8 @@ def rules(text: str) -> list[str]:
     for found in _NUMBER.finditer(text):
         rest = re.match(r"[\s,)}\]]*([\w°%^²]+)?", text[found.end() :])
         after = rest[1] if rest else None
+        if after in ("px", "mm", "m", "deg") and found[0].endswith("g}"):
+            wrong.append(f"large ones come out as 2e+02, use two_digits: {found[0]} {after}")
         if after is not None and after not in _UNITS and not after.startswith("px"):
             wrong.append(f"no unit after {found[0]}: {after}")
     return wrong

@@ -11,22 +11,25 @@ from pathlib import PurePath
 
 DASH = "\N{EN DASH}"
 _SPACE = "\N{NO-BREAK SPACE}"
+IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "inch": 1.0 / 0.0254, "ft": 1.0 / 0.3048}
+"""How many of each unit that lengths are given in."""
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 # ---- numbers --------------------------------------------------------------------------------------------------------
 
 
-def two_digits(value: float) -> str:
-    """Two digits, and all that stand before the point: 0.21, 6.6, 24, 130."""
-    return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"  # two digits of 99.5 are 1e+02
+def two_digits(value: float, digits: int = 2, sign: str = "") -> str:
+    """So many digits, and all that stand before the point: 0.21, 6.6, 24, 130; `sign` "+" also of what is positive."""
+    large = abs(value) >= 10.0**digits - 0.5  # two digits of 99.5 are 1e+02
+    return f"{value:{sign}.0f}" if large else f"{value:{sign}.{digits}g}"
 
 
-def short(value: float) -> str:
-    """Two digits: 0.21, 6.6, 24, 130; a dash for what is not there, "unknown" for infinity."""
+def short(value: float, digits: int = 2) -> str:
+    """Two digits, or so many: 0.21, 6.6, 24, 130; a dash for what is not there, "unknown" for infinity."""
     if math.isnan(value):
         return DASH
-    return "unknown" if math.isinf(value) else two_digits(value)
+    return "unknown" if math.isinf(value) else two_digits(value, digits)
 
 
 def mm(value: float) -> str:

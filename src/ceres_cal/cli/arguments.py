@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from ceres_cal import observations, scene
-from ceres_cal.base import InputError, did_you_mean, printable
+from ceres_cal.base import IN_A_METRE, InputError, did_you_mean, printable
 from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:
@@ -22,9 +22,8 @@ PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
 FACING_EXAMPLE = "LeftGoalLine=top"
 _ESTIMATE_EXAMPLE = "length,width"
 _PLACES = {"FILE": "file ", "DIR": "folder "}
-_IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy", "tukey"]
-_LENGTH = re.compile(r"\s*(.*?)\s*(mm|cm|m)\s*")
+_LENGTH = re.compile(rf"\s*(.*?)\s*({'|'.join(IN_A_METRE)})\s*")
 
 
 def calibration_argument(what: str = "file that `ceres-cal calibrate` or `refit` wrote") -> Any:
@@ -131,7 +130,7 @@ def parse_length(text: str, where: str, unit: str = "m") -> float:
     found = _LENGTH.fullmatch(text)
     if found is None:
         return parse_number(text, where)
-    return parse_number(found[1], where) * _IN_A_METRE[unit] / _IN_A_METRE[found[2]]
+    return parse_number(found[1], where) * IN_A_METRE[unit] / IN_A_METRE[found[2]]
 
 
 def parse_lengths(text: str, where: str) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import base, detect, formats, moves, report
-from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace
+from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace, short
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
 from ceres_cal.cli.foreign import from_option, import_options, typed_options
@@ -90,19 +90,19 @@ def _checked_station(one: moves.Agreement) -> Section:
     data = {name: getattr(one, name) for name in ("holds", "probability", "statistic", "degrees", "words")}
     data |= {"station": one.name, "used": used, "outliers": misfit.outliers, "noise": noise}
     sizes: dict[str, float | None] = dict.fromkeys(("moved_mm", "turned_deg", "phi_change", "shift_px"))
-    maps: list[tuple[float, float | None, float | None]] = [(height_m, None, None) for height_m in HEIGHTS_M]
+    maps = [(height_m, math.nan, math.nan) for height_m in HEIGHTS_M]
     if change is not None:
         phi_change = change.phi_px[1] / change.phi_px[0] - 1.0
         sizes |= {"moved_mm": change.moved_mm, "turned_deg": change.turned_deg}
         sizes |= {"phi_change": phi_change, "shift_px": change.shift_px}
-        picture = f"picture {change.shift_px:.3g} px rms, " if math.isfinite(change.shift_px) else ""
+        picture = f"picture {short(change.shift_px, 3)} px rms, " if math.isfinite(change.shift_px) else ""
         size = f"{picture}phi {100.0 * phi_change:+.3f} %"
         maps = [(over.height_m, over.mean_mm, over.worst_mm) for over in change.maps]
         lines += [
             f"{used} observations, {misfit.outliers} outliers, noise {noise:.2f} times as before",
             f"{moves.moved_words(1e-3 * change.moved_mm, change.turned_deg)}, {size}",
             *(
-                f"map {at_height(h)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
+                f"map {at_height(h)}: {short(mean, 3)} mm on average, {short(worst, 3)} mm at most"
                 for h, mean, worst in maps
                 if mean == mean
             ),
@@ -161,7 +161,8 @@ def _scored(answer: moves.Agreements, before: Calibration) -> Document:
     parts = {"cameras": list(map(_misfit_data, cameras)), "views": list(map(_misfit_data, views))}
     return Document(
         (
-            Section("score", ["intrinsics held, poses alone solved for", *known], numbers),
+            Section("score", [f"{one.name} {one.words}" for one in cameras], {"holds": answer.holds}),
+            Section("noise", ["intrinsics held, poses alone solved for", *known], numbers),
             *(Section("camera", [f"{one.name}: {_left(one)}"]) for one in cameras),
             Section("worst", worst, parts),
         )
@@ -169,7 +170,8 @@ def _scored(answer: moves.Agreements, before: Calibration) -> Document:
 
 
 def _misfit_data(one: moves.Agreement) -> dict[str, Any]:
-    return {"name": one.name, **{name: value for name, value in vars(one.misfit).items() if name != "noise"}}
+    said = {name: value for name, value in vars(one.misfit).items() if name != "noise"}
+    return {"name": one.name, **said, **({"holds": one.holds, "words": one.words} if one.words else {})}
 
 
 def _left(one: moves.Agreement) -> str:
@@ -226,7 +228,7 @@ def _audited_station(one: moves.Agreement) -> Section:
     off_px, noise_px = moves.excess_px(one)
     known_mm = {} if one.solution.posterior is None else {over.height_m: over.known_mm for over in maps}
     known = (
-        f"{f'± {sd:.2g} mm' if math.isfinite(sd) else 'unknown'} at {1e3 * h:.0f} mm" for h, sd in known_mm.items()
+        f"{f'± {short(sd)} mm' if math.isfinite(sd) else 'unknown'} at {1e3 * h:.0f} mm" for h, sd in known_mm.items()
     )
     ours = ", ".join((f"ours: {camera!r}", *known))
     off = f"its picture is off by {off_px:.3f} px rms beyond the noise of {noise_px:.3f} px"

@@ -19,12 +19,9 @@ from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Find
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.table.targets import feature_of
 from ceres_cal.problem.structure import numbers_by_kind
-from ceres_cal.robust.noise import Inliers
+from ceres_cal.robust.noise import LARGER, Inliers
 from ceres_cal.scene.curves import nearest_on_track
 
-# Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound
-# scene is a finding; at 2.3 noise of twice the stated one is missed.
-LARGER = 1.15
 # Pairs of neighbours: the correlation of 20 is known to 0.2. Nothing changes from half to double.
 _FEWEST_PAIRS = 20
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 from msgspec import Struct
 
 from ceres_cal import scene
-from ceres_cal.base import Frozen, InputError, field, make_folder, write_bytes
+from ceres_cal.base import Frozen, InputError, field, make_folder, short, write_bytes
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -51,8 +51,8 @@ class Exported(Frozen):
             worst = max((worst for _, worst in loss.field_mm.values()), default=float("inf"))
             if not worst <= most:  # type: ignore[operator]
                 raise InputError(
-                    f"station {loss.station!r}: the format would be wrong by {worst:.3g} mm on the field, more than "
-                    f"{most:g}: calibrate with a lens that it holds, or allow for more"
+                    f"station {loss.station!r}: the format would be wrong by {short(worst, 3)} mm on the field, more "
+                    f"than {most:g}: calibrate with a lens that it holds, or allow for more"
                 )
 
     def save(self, path: str | Path) -> None:
@@ -188,7 +188,7 @@ def calibration_of(
         ours[name], (rms, worst) = given.camera()
         if worst > 0.0:
             what = f"its {given.model} model is held as the nearest {ours[name].lens.kind} lens"
-            told.append(f"camera {name!r}: {what}, off by {rms:.2g} px rms and {worst:.2g} px at most")
+            told.append(f"camera {name!r}: {what}, off by {short(rms)} px rms and {short(worst)} px at most")
         if given.cam_from_world is None:
             told.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
     stations = {name: Station(name, camera.cam_from_world) for name, camera in ours.items()}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from ceres_cal import posterior, scene
-from ceres_cal.base import HEIGHTS_M, Array, InputError, at_height, grid_places, rms_and_largest
+from ceres_cal.base import HEIGHTS_M, Array, InputError, at_height, grid_places, rms_and_largest, short
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.scene import ForeignCamera, image_grid, in_image
 
@@ -112,11 +112,12 @@ def nearest_foreign(
 def loss_words(loss: ExportLoss) -> list[str]:
     """What is lost, a line each, for files that have room for it: on the field first, where it counts."""
     lines = [
-        f"{loss.station}: {rms:.3g} mm rms, {worst:.3g} mm at most, {at_height(height_m)}"
+        f"{loss.station}: {short(rms, 3)} mm rms, {short(worst, 3)} mm at most, {at_height(height_m)}"
         for height_m, (rms, worst) in loss.field_mm.items()
     ]
     if loss.image_px is not None:
-        shown = np.isfinite(loss.image_px[0])
-        off = "{:.3g} px rms, {:.3g} px at most".format(*loss.image_px) if shown else "some of it is not shown at all"
+        rms, worst = loss.image_px
+        shown = f"{short(rms, 3)} px rms, {short(worst, 3)} px at most"
+        off = shown if np.isfinite(rms) else "some of it is not shown at all"
         lines.append(f"{loss.station}: {off}, over the image")
     return lines

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base import Array, InputError, Pose, replace
+from ceres_cal.base import Array, InputError, Pose, replace, two_digits
 from ceres_cal.formats.format import (
     Exported,
     ExportFormat,
@@ -65,7 +65,7 @@ def _reader_traps(camera: ForeignCamera) -> list[str]:
     if worst <= rough_px:
         return []
     end = "criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)"
-    return [f"cv2.undistortPoints stops after five rounds, here up to {worst:.2g} px off: give it {end}"]
+    return [f"cv2.undistortPoints stops after five rounds, here up to {two_digits(worst)} px off: give it {end}"]
 
 
 def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:

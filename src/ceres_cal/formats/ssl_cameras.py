@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base import HEIGHTS_M, Array, InputError, Pose, quaternion, rotation_exp, rotation_of
+from ceres_cal.base import HEIGHTS_M, Array, InputError, Pose, quaternion, rotation_exp, rotation_of, short
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels, nearest_foreign
@@ -74,8 +74,9 @@ def _less_lost(camera: Camera, loss: ExportLoss, box_m: Box | None) -> list[str]
     other = nearest_foreign(camera, loss.station, opencv_models(camera), box_m)[1]
     left = max(worst for _, worst in other.field_mm.values())
     return [
-        f"one coefficient does not hold this lens, {worst:.3g} mm are lost at most: to lose less, read --to opencv "
-        f"({left:.2g} mm at most) or --to table in your own software, or let more cameras see less of the field each"
+        f"one coefficient does not hold this lens, {short(worst, 3)} mm are lost at most: to lose less, read --to "
+        f"opencv ({short(left)} mm at most) or --to table in your own software, or let more cameras see less of the "
+        "field each"
     ]
 
 

@@ -127,6 +127,16 @@ class Misfit(Frozen, eq=True):
     all_rms_px: float = np.nan
     noise: tuple[float, float] = (np.nan, np.nan)
 
+    @property
+    def count(self) -> int:
+        """How many observations there are, of both kinds, outliers too."""
+        return self.points + self.curves + self.outliers
+
+    @property
+    def many_out(self) -> bool:
+        """Whether so many were taken out that the rest says little."""
+        return self.outliers > 0.25 * self.count
+
 
 class Agreement(Frozen, kw_only=True):
     """What is said of one station, camera or view; what was not asked is left at its default.

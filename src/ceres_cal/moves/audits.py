@@ -14,7 +14,19 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, InputError, Pose, at_height, attempt, checked, numerical, upper_tail
+from ceres_cal.base import (
+    IN_A_METRE,
+    Array,
+    CalibrationError,
+    InputError,
+    Pose,
+    at_height,
+    attempt,
+    checked,
+    numerical,
+    short,
+    upper_tail,
+)
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -36,9 +48,10 @@ def audit(foreign: Calibration, observations: Observations) -> Agreements:
     """Hold a calibration, ours or another program's, against observations of its stations.
 
     The answer of a station has the least change that explains the observations as its `cause` ("another image size",
-    "half a pixel", "swapped focal lengths", "moved", "too few coefficients" or "other intrinsics"), our own calibration
-    of the same observations as its `solution`, and the change from that to the given camera, with how well ours knows
-    places as what is expected. `pose_free`: it did not say where it stands, and the pose that is best for it was taken.
+    "half a pixel", "swapped focal lengths", "another unit", "another focal length", "moved", "too few coefficients" or
+    "other intrinsics"), our own calibration of the same observations as its `solution`, and the change from that to the
+    given camera, with how well ours knows places as what is expected. `pose_free`: it did not say where it stands, and
+    the pose that is best for it was taken.
 
     Args:
         foreign: see `formats.import_calibration`. A single station need not be named as in the observations.
@@ -191,9 +204,14 @@ def _cause(case: _AuditCase, camera: Camera, best: float, degrees: int, posed: b
     for cause, words, changed in _mistakes(camera, case.ours.station()):
         if _sound(case.least(changed, pose=not posed)[0] - best, degrees):
             return cause, words
+    unit, scaled = _in_metres(camera, case.ours.station())
+    if case.least(scaled, pose=False)[0] < case.least(camera, pose=False)[0]:
+        rest = case.least(scaled, pose=False)[0] - best
+        besides = "" if _sound(rest, degrees) else f"; besides, {': '.join(_cause(case, scaled, best, degrees, posed))}"
+        return "another unit", f"its position is in {unit}, it seems, and must be in metres{besides}"
     here = camera.at(case.ours.station().cam_from_world)
-    if posed and _sound(case.least(here, pose=True)[0] - best, degrees - 6):
-        return "moved", "it explains them from another place: refit it, or calibrate again"
+    if freed := _freed(case, camera, here, best, degrees, posed):
+        return freed
     for cause, words, changed in _mistakes(here, case.ours.station()) if posed else ():
         if _sound(case.least(changed, pose=True)[0] - best, degrees - 6):
             return cause, f"{words}; and it has moved"
@@ -205,6 +223,30 @@ def _cause(case: _AuditCase, camera: Camera, best: float, degrees: int, posed: b
             f"a {case.ours.station().lens.kind} lens does ({', '.join(case.ours.station().lens.names)})"
         )
     return "other intrinsics", "another zoom or lens, or it was calibrated from too little: calibrate again"
+
+
+def _freed(
+    case: _AuditCase, camera: Camera, here: Camera, best: float, degrees: int, posed: bool
+) -> tuple[str, str] | None:
+    """What explains it when let go: its focal length, else its pose, else both."""
+    zoomed = "it does with a focal length of {:.1f} px in place of {:.1f}"
+    tried = [("another focal length", zoomed, camera, 1)]
+    if posed:
+        moved = "it explains them from another place: refit it, or calibrate again"
+        tried += [("moved", moved, here, 6), ("another focal length", f"{zoomed}; and it has moved", here, 7)]
+    for cause, words, start, let_go in tried:
+        cost, there = case.least(start, pose=not posed or let_go > 1, lens=() if let_go == 6 else (0,))
+        if _sound(cost - best, degrees - let_go):
+            return cause, words.format(there.phi, camera.phi)
+    return None
+
+
+def _in_metres(camera: Camera, ours: Camera) -> tuple[str, Camera]:
+    """The unit in which it is about as far from the origin as ours, and the camera with its position taken so."""
+    far = float(np.linalg.norm(camera.position) / np.linalg.norm(ours.position))
+    unit = min(IN_A_METRE, key=lambda one: abs(np.log(far / IN_A_METRE[one])))
+    pose = camera.cam_from_world
+    return unit, camera.at(replace(pose, translation=pose.translation / IN_A_METRE[unit]))
 
 
 def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]:
@@ -223,7 +265,7 @@ def _mistakes(camera: Camera, ours: Camera) -> Iterator[tuple[str, str, Camera]]
     for scale in scales:
         yield (
             "another image size",
-            f"it is one of images {scale:.3g} times as large",
+            f"it is one of images {short(scale, 3)} times as large",
             resized(camera, scale, (wide, high)),
         )
 
@@ -240,7 +282,8 @@ def resized(camera: Camera, scale: float, image_size: tuple[int, int]) -> Camera
 
 def _words(cause: str | None, what_to_do: str, change: MapChange, posed: bool) -> str:
     sizes = [
-        f"{one.rms_mm:.2g} mm rms and {one.most_mm:.2g} mm at most {at_height(one.height_m)}" for one in change.maps
+        f"{short(one.rms_mm)} mm rms and {short(one.most_mm)} mm at most {at_height(one.height_m)}"
+        for one in change.maps
     ]
     placed = "" if posed else " (from the pose that is best for it: it says none)"
     if cause is None:

@@ -295,7 +295,6 @@ def not_found(station: str, words: str, misfit: Misfit | None = None) -> Agreeme
 
 
 def _words(answer: Agreement) -> str:
-    many_outliers = 0.25
     change, misfit = answer.change, answer.misfit
     worst_mm = change.maps[0].worst_mm if change and change.maps else np.nan  # of a station that sees none of a field
     if answer.holds:
@@ -306,10 +305,9 @@ def _words(answer: Agreement) -> str:
     else:
         shifts = f", which shifts the map by up to {worst_mm:.1f} mm on the floor" if np.isfinite(worst_mm) else ""
         words = f"no longer holds: {_cause_words(answer)}{shifts} (probability {answer.probability:.1g})"
-    count = misfit.points + misfit.curves + misfit.outliers
-    if misfit.outliers > many_outliers * count:
+    if misfit.many_out:
         remedy = "refit" if answer.cause in WORDS else "check labels"
-        words += f"; but {misfit.outliers} of {count} observations fit nowhere: {remedy}"
+        words += f"; but {misfit.outliers} of {misfit.count} observations fit nowhere: {remedy}"
     return words
 
 

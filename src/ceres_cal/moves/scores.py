@@ -6,16 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ceres_cal.base import InputError, Mask, Pose, checked, numerical, replace, rms
+from ceres_cal.base import InputError, Mask, Pose, checked, numerical, replace, rms, two_digits
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.solving import Task, solved_from
-from ceres_cal.moves.agreement import Agreement, Agreements, Misfit, matched, require_stations
+from ceres_cal.moves.agreement import NOISIER, Agreement, Agreements, Misfit, matched, require_stations
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.problem import EXACT, Estimate, Options, Station, make_layout
 from ceres_cal.problem.priors import gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.residuals import Residuals, residuals
+from ceres_cal.robust.noise import LARGER
 from ceres_cal.start.initialise import Start
 from ceres_cal.start.world import chained_poses
 
@@ -29,7 +30,7 @@ def score(
 
     Targets are taken as the calibration says that they were built. A calibration of another program will do. The
     answers are those of its cameras, with what each view leaves, the worst first, and the poses that suit the
-    observations best (`solution`). Whether the calibration holds is not decided: the noise says how well.
+    observations best (`solution`). A camera holds where the noise is that of its calibration; None where it has none.
 
     Args:
         options: loss and rejection; those of the calibration by default.
@@ -67,7 +68,10 @@ def score(
         own = np.array([view.camera == name for view in observed.views])
         misfit = _misfit(own, observed, left, posed, noise)
         its = tuple(view for camera, view in views if camera == name)
-        answers[name] = Agreement(name=name, misfit=misfit, views=its, pose_free=True, solution=posed)
+        holds, words = _verdict(misfit)
+        answers[name] = Agreement(
+            name=name, holds=holds, words=words, misfit=misfit, views=its, pose_free=True, solution=posed
+        )
     return Agreements(answers)
 
 
@@ -94,6 +98,23 @@ def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station
     found = np.array(numbers, dtype=np.int64), np.array(poses).reshape(-1, 3, 4)
     stations, placements = chained_poses(sights, *found, known)
     return Estimate(cameras, stations, placements, EXACT)
+
+
+def _verdict(misfit: Misfit) -> tuple[bool | None, str]:
+    """Whether a camera predicts what it was scored by, and the sentence that says so."""
+    noise = max((one for one in misfit.noise if one == one), default=np.nan)
+    size = f"to {two_digits(max(misfit.points_rms_px, misfit.curves_rms_px))} px"
+    if misfit.many_out:
+        out = f"{misfit.outliers} of {misfit.count} observations were taken out"
+        return False, f"is not good for these: {out}: check labels, target and camera"
+    if noise > NOISIER:
+        much = f"the noise is {two_digits(noise)} times that of its calibration"
+        return False, f"is not good for these, {size} only: {much}: another focus, zoom or target, or too simple a lens"
+    if np.isnan(noise):
+        return None, f"predicts these {size}; its calibration states no noise to compare this with"
+    if noise > LARGER:
+        return None, f"is usable for these, {size}, with {two_digits(noise)} times the noise that it was made with"
+    return True, f"is good for these: it predicts them {size}, as well as those that it was made from"
 
 
 # ---- what is left ---------------------------------------------------------------------------------------------------

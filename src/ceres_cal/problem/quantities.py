@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base import Array, Frozen, InputError, Pose, replace, rotation_exp, rotation_log, skew
+from ceres_cal.base import Array, Frozen, InputError, Pose, replace, rotation_exp, rotation_log, skew, two_digits
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import POSE_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
 from ceres_cal.problem.parameters import (
@@ -412,7 +412,7 @@ def place_range(seen: Array, spread: float, said: str) -> Range:
 def _require_tolerance(tolerance: Tolerance, target: str, observations: Observations) -> None:
     sizes_m = {name: float(np.max(np.diff(one.box, axis=0))) for name, one in observations.targets.items()}
     size_m = sizes_m[target] or max(sizes_m.values()) or np.inf  # a pole's top is placed on the field
-    bounds = Range(0.0, _BUILT * size_m, "m", 0.0, f"the target is {size_m:.3g} m long")
+    bounds = Range(0.0, _BUILT * size_m, "m", 0.0, f"the target is {two_digits(size_m, 3)} m long")
     plain: Mapping[str, float] = {name: value for name, value in vars(tolerance).items() if name != "curve_m"}
     for name, value in {**plain, **tolerance.curve_m}.items():
         bounds.require(value, f"the tolerance {name} of target {target!r}")

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.words import chance, counted, fixed, grouped, mm, plural, powered, sentence, short
+from ceres_cal.base.words import chance, counted, fixed, grouped, mm, plural, powered, sentence, short, two_digits
 from ceres_cal.calibration import LensChoice
 from ceres_cal.calibration.lens_forms import label_of
 from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable
@@ -87,7 +87,9 @@ def _card(finding: Finding) -> Card:
         facts.append(mm(finding.effect_mm))
     facts.append(counted(finding.observations, "observation"))
     facts.append(f"false alarm: {powered(chance(finding.log10_p))}")
-    facts += [f"{one.name} {one.value:+.3g} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts]
+    facts += [
+        f"{one.name} {two_digits(one.value, 3, '+')} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts
+    ]
     return Card(
         "no" if is_against(finding) else "care", sentence(finding.sentence), sentence(finding.advice), tuple(facts)
     )

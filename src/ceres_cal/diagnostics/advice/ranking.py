@@ -8,7 +8,18 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_matrices, numerical, replace, text_of
+from ceres_cal.base import (
+    ROBOT_TOP_M,
+    Frozen,
+    brief,
+    checked,
+    each,
+    for_small_matrices,
+    numerical,
+    replace,
+    short,
+    text_of,
+)
 from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, still
@@ -70,8 +81,8 @@ class Advice(Frozen):
     good_enough_mm: float | None
 
     def __repr__(self) -> str:
-        rows = [(f"{one.after.worst_mm:.2g} mm", one.measurement.words) for one in self.promises]
-        title = f"Advice for station {self.station!r}: {self.before.worst_mm:.2g} mm at worst, which becomes"
+        rows = [(f"{short(one.after.worst_mm)} mm", one.measurement.words) for one in self.promises]
+        title = f"Advice for station {self.station!r}: {short(self.before.worst_mm)} mm at worst, which becomes"
         return text_of((title, rows))
 
 

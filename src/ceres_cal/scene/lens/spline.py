@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, grid_places, rms
+from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, grid_places, rms, two_digits
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 
@@ -224,9 +224,8 @@ class Spline(Planar):
         plain = Spline(self.values[: len(_names(self.powers))], self.powers)
         with_it, without = (lens.mapped(grid_places(x, y))[:, 0] for lens in (self, plain))
         size_px = self._rim_px * rms(np.linalg.norm(with_it - without, axis=0))
-        return (
-            f"{said}; a surface of {len(NODES) // 2} nodes displaces by {size_px:.2g} px besides (rms over the picture)"
-        )
+        size = f"{two_digits(size_px)} px besides (rms over the picture)"
+        return f"{said}; a surface of {len(NODES) // 2} nodes displaces by {size}"
 
     @property
     def nodes(self) -> frozenset[str]:

@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import InputError, checked
+from ceres_cal.base import InputError, checked, two_digits
 from ceres_cal.scene.curves import Curve, Segment
 from ceres_cal.scene.targets.target import Disc, Grid, Paper, Square, Target, TargetKind, from_arguments, require_size
 
@@ -81,7 +81,9 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
         raise InputError(f"circle-grid: spacing_m must be a positive number of metres, not {spacing_m}")
     apart_m = float(spacing_m) * (np.sqrt(2.0) if asymmetric else 1.0)
     if not 0.0 < diameter_m < apart_m:
-        raise InputError(f"circle-grid: diameter_m must be above 0 and below the {apart_m:.4g} m between circles")
+        raise InputError(
+            f"circle-grid: diameter_m must be above 0 and below the {two_digits(apart_m, 4)} m between circles"
+        )
     size = Grid(int(columns), int(rows), float(spacing_m))
     spec = {
         "kind": "circle-grid",
