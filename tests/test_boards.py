@@ -369,8 +369,9 @@ def test_depth_and_colour_change_nothing(tmp_path: Path, picture: Array) -> None
         "deep": grey.astype(np.uint16) * 20 + 700,  # 12 bit in a 16-bit file, far from filling it
     }
     paths = [write(tmp_path / f"{name}.png", image) for name, image in images.items()]
+    paths.append(write(tmp_path / "float.tiff", images["colour"].astype(np.float32) / 255.0))
     assert read_grey(paths[3]).dtype == np.uint16
-    pixels = detect_boards(paths, BOARD, corners="saddle").observations.points.pixels.reshape(4, 42, 2)
+    pixels = detect_boards(paths, BOARD, corners="saddle").observations.points.pixels.reshape(5, 42, 2)
     assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.00005
 
 

@@ -124,7 +124,7 @@ HEADER = {"format": "ceres-cal/test", "version": 3}
     "content, message",
     [
         (b"", "not valid JSON (cut short?)"),
-        (b"%PDF-1.4\n%\xe2\xe3", "not valid JSON (cut short?)"),
+        (b"%PDF-1.4\n%\xe2\xe3", "not valid JSON"),
         (b'{"format": "ceres-cal/test", "ver', "not valid JSON (cut short?)"),
         (b"[" * 100_000, "not valid JSON (cut short?)"),
         (b"[1, 2]", '"format" must be "ceres-cal/test", not None'),

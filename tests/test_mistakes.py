@@ -133,6 +133,10 @@ ON_THE_COMMAND_LINE = [
     ("targets print ssl-b -o OUT.pdf", "is not printed on paper: print a board, circles or rings"),
     ("undistort CAL PHOTO --camera overhaed -o OUT", "there is no camera 'overhaed': did you mean 'overhead'?"),
     ("simulate ssl-feild -o OUT", "there is no scene 'ssl-feild': did you mean 'ssl-field'?"),
+    ("calibrate PHOTOS", "not observations (.json, .npz or a folder .columns): `ceres-cal import` makes them of a CSV"),
+    ("calibrate LATIN", "latin.json: not valid JSON: byte 1 is not UTF-8: save it"),
+    ("""detect board PHOTO --target '{"kind": "chekerboard"}' -o OUT.json""", "did you mean 'checkerboard'?"),
+    ("detect board PHOTO --target UTF16 -o OUT.json", "utf16.json: unknown kind 'ringz': did you mean 'rings'?"),
     ("calibrate NO_FRAME", "'frame' is missing (name of the photograph) in views[3]"),
     ("calibrate NO_SIZE", "'image_size' is missing (width and height in px) in cameras.overhead"),
 ]
@@ -148,7 +152,11 @@ def names(calibration: cc.Calibration, tmp_path_factory: pytest.TempPathFactory)
     sample["views"][3]["frame"] = frame
     del sample["cameras"]["overhead"]["image_size"]
     (folder / "no_size.json").write_text(json.dumps(sample), encoding="utf-8")
+    (folder / "latin.json").write_bytes('"é"'.encode("latin-1"))
+    (folder / "utf16.json").write_text('{"kind": "ringz"}', encoding="utf-16")
     return {
+        "LATIN": str(folder / "latin.json"),
+        "UTF16": str(folder / "utf16.json"),
         "OBS": str(SAMPLE),
         "CAL": str(folder / "calibration.json"),
         "PHOTOS": str(PHOTOGRAPHS),

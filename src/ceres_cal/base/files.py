@@ -6,6 +6,7 @@ its size, headers and marks before any of it is made: more than `most_bytes` is 
 
 from __future__ import annotations
 
+import codecs
 import fcntl
 import json
 import math
@@ -95,7 +96,7 @@ def require_room(needed: float, where: str) -> None:
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """The content of a file.
+    """The content of a file; text in UTF-16, as Windows writes it, in UTF-8.
 
     Raises:
         InputError: it is missing, cannot be read, is no regular file, or is too large.
@@ -103,7 +104,11 @@ def read_bytes(path: str | Path) -> bytes:
     with opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         require_room(size, str(path))
-        return stream.read(size)
+        content = stream.read(size)
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        with suppress(UnicodeDecodeError):  # quiet: it is no text, and read as it is
+            return content.decode("utf-16").encode()
+    return content
 
 
 @contextmanager
@@ -152,6 +157,10 @@ def parse_json(content: bytes, where: str) -> Any:
         data = json.loads(content.decode("utf-8-sig"), parse_int=_whole)
         if _SURROGATE.search(content):
             msgspec.json.encode(data)  # half a surrogate pair is no letter that could be written again
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{where}: not valid JSON: byte {error.start} is not UTF-8: save it in this encoding"
+        ) from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: not valid JSON (cut short?): {error}") from None
     _require_unique_keys(content, where)

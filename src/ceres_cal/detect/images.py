@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base import Array32, Image, InputError, Mask, read_bytes, require_room
+from ceres_cal.base import AnyArray, Array32, Image, InputError, Mask, read_bytes, require_room
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
@@ -76,10 +76,23 @@ def _decoded(path: str | Path, channels: int) -> Image:
     with suppress(cv2.error, struct.error):  # reads: "not an image that OpenCV can read (cut short?)"
         if size := claimed_size(content):
             _require_believable(size, len(content), str(path))
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+            packed = np.frombuffer(content, np.uint8)
+            image = cv2.imdecode(packed, flags)
+            if image is None or image.dtype.itemsize > 2:  # of which OpenCV makes no grey
+                image = _in_levels(cv2.imdecode(packed, flags | cv2.IMREAD_ANYCOLOR), channels, str(path))
     if image is None:
         raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
     return image
+
+
+def _in_levels(image: AnyArray | None, channels: int, path: str) -> Image | None:
+    """A picture of floats, or of long numbers, as levels from 0 to 255, in grey where asked."""
+    if image is None:
+        return None
+    if not np.isfinite(image).all():
+        raise InputError(f"{path}: some of its pixels are no finite numbers: convert it to PNG")
+    levels = image.astype(np.float32) * np.float32(255.0 / max(float(np.max(image)), 1e-9))
+    return cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY) if levels.ndim == 3 and channels == cv2.IMREAD_GRAYSCALE else levels
 
 
 def _require_believable(size: tuple[int, int], length: int, path: str) -> None:

@@ -143,14 +143,18 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
 
 def read_content(path: Path) -> Content:
     """See `Observations.load`."""
+    wrong = InputError(
+        f"{path}: not observations (.json, .npz or a folder .columns): `ceres-cal import` makes them of a CSV file, "
+        "`ceres-cal detect` of photographs, and `ceres-cal run` takes a folder of photographs"
+    )
+    if path.is_dir() and not (path / HEADER).exists():
+        raise wrong
     if path.suffix == ENDING or path.is_dir():
         header = decode_json(read_bytes(path / HEADER), ObservationsFile, str(path / HEADER), FORMAT, VERSION)
         return _of_columns(header, read_folder(path, _NUMBERS))
     content = read_bytes(path)
     if path.suffix not in (".json", ".npz") and not content.lstrip().startswith(b"{"):
-        raise InputError(
-            "not observations (.json, .npz or a folder .columns): `ceres-cal import` makes them of a CSV file"
-        )
+        raise wrong
     return _from_npz(content, str(path)) if path.suffix == ".npz" else _from_json(content, str(path))
 
 

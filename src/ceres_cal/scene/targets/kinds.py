@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ceres_cal.base import InputError, LazyTable, naming
+from ceres_cal.base import InputError, LazyTable, did_you_mean, naming
 from ceres_cal.scene.targets.painted_fields import templates
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
@@ -38,7 +38,8 @@ def target_from_spec(spec: Any, where: str) -> Target:
     kind = spec.get("kind") if isinstance(spec, dict) else None
     if not isinstance(kind, str) or kind not in TARGET_KINDS:
         missing = '; its description has no "kind"' if kind is None else ""
-        raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}{missing}")
+        choices = did_you_mean(kind, TARGET_KINDS) or f": choose one of {', '.join(TARGET_KINDS)}"
+        raise InputError(f"{where}: unknown kind {kind!r}{choices}{missing}")
     with naming(where):
         return TARGET_KINDS[kind].from_spec(spec, where)
 
