@@ -133,6 +133,7 @@ ON_THE_COMMAND_LINE = [
     ("targets print ssl-b -o OUT.pdf", "is not printed on paper: print a board, circles or rings"),
     ("undistort CAL PHOTO --camera overhaed -o OUT", "there is no camera 'overhaed': did you mean 'overhead'?"),
     ("simulate ssl-feild -o OUT", "there is no scene 'ssl-feild': did you mean 'ssl-field'?"),
+    ("calibrate INCHES", "'inches' cannot be read: give the file in 'metres, radians, pixels', in units"),
     ("calibrate PHOTOS", "not observations (.json, .npz or a folder .columns): `ceres-cal import` makes them of a CSV"),
     ("calibrate LATIN", "latin.json: not valid JSON: byte 1 is not UTF-8: save it"),
     ("""detect board PHOTO --target '{"kind": "chekerboard"}' -o OUT.json""", "did you mean 'checkerboard'?"),
@@ -154,7 +155,9 @@ def names(calibration: cc.Calibration, tmp_path_factory: pytest.TempPathFactory)
     (folder / "no_size.json").write_text(json.dumps(sample), encoding="utf-8")
     (folder / "latin.json").write_bytes('"é"'.encode("latin-1"))
     (folder / "utf16.json").write_text('{"kind": "ringz"}', encoding="utf-16")
+    (folder / "inches.json").write_text(json.dumps({**sample, "units": "inches"}), encoding="utf-8")
     return {
+        "INCHES": str(folder / "inches.json"),
         "LATIN": str(folder / "latin.json"),
         "UTF16": str(folder / "utf16.json"),
         "OBS": str(SAMPLE),

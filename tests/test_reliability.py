@@ -389,18 +389,13 @@ def test_pixels_far_off_and_another_origin(observations: Observations) -> None:
     assert any("principal point lies" in line for line in calibrate(shifted, RADIAL).warnings)
 
 
-def test_a_field_in_millimetres(observations: Observations) -> None:
-    (name,) = observations.targets
-    lengths = {
-        "field_length_m": 9000.0, "field_width_m": 6000.0, "goal_width_m": 1000.0, "penalty_area_depth_m": 1000.0,
-        "penalty_area_width_m": 2000.0, "goal_center_to_penalty_mark_m": 6000.0, "center_circle_radius_m": 500.0,
-        "line_thickness_m": 10.0,
-    }  # fmt: skip
-    large = replace(observations, targets={name: ssl_field(None, **lengths)}, priors=())
-    assert (
-        f"target {name!r} reaches 5408 m from its origin: are its numbers metres"
-        in calibrate(large, RADIAL).warnings[0]
-    )
+@pytest.mark.parametrize(
+    "many, said", [(1000.0, "are in mm, it"), (1.0 / 0.3048, "are in ft, it"), (50.0, "over 33 times")]
+)
+def test_a_field_in_another_unit(many: float, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        ssl_field("B", field_length_m=9.0 * many, field_width_m=6.0 * many)
+    assert ssl_field("B", field_length_m=9.0 / 0.3048)  # one alone is a long field
 
 
 @pytest.mark.parametrize("scale", [0.001, 1000.0])
@@ -416,6 +411,7 @@ def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> N
     noise_px = 1e-4 * phi
     seen = simulate(scene, Disturbance(noise_px, noise_px)).observations
     found = calibrate(seen, Options(lens="radial", free_principal_point=False))
+    assert (scale > 1.0) == any("reaches 5408 m from its origin: are its numbers" in one for one in found.warnings)
     known = found.uncertainty.verdict("camera", "c", "phi")
     assert abs(known.value - phi) < 4.0 * known.sd < 0.1 * phi
 

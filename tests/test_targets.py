@@ -371,7 +371,7 @@ BAD_SPECS: list[tuple[Any, str]] = [
     ({"kind": "ssl-field", "division": 1}, "division: Expected a text or nothing, got a whole number"),
     (
         {"kind": "ssl-field", "division": "A", "field_length": 9.0},
-        "unknown dimension 'field_length': the dimensions are",
+        "unknown dimension 'field_length': did you mean 'field_length_m'",
     ),
     ({"kind": "ssl-field", "division": "A", "field_length_m": "9"}, "field_length_m: Expected a number, got a text"),
     (

@@ -291,6 +291,9 @@ def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
         return f"{text} in {place}" if place else text
     if found := re.fullmatch(r"Object contains unknown field `(.+)`", " ".join(said.split())):
         return f"there is no field {found[1]!r}{f' in {place}' if place else ''}: remove it, or correct its name"
+    if found := re.fullmatch(r"Invalid enum value (.*)", said):
+        must = {"units": UNITS, "pixel_origin": PIXEL_ORIGIN}.get(str(names[-1]) if names else "")
+        said = f"{found[1]} cannot be read" + (f": give the file in {must!r}" if must else "")
     for theirs in set(re.findall(r"`([^`]+)`", said)):
         said = said.replace(f"`{theirs}`", " or ".join(_KINDS.get(one, one) for one in theirs.split(" | ")))
     return f"{said}, in {place}" if place else said

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from ceres_cal.base import InputError, checked, convert, no_such
+from ceres_cal.base import IN_A_METRE, InputError, checked, convert, did_you_mean, no_such
 from ceres_cal.scene.curves import Arc, Curve, Segment, with_crossings
 from ceres_cal.scene.targets.target import LARGEST_M, Target, TargetKind
 
@@ -145,8 +146,9 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         for name, value in given.items():
             if name not in (*self.dimensions, *self.parts, TOLERANCE):
                 switched = f"; its parts are {', '.join(self.parts)}" if self.parts else ""
-                known = ", ".join(self.dimensions)
-                raise InputError(f"{self.kind}: unknown dimension {name!r}: the dimensions are {known}{switched}")
+                known = f": the dimensions, in metres, are {', '.join(self.dimensions)}{switched}"
+                near = did_you_mean(name, (*self.dimensions, *self.parts))
+                raise InputError(f"{self.kind}: unknown dimension {name!r}{near or known}")
             if isinstance(value, bool) != (name in self.parts):
                 wanted = "true or false" if name in self.parts else "a length in metres"
                 raise InputError(f"{self.kind}: {name} must be {wanted}, not {value}")
@@ -164,7 +166,22 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         for name, value in every.items():
             if not 0.0 < value < LARGEST_M:
                 raise InputError(f"{self.kind}: {name} must be a positive number of metres, not {value}")
+        self._require_metres({name: float(value) for name, value in given.items() if name in self.dimensions})
         return {name: float(every[name]) for name in self.dimensions}
+
+    def _require_metres(self, given: Mapping[str, float]) -> None:
+        """Raise InputError where most of two dimensions or more are known ones in another unit, to 2 %, or where all
+        are far larger: in inches a field is 39 times as large.
+        """
+        least = np.inf
+        for variant, (unit, many) in product(self.choices or (None,), IN_A_METRE.items()):
+            ratios = np.array([value / _of(self.dimensions[name], variant) for name, value in given.items()])
+            same = np.mean(np.abs(ratios / many - 1.0) < 0.02) if len(ratios) > 1 else 0.0
+            if unit != "m" and same > 0.5:
+                raise InputError(f"{self.kind}: its dimensions are in {unit}, it seems: give them in metres")
+            least = float(np.min(ratios, initial=least))
+        if given and least > 25.0:
+            raise InputError(f"{self.kind}: its dimensions are over {least:.0f} times the usual: give them in metres")
 
     def _others(self, variant: str | None, parts: Mapping[str, bool]) -> dict[str, Mapping[str, Any]]:
         """What it may be mistaken for, in words."""
@@ -183,8 +200,9 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         if self.variants is not None:
             key = self.variants.key
             variant = convert(data.pop(key, None), str | None, f"{where}.{key}")  # type: ignore[arg-type]
-        given = {
-            name: convert(value, bool if name in self.parts else float, f"{where}: {name}")
+        known = {**dict.fromkeys((*self.dimensions, TOLERANCE), float), **dict.fromkeys(self.parts, bool)}
+        given = {  # an unknown one is refused by its name, whatever its value
+            name: convert(value, known[name], f"{where}: {name}") if name in known else 0.0
             for name, value in data.items()
         }
         return _made(self.kind, variant, tuple(given.items()))
