@@ -55,7 +55,7 @@ WRONG = {
     "detect field": [
         ("VIDEO --auto --target ssl-c", "there is no target 'ssl-c': did you mean 'ssl-b'?"),
         ("VIDEO --auto --target VIDEO", "not valid JSON"),
-        ("VIDEO --auto --target MILLIMETRES", "the field reaches 5408 m from its origin"),
+        ("VIDEO --auto --target MILLIMETRES", "its dimensions are in mm, it seems"),
         ('VIDEO --auto --target \'{"kind": "rings", "radii_m": [0.1]}\'', "no painted curve"),
         ("VIDEO --target ssl-b --start nowhere.json", "nowhere.json: no such file"),
         ("VIDEO --target ssl-b --corner TopLeftCorner=1,2", "4 points are needed to start from"),
@@ -78,7 +78,7 @@ WRONG = {
     ],
     "run": [
         ("VIDEO --target ssl-c", "did you mean 'ssl-b'?"),
-        ("VIDEO --target MILLIMETRES", "the field reaches 5408 m from its origin"),
+        ("VIDEO --target MILLIMETRES", "its dimensions are in mm, it seems"),
         ("VIDEO --board 9x6x100m", "it reaches 943 m from its origin"),
         ("VIDEO --board 2x2x25mm", "needs 3 inner corners a side or more"),
         ("VIDEO --target ssl-b --facing LeftGoalLine=up", "there is no side 'up'"),

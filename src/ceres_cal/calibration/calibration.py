@@ -233,7 +233,9 @@ class Calibration(Frozen):
         Raises:
             InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
         """
-        data = decode_json(read_bytes(path), CalibrationFile, str(path), FORMAT, VERSION, finite=True)
+        if not (content := read_bytes(path)).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+            raise InputError(f"{path}: no calibration of ceres-cal: `ceres-cal import` makes one of another program's")
+        data = decode_json(content, CalibrationFile, str(path), FORMAT, VERSION, finite=True)
         with naming(path):
             return cls.from_file(data)
 

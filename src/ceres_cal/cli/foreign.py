@@ -135,6 +135,8 @@ def _import(
 
     require_output(output, [file])
     given = formats.read_foreign(file, form, **typed_options(options, form))
+    if not isinstance(given, Observations):
+        require_output(output, [file], "calibrations are", ".json")
     save(output, given)
     path, place = str(output), f"written to {output}"
     if isinstance(given, Observations):

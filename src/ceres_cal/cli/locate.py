@@ -132,9 +132,12 @@ def _or_null(values: base.Array) -> list[list[float] | None]:
 
 
 def _why_not_located(camera: scene.Camera, pixel: base.Array, height_m: float) -> str:
+    import numpy as np
+
     radius = camera.lens.monotone_radius(camera.phi)
     if camera.rays(pixel[None])[0, 0] != camera.rays(pixel[None])[0, 0]:
-        return f"it lies past the {radius:.0f} px from the principal point where the lens has one answer"
+        reach = f"past the {radius:.0f} px from the principal point where the lens has one answer"
+        return f"it lies {reach if radius < np.inf else 'too far outside the image for the lens'}"
     if not scene.in_image(pixel, camera.image_size):
         return "it lies outside the image of {} x {} px: check its coordinates".format(*camera.image_size)
     return f"its ray does not meet the plane z = {height_m:g} m in front of the camera"

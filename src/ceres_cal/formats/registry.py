@@ -135,6 +135,8 @@ def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat
     for form in IMPORT_FORMATS.values():
         if (path.name.endswith(form.endings) if form.endings else path.is_dir()) and form.recognises(content):
             return form
+    if b'"ceres-cal/' in content[:4096]:
+        raise InputError(f"{path}: a file of ceres-cal, not of another program: give it without an import")
     raise InputError(f"{path}: of no format that is known by its ending and content: name one of {known}")
 
 

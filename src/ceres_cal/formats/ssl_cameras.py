@@ -39,7 +39,8 @@ def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
     if not given and (not all(texts) or len(set(texts)) != len(texts)):
         texts = [str(number) for number in range(len(stations))]
     if len(texts) != len(stations) or len(set(texts)) != len(texts) or not all(text.isdigit() for text in texts):
-        raise InputError(f"camera_id {given!r}: give {len(stations)} different whole numbers for {', '.join(stations)}")
+        each = f"{', '.join(stations)} a whole number from 0 on, no two alike"
+        raise InputError(f"camera_id {given!r}: give {each}")
     return tuple(map(int, texts))
 
 

@@ -79,7 +79,7 @@ def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Map
 def require_size(features: float, what: str) -> None:
     """Raise InputError where a target, or all of a file, would have more than MOST_FEATURES."""
     if not features <= MOST_FEATURES:
-        raise InputError(f"{what}: at most {MOST_FEATURES} points and curves, not {features:.3g}: split it")
+        raise InputError(f"{what}: at most {MOST_FEATURES} points and curves, not {features:.0f}: split it")
 
 
 class Grid(Struct, frozen=True):
