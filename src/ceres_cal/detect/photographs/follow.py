@@ -240,7 +240,11 @@ class Tracker:
             return followed
         curves = [name for name in whole.curves if name not in followed.built.aside_m]
         left = replace(whole, curves=curves, target=followed.target)
-        return whole.without_aside(left.with_best_lens(followed))
+        there = whole.without_aside(left.with_best_lens(followed))
+        if followed.camera.aspect == 1.0 or there.is_field:
+            return there
+        stretched = whole.without_aside(left.with_best_lens(followed, is_stretched=True))
+        return stretched if stretched.is_field else there
 
     def as_drawn(self, other: Followed) -> Followed:
         """What looks like another field, or the one that is drawn, where all of its lines are there as well.
@@ -256,15 +260,19 @@ class Tracker:
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
     def told(self, followed: Followed) -> Followed:
-        """The same refined, with square pixels; unless these suit clearly worse, by other dimensions as well, than the
-        field in a picture that was stretched one way.
+        """The same refined, with square pixels; unless it is the field in a picture that was stretched one way, and
+        square pixels suit clearly worse, by other dimensions as well, or show no field and no other dimensions either.
         """
         square = self.squared(followed)
-        if self._suits_worse(square, followed):
-            stretched = self.refined(followed)
-            if stretched.is_field and self._suits_worse(self._with(square).as_built(square)[1], stretched):
-                return stretched
-        return self.refined(square)
+        even = self.refined(square)
+        if even.is_field and not self._suits_worse(square, followed):
+            return even
+        stretched = self.refined(followed)
+        if not stretched.is_field:
+            return even
+        built, nearest = self._with(square).as_built(square)
+        is_another = even.is_field or (built.dimensions and not built.aside_m)
+        return even if is_another and not self._suits_worse(nearest, stretched) else stretched
 
     def _suits_worse(self, one: Followed, other: Followed) -> bool:
         """Whether less paint is found where one has the lines than where another has them, or it lies off that."""
@@ -319,14 +327,15 @@ class Tracker:
             built = as_built(nearest.lines, nearest.camera, target, self.free.priors)
         return built, nearest
 
-    def with_best_lens(self, followed: Followed) -> Followed:
+    def with_best_lens(self, followed: Followed, *, is_stretched: bool = False) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
 
         A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
         does so where nothing was measured.
         """
         lengths = tuple(prior for prior in self.free.priors if prior.dimension)
-        best = best_fit(followed.camera, self._observed(followed.lines, followed.camera), lengths)
+        observed = self._observed(followed.lines, followed.camera)
+        best = best_fit(followed.camera, observed, lengths, is_stretched=is_stretched)
         if best is None:
             return followed
         camera, target = best.station(), best.targets[TARGET]
@@ -377,16 +386,17 @@ class Tracker:
         )
 
 
-def best_fit(camera: Camera, observations: Observations, lengths: tuple[Prior, ...] = ()) -> Calibration | None:
+def best_fit(
+    camera: Camera, observations: Observations, lengths: tuple[Prior, ...] = (), *, is_stretched: bool = False
+) -> Calibration | None:
     """The calibration of one view with the kind of lens that suits it best, from a camera near by.
 
-    Pixels are square where this camera's are, or where they suit the view nearly as well.
+    Pixels are square where this camera's are, or where they suit the view nearly as well and it is not stretched.
     """
     # Times the noise with other pixels: 1.00 to 1.07 where a court was drawn a millimetre off, 1.18 where a photograph
-    # of worn lines was stretched by 4 %, 7 where a clear one was by 7 %. With 1.12 a board painted by hand, whose other
-    # lines hide what a stretched picture does, was refused in 6 of 8 pictures that differ by noise; so in 5 of 12.
-    nearly = 1.05
-    fits = _fits(_squared(camera), observations, lengths)
+    # of worn lines was stretched by 4 %, 7 where a clear one was by 7 %.
+    nearly = 1.12
+    fits = [] if is_stretched else _fits(_squared(camera), observations, lengths)
     if camera.aspect != 1.0:
         fits += [(nearly * off, found, own) for off, found, own in _fits(camera, observations, lengths)]
     order = sorted(fits, key=lambda fit: (fit[1].station().folds, fit[0]))
