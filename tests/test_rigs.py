@@ -16,10 +16,13 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.detect.images import read_grey
 from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.same_frame import with_same_frames
-from ceres_cal.problem.parameters import Options, Station
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Estimate, Options, Station
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.targets import Target, checkerboard
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.same_labels import with_same_labels
@@ -189,6 +192,14 @@ def _opencv_corners(path: Path) -> np.ndarray:
     return np.asarray(cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), (3, 100, 1e-6)), dtype=float)
 
 
+def test_a_camera_of_which_nothing_is_left_gets_the_same_kind_of_lens() -> None:
+    """Where all of its observations had been taken out, it kept the lens before: "unexpected KeyError: 'a2'"."""
+    sights = gather_sights(_rig(checkerboard(5, 4, 0.1), 2).of_station("left"))
+    there = Estimate({"left": _LEFT, "right": _LEFT}, _STATIONS, {}, EXACT)
+    seen = seen_through(there, Options(lens="radial"), profiles_of(there, sights))
+    assert {name: camera.lens.kind for name, camera in seen.cameras.items()} == {"left": "radial", "right": "radial"}
+
+
 # ---- as typed -------------------------------------------------------------------------------------------------------
 
 
@@ -210,3 +221,31 @@ def test_join_as_typed(say: Say, tmp_path: Path) -> None:
     data = json.loads(say("join", *paths, "--same-frame", "index", "-o", tmp_path / "i.json", "--json").out)
     assert data["moments_by_cameras"] == {"2": 11} and data["turned"] == [["right", "0005"]]
     assert "no pattern fits" in refused(say("join", *paths, "--same-frame", "up*", "-o", joined))
+
+
+def test_run_makes_the_labels_of_a_camera_upside_down_agree(
+    say: Say, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A board of 5 x 3 corners: without it the second camera missed half of its observations by more than 24 px."""
+
+    def calibrated(*given: object) -> None:
+        raise InputError(f"calibrate {given[-1]}")
+
+    monkeypatch.setattr("ceres_cal.cli.run._calibrated", calibrated)
+    squares = np.kron(np.indices((4, 6)).sum(axis=0) % 2, np.ones((20, 20)))
+    board = np.pad(255 * squares, 20, constant_values=255).astype(np.uint8)
+    for number, turns in enumerate([(0.5, 0.2), (-0.4, 0.4), (0.1, -0.6)]):
+        for side, shift in (("left", 30.0), ("right", -30.0)):
+            rotation = rotation_exp([*turns, 0.1])
+            plane = np.column_stack([rotation[:, :2], rotation @ [-80.0, -60.0, 0.0] + [shift, 0.0, 400.0]])
+            lens = np.array([[500.0, 0.0, 159.5], [0.0, 500.0, 119.5], [0.0, 0.0, 1.0]])
+            image = cv2.warpPerspective(board, lens @ plane, (320, 240), borderValue=128)
+            (tmp_path / "rig" / side).mkdir(parents=True, exist_ok=True)
+            image = cv2.GaussianBlur(image, (0, 0), 0.7)
+            cv2.imwrite(str(tmp_path / "rig" / side / f"{number}.png"), image[::-1, ::-1] if side == "right" else image)
+    joined, out = tmp_path / "out" / "rig.json", tmp_path / "out"
+    assert f"calibrate ['{joined}']" in refused(
+        say("run", tmp_path / "rig", "--board", "5x3x20mm", "-o", out, "--quiet")
+    )
+    seen = combine([Observations.load(out / side / "board.json") for side in ("left", "right")])
+    assert with_same_labels(seen).turned and not with_same_labels(Observations.load(joined)).turned

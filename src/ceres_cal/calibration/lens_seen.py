@@ -187,11 +187,10 @@ _KEPT = 1.5  # times the squares that normal equations promise: what leaves more
 
 
 def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
-    """What each camera's lens does, as far as it was observed."""
-    return {
-        name: LensProfile.of(camera := estimate.cameras[name], sights.of_camera(name).about(camera).reach_px)
-        for name in sights.cameras
-    }
+    """What each camera's lens does, as far as it was observed; over its picture where all it showed was taken out."""
+    seen = {name: sights.of_camera(name).about(estimate.cameras[name]).reach_px for name in sights.cameras}
+    every = estimate.cameras.items()
+    return {name: LensProfile.of(camera, seen.get(name, camera.corner_radius)) for name, camera in every}
 
 
 def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, LensProfile]) -> Estimate:
@@ -314,7 +313,7 @@ class InlierRows(Frozen):
     def _near_best(self, forms: tuple[Form, ...], problem: Problem, estimate: Estimate) -> Kind:
         whole = bool(_placed(self.sights).any())
         normals = group_normals(problem, estimate, self._groups, problem.private if whole else frozenset())
-        reach_px = {name: profile.reach_px for name, profile in self._profiles.items()}
+        reach_px = {name: self._profiles[name].reach_px for name in self.sights.cameras}
         return Kind(forms, estimate, normals, self._sigma_px, reach_px)
 
     @cached_property

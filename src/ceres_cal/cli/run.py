@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ceres_cal import base, detect, formats
+from ceres_cal import base, detect, formats, scene, start
 from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError, each_camera, images_and_videos, replace
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
@@ -73,7 +73,12 @@ def _run(args: RunArguments) -> Document:
         base.make_folder(one.output)
     images = [_photographs(one) for one in cameras]
     steps = [step for one, own in zip(cameras, images, strict=True) for step in _seen_by(one, own, len(cameras) > 1)]
-    calibrated = _calibrated(args, cameras, [step.data for step in steps if "output" in step.data])
+    detected = [step.data for step in steps if "output" in step.data]
+    observations = [str(data["output"]) for data in detected]
+    if len(cameras) > 1 and _is_named_by_chance(args.board):
+        steps.append(_attempted(args, "join", [*observations, "-o", str(args.output / "rig.json")]))
+        observations = [str(steps[-1].data["output"])] if steps[-1].data else observations
+    calibrated = _calibrated(args, cameras, detected, observations)
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
@@ -198,8 +203,17 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
         yield _step(args, "detect field", asked, most=1)
 
 
-def _calibrated(args: RunArguments, cameras: Sequence[RunArguments], detected: Sequence[dict[str, Any]]) -> _Step:
-    observations = [data["output"] for data in detected]
+def _is_named_by_chance(board: str | None) -> bool:
+    """Whether a board looks the same turned by half a turn, so that each camera may name its corners otherwise."""
+    return board is not None and len(start.symmetries(scene.checkerboard(*arguments.parse_board(board)))) > 1
+
+
+def _calibrated(
+    args: RunArguments,
+    cameras: Sequence[RunArguments],
+    detected: Sequence[dict[str, Any]],
+    observations: Sequence[str],
+) -> _Step:
     priors = arguments.repeated("--prior", args.prior)
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
     seen = [(one, *images_and_videos(one.images)) for one in cameras]
