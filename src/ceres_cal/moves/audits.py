@@ -14,20 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import (
-    IN_A_METRE,
-    Array,
-    CalibrationError,
-    InputError,
-    Pose,
-    at_height,
-    attempt,
-    checked,
-    numerical,
-    short,
-    upper_tail,
-)
+from ceres_cal.base import Array, CalibrationError, InputError, Pose, at_height, attempt, checked, numerical, upper_tail
 from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.words import IN_A_METRE, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import Agreement, Agreements, MapChange, Misfit, change_of, field_grids

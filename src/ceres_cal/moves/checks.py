@@ -51,9 +51,6 @@ _INLIER_SIGMA = 3.5
 _LEAST_SHARE = 0.5
 # Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
 _USUAL_EQUATIONS = 4.0
-# Times as wide as it was known is a lens that is solved for: where it has changed, its misfit is no noise. At 30 it
-# runs along what new observations hardly tell until nothing is linear; 3 of 15 unmoved cameras have changed then.
-_LOOSE = 3.0
 
 
 @checked
@@ -125,7 +122,10 @@ class _CheckCase(Frozen):
     @property
     def loosened(self) -> _CheckCase:
         """The intrinsics known hardly at all: enough to keep a solve from running away along a valley."""
-        scale = [_LOOSE if key.kind == "camera" else 1.0 for key in self.prior.keys]
+        # Where a lens has changed, its misfit is no noise. At 30 times it runs along what new observations hardly tell
+        # until nothing is linear, and 3 of 15 unmoved cameras have changed.
+        times = 3.0
+        scale = [times if key.kind == "camera" else 1.0 for key in self.prior.keys]
         return replace(self, prior=self.prior.widened(np.array(scale)))
 
     def problem(self, used: Sights, freed: Collection[Key] = (), noise: float = 1.0) -> Problem:

@@ -8,19 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import (
-    ROBOT_TOP_M,
-    Frozen,
-    brief,
-    checked,
-    each,
-    for_small_matrices,
-    numerical,
-    replace,
-    short,
-    text_of,
-)
+from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_matrices, numerical, replace, text_of
 from ceres_cal.base.errors import InputError, StepProgress
+from ceres_cal.base.words import short
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, still
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
