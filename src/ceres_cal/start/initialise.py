@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, numerical
+from ceres_cal.base.arrays import Array, Indices, median, numerical
 from ceres_cal.base.errors import attempt
 from ceres_cal.base.frozen import Frozen, replace
 from ceres_cal.base.transforms import Pose
@@ -21,7 +21,6 @@ from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
 from ceres_cal.problem.priors import ANY_PHI
 from ceres_cal.problem.quantities import PHI_RANGE
-from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     RADII,
@@ -32,7 +31,7 @@ from ceres_cal.start.closed_forms import (
     poses_from_homographies,
 )
 from ceres_cal.start.planes import Homographies, profile_and_homographies
-from ceres_cal.start.world import Placed, beforehand, chained_poses, placed
+from ceres_cal.start.world import CameraPlace, Placed, beforehand, chained_poses, left_of, placed
 
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
@@ -68,31 +67,34 @@ def initialise(sights: Sights, options: Options) -> Start:
     least_sigmas, better = 5.0, 0.75  # that are left; share of them: a wrong quarter leaves 1.3 to 20 times as many
     share = 0.22  # of the picture's size, from its middle
     observations = sights.observations
-    start = _initialised(sights, options)
+    start, places = _initialised(sights, options)
     for name, size in observations.cameras.items():
         own = sights.numbers(camera=name)
         stated = [one.quantity for one in (*observations.priors, *options.priors) if one.name == name]
         known = {"principal_point", "cx", "cy"} & {*stated, *options.fixed}
         if known or any(sights.keys[number].placement is not None for number in own):
             continue
-        least, given = better * _left(sights.take(own), start), options
+        least, given = better * _left(sights, own, start, places), options
         for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_sigmas else ():
             there = Prior("camera", name, "principal_point", (x * size[0], y * size[1]), (1.0, 1.0))
             moved = replace(given, priors=(*given.priors, there))
             other = attempt(partial(_initialised, sights, moved))  # quiet: it is one of five
-            if isinstance(other, Start) and (left := _left(sights.take(own), other)) < least:
-                start, least, options = other, left, moved
+            if isinstance(other, tuple) and (left := _left(sights, own, *other)) < least:
+                (start, _), least, options = other, left, moved
     return start
 
 
-def _left(sights: Sights, start: Start) -> float:
-    """The median of what a start leaves of all that these sights hold, in stated sigmas."""
-    points, curves = residuals(sights, start.estimate).lengths
-    points, curves = points[sights.point_rows] / sights.sigma_px, curves[sights.curve_rows] / sights.curve_sigma_px
-    return float(np.median(np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)))
+def _left(sights: Sights, own: Indices, start: Start, places: Mapping[int, CameraPlace]) -> float:
+    """The median of what a start leaves of all that a camera's own sights hold, in stated sigmas: by the profile that
+    it found. The paper's lens, which stands in its place until one is chosen, may be off by more than a wrong quarter.
+    """
+    one = sights.take(own)
+    seen = one.about(start.estimate.cameras[one.cameras[0]])
+    return median(np.concatenate([left_of(seen[i], places[number]) for i, number in enumerate(own.tolist())]))
 
 
-def _initialised(sights: Sights, options: Options) -> Start:
+def _initialised(sights: Sights, options: Options) -> tuple[Start, Mapping[int, CameraPlace]]:
+    """A start, and from where each sight of the world is seen there."""
     posed = posed_sights(sights, options)
     stations, placements = chained_poses(sights, posed.numbers, posed.poses, open_numbers=posed.open)
     structure = options.structure_of(sights.observations.targets)
@@ -105,7 +107,7 @@ def _initialised(sights: Sights, options: Options) -> Start:
         )
         for key, pose, camera in posed.others
     )
-    return Start(estimate, posed.phi_from, others=others)
+    return Start(estimate, posed.phi_from, others=others), posed.places
 
 
 class PosedSights(Frozen):
@@ -113,6 +115,7 @@ class PosedSights(Frozen):
 
     Attributes:
         cameras, phi_from: by name. numbers: (K,) of sights. poses: (K, 3, 4) cam_from_frame.
+        places: number of a sight of the world -> where its camera stands.
         others: sights of the world that are seen alike from elsewhere: pose (3, 4) and the camera there.
         open: number of a sight -> names of what it leaves open.
     """
@@ -121,6 +124,7 @@ class PosedSights(Frozen):
     phi_from: dict[str, str]
     numbers: Indices
     poses: Array
+    places: dict[int, CameraPlace]
     others: tuple[tuple[SightKey, Array, Camera], ...]
     open: dict[int, tuple[str, ...]]
 
@@ -134,13 +138,14 @@ def posed_sights(sights: Sights, options: Options) -> PosedSights:
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
         one = _start_camera(name, blank, seen, options, [p for p in priors if _concerns(p, name, seen)])
-        there = {int(own[number]): names for number, names in one.open.items()}
-        parts.append(replace(one, numbers=own[one.numbers], open=there))
+        places, there = ({int(own[n]): value for n, value in part.items()} for part in (one.places, one.open))
+        parts.append(replace(one, numbers=own[one.numbers], places=places, open=there))
     return PosedSights(
         {name: camera for part in parts for name, camera in part.cameras.items()},
         {name: source for part in parts for name, source in part.phi_from.items()},
         np.concatenate([part.numbers for part in parts]),
         np.concatenate([part.poses for part in parts]),
+        {number: place for part in parts for number, place in part.places.items()},
         tuple(other for part in parts for other in part.others),
         {number: names for part in parts for number, names in part.open.items()},
     )
@@ -182,7 +187,8 @@ def _start_camera(name: str, blank: Camera, sights: Sights, options: Options, pr
     camera = _with_lens(blank, sights, profile, phi, options)
     numbers, stack = np.array(list(poses), dtype=np.int64), np.array(list(poses.values())).reshape(-1, 3, 4)
     lost = {n: one.open for n, one in found.items() if n not in poses}
-    return PosedSights({name: camera}, {name: phi_from}, numbers, stack, others, lost)
+    places = {n: one.places[0] for n, one in found.items()}
+    return PosedSights({name: camera}, {name: phi_from}, numbers, stack, places, others, lost)
 
 
 def _known_phi(phi: float, told: bool, unit: float, priors: Sequence[Prior]) -> tuple[float, float]:

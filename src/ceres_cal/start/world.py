@@ -81,11 +81,10 @@ def placed(
         SolutionError: only a mirrored picture of the floor holds.
     """
     bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
-    lines = _lines_of(sight, profile, known)
+    lines = _lines_of(sight, profile, known, _rows_of(sight))
     given = Candidates.none()
     if proposed is not None and np.all(np.isfinite(proposed)):
-        rotation = proposed[:, :3].T
-        given = Candidates(rotation[None], (-rotation @ proposed[:, 3])[None], np.array([log_phi]), np.zeros(1))
+        given = _candidate(proposed, log_phi)
         found = best_of(lines, given)
         if holds(lines, found):
             if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
@@ -115,7 +114,7 @@ def _searched(
 ) -> tuple[Sightlines, RadialProfile, BestCameras]:
     """`axes`: which way the picture's x and y point."""
     few = 8, 4  # points, and places of each curve, for the first rounds of a search
-    every = (_lines_of(sight, profile, known, most) for most in (_MOST, few))
+    every = (_lines_of(sight, profile, known, _rows_of(sight, most)) for most in (_MOST, few))
     lines, some = (replace(one, pixels=one.pixels * axes) for one in every)
     return lines, profile, searched(lines, some, given)
 
@@ -167,21 +166,42 @@ def _sd_of(matrix: Array, number: int) -> float:
     return float(np.sqrt(np.sum(share**2 / np.maximum(values, 1e-300))))
 
 
+def left_of(sight: Sights, place: CameraPlace) -> Array:
+    """(2 N + M,) how far from its place or curve all that a sight shows is seen, in stated sigmas; infinite where it
+    cannot be. What no lens of the options follows is not in it.
+    """
+    points, some = chosen = _rows_of(sight, (len(sight.points), len(sight.on_arc)))
+    log_phi = float(np.log(place.phi))
+    held = Beforehand(np.zeros(3), np.full(3, np.inf), (log_phi, 0.0), 0.0)
+    lines, there = _lines_of(sight, place.profile, held, chosen), _candidate(place.pose, log_phi)
+    sigma_px = np.concatenate([sight.sigma_px[points], sight.sigma_px[points], sight.curve_sigma_px[some]])
+    return np.asarray(np.where(lines.seen(there), np.abs(lines.distances(there)), np.inf)[0] / sigma_px)
+
+
+def _candidate(pose: Array, log_phi: float) -> Candidates:
+    """The one camera at cam_from_world (3, 4)."""
+    rotation = pose[:, :3].T
+    return Candidates(rotation[None], (-rotation @ pose[:, 3])[None], np.array([log_phi]), np.zeros(1))
+
+
 def _place(poses: Candidates, number: int, profile: RadialProfile) -> CameraPlace:
     rotation = poses.rotations[number].T
     pose = np.column_stack([rotation, -rotation @ poses.positions[number]])
     return CameraPlace(pose, float(np.exp(poses.log_phi[number])), profile.bent(float(poses.bend[number])))
 
 
-def _lines_of(sight: Sights, profile: RadialProfile, known: Beforehand, most: tuple[int, int] = _MOST) -> Sightlines:
-    """Some of what a sight shows, evenly."""
+def _rows_of(sight: Sights, most: tuple[int, int] = _MOST) -> tuple[Indices, Indices]:
+    """Numbers of some points of a sight and of some places of each of its curves, evenly, those of arcs last."""
     points = evenly(len(sight.points), most[0])
-    tracks = sight.track_index
-    every = (np.flatnonzero(tracks == track) for track in distinct(tracks))
-    rows = [own[evenly(len(own), most[1])] for own in every]
-    some = np.concatenate([np.empty(0, np.int64), *rows])
-    arc = sight.on_arc[some]
-    some, arcs = np.concatenate([some[~arc], some[arc]]), int(np.count_nonzero(arc))
+    every = (np.flatnonzero(sight.track_index == track) for track in distinct(sight.track_index))
+    some = np.concatenate([np.empty(0, np.int64), *(own[evenly(len(own), most[1])] for own in every)])
+    return points, some[np.argsort(sight.on_arc[some], kind="stable")]
+
+
+def _lines_of(sight: Sights, profile: RadialProfile, known: Beforehand, chosen: tuple[Indices, Indices]) -> Sightlines:
+    """Of the chosen rows, see `_rows_of`."""
+    (points, some), tracks = chosen, sight.track_index
+    arcs = int(np.count_nonzero(sight.on_arc[some]))
     starts, along = sight.tracks[tracks[some], 0], sight.tracks[tracks[some], 1].copy()
     if arcs:
         along[-arcs:] = np.column_stack([np.linalg.norm(along[-arcs:], axis=1), np.zeros((arcs, 2))])
