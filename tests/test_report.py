@@ -287,7 +287,7 @@ def test_boards_alone_tell_no_places() -> None:
     observations = simulate(scene, disturbance, seed=1).observations
     page = make_report(calibrate(observations, RADIAL), observations)
     assert headline(page) == (
-        "good: The intrinsics can be trusted, to 1.8 px in the observed part of the image. No station sees a field, "
+        "good: The intrinsics can be trusted, to 1.9 px in the observed part of the image. No station sees a field, "
         "so places in the world are not known."
     )
     assert '<figure id="map' not in page and "defines the world" in page

@@ -98,14 +98,9 @@ def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
     return np.array([order[name] for name in names], dtype=np.int64)
 
 
-def evenly(count: int, most: int, *, down: bool = False) -> Indices:
-    """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them.
-
-    Args:
-        down: the next lower ones in place of the nearest.
-    """
-    exact = np.linspace(0, max(count - 1, 0), min(count, most))
-    return (np.floor(exact + 1e-9) if down else exact.round()).astype(np.int64)
+def evenly(count: int, most: int) -> Indices:
+    """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
+    return np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64)
 
 
 @contextmanager

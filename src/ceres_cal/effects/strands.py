@@ -216,17 +216,20 @@ class StrandFamily(Frozen):
 
 @lru_cache(maxsize=256)
 def _near_and_far(count: int) -> Indices:
-    """Rows of a strand: some next to one another in its middle, and some over all of it."""
+    """Rows of a strand: all of few; else some next to one another in its middle, and some over all of it."""
     near, far = 30, 30  # rows of a strand that are looked at: next to one another, and over all of it
-    middle = max(0, (count - near) // 2)
-    return distinct(np.append(np.arange(middle, min(count, middle + near)), evenly(count, far, down=True)))
+    if count <= near + far:
+        return np.arange(count)
+    return distinct(np.append((count - near) // 2 + np.arange(near), evenly(count, far)))
 
 
 # ---- the views that are asked ---------------------------------------------------------------------------------------
 
 
-def sampled(problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation) -> Linearised | None:
-    """The equations of some views of every camera; None where there are no shared numbers.
+def sampled(
+    problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation, most_views: int
+) -> Linearised | None:
+    """The equations of at most so many views of every camera; None where there are no shared numbers.
 
     Args:
         problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
@@ -235,7 +238,7 @@ def sampled(problem: Problem, there: Residuals, estimate: Estimate, reduced: Red
     sights = _shown(problem.sights, there)
     if not len(reduced.shared.matrix) or not len(sights):
         return None
-    equations = equations_of(_some(sights), estimate, there)
+    equations = equations_of(_some(sights, most_views), estimate, there)
     weights = equation_weights(problem.weighting, equations, there).within_sigma
     return linearise_within(problem, estimate, equations, weights, reduced.shared)
 
@@ -248,11 +251,8 @@ def _shown(sights: Sights, there: Residuals) -> Sights:
     return sights.used(points, curves)
 
 
-def _some(sights: Sights) -> Sights:
-    """Of each camera some views, evenly, and of each of them some rows."""
-    # Of a camera. Which they are matters: of sixty crooked boards 84 to 99 % of places lay inside their 95 %, by 12 to
-    # 60 views; the figures of docs/accuracy.md are of these.
-    most_views = 16
+def _some(sights: Sights, most_views: int) -> Sights:
+    """Of each camera at most so many views, evenly, and of each of them some rows."""
     observations = sights.observations
     chosen, shown = np.zeros((2, len(observations.views)), dtype=bool)
     shown[observations.points.view[sights.point_rows]] = True
@@ -261,7 +261,7 @@ def _some(sights: Sights) -> Sights:
         own = (views for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera)
         views = np.array([view for views in own for view in views])
         views = views[shown[views]]
-        chosen[views[evenly(len(views), most_views, down=True)]] = True
+        chosen[views[evenly(len(views), most_views)]] = True
     wanted = set(np.flatnonzero(chosen).tolist())
     sights = sights.take(np.flatnonzero([not wanted.isdisjoint(views) for views in sights.views]))
     rows = max(np.diff(sights.point_bounds).max(), np.diff(sights.curve_bounds).max())
@@ -277,7 +277,7 @@ def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
     for number in np.flatnonzero(np.bincount(view[rows], minlength=len(chosen)) > _MOST_ROWS):
         own = np.flatnonzero(view == number)
         rows[own] = False
-        rows[own[evenly(len(own), _MOST_ROWS, down=True)]] = True
+        rows[own[evenly(len(own), _MOST_ROWS)]] = True
     return rows
 
 
