@@ -243,7 +243,7 @@ def test_a_height_measured_after_a_move_is_tested() -> None:
 def test_a_height_that_no_calibration_comes_out_of_is_refused() -> None:
     """The height is blamed, not the labels."""
     with pytest.raises(
-        SolutionError, match=r"the stated height of station 'overhead', 150.*say 3.970 ± 0.053 m.*sigmas apart"
+        SolutionError, match=r"the stated height of station 'overhead', 150.*say 3.969 ± 0.053 m.*sigmas apart"
     ):
         calibrate(seen(), under(height(150.0, 5e-6 * 150.0)))
 

@@ -217,10 +217,10 @@ class StrandFamily(Frozen):
 @lru_cache(maxsize=256)
 def _near_and_far(count: int) -> Indices:
     """Rows of a strand: all of few; else some next to one another in its middle, and some over all of it."""
-    near, far = 30, 30  # rows of a strand that are looked at: next to one another, and over all of it
-    if count <= near + far:
+    each = 30  # rows of a strand that are looked at: next to one another, and over all of it
+    if count <= each + each:
         return np.arange(count)
-    return distinct(np.append((count - near) // 2 + np.arange(near), evenly(count, far)))
+    return distinct(np.append((count - each) // 2 + np.arange(each), evenly(count, each)))
 
 
 # ---- the views that are asked ---------------------------------------------------------------------------------------

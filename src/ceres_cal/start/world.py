@@ -20,7 +20,10 @@ from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import BestCameras, apart, best_of, information, searched
 from ceres_cal.start.sightlines import Beforehand, Candidates, Sightlines
 
-_MOST = (20, 12)  # points, and places of each curve, beyond which a start learns nothing more
+_MOST = (20, 12)  # points, and places of each curve, by which a camera is searched for
+# Times as many, by which the best come to their minima: by these or other twelve of a curve a wide lens' field was found
+# or lost, and phi was told or guessed.
+_FINALLY = 16
 _HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
 _SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
 _ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
@@ -88,8 +91,8 @@ def placed(
         found = best_of(lines, given)
         if holds(lines, found):
             if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
-                found = replace(found, poses=given, costs=found.costs[:1])
-            return _answered(lines, profile, found)
+                return _answered(lines, profile, replace(found, poses=given, costs=found.costs[:1]))
+            return _answered(*_at_rest(sight, lines, profile, found))
     known = replace(known, bend_sd=bend_sd if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
     profiles = (profile, none) if may_bend else (profile,)
@@ -106,7 +109,17 @@ def placed(
                 f"station {sight.keys[0].station!r}: what it sees of the floor is a mirrored picture: x and y are "
                 "swapped, or y points upwards, or left and right are exchanged in the labels: correct the observations"
             )
-    return _answered(lines, chosen, found)
+    return _answered(*_at_rest(sight, lines, chosen, found))
+
+
+def _at_rest(
+    sight: Sights, lines: Sightlines, profile: RadialProfile, found: BestCameras
+) -> tuple[Sightlines, RadialProfile, BestCameras]:
+    """The best places and what fits alike, by nearly all rows of a sight in place of some."""
+    most_places = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
+    alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
+    every = _lines_of(sight, profile, lines.known, _rows_of(sight, (_FINALLY * _MOST[0], _FINALLY * _MOST[1])))
+    return every, profile, best_of(every, found.poses.take(np.array(alike[:most_places])))
 
 
 def _searched(
@@ -122,11 +135,9 @@ def _searched(
 def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> Placed:
     """With what the best place leaves open, and the others that fit alike."""
     finest_px = 1e-2  # of a scale: exact data are told no better
-    most_places = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, finest_px)
     matrix = information(lines, best, scale)
-    alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
-    places = tuple(_place(found.poses, number, profile) for number in alike[:most_places])
+    places = tuple(_place(found.poses, number, profile) for number in apart(found.poses, found.costs, _APART))
     return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
