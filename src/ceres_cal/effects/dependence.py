@@ -206,9 +206,6 @@ def _root_of(rising: Callable[[float], float], low: float, high: float) -> float
 # Share of the largest variance of a score: what is below is rounding. Of a direction that priors alone know it was
 # 3e-10, and rounding of that made a standard deviation four times too large. Nothing changes up to a thousandfold.
 _DETERMINED = 1e-9
-# Views of a camera that are asked whether anything goes together, and where it likely does, how far: by other 16 of 60
-# or 120 views of a crooked lens the 95 % intervals were by up to a quarter shorter or longer, and held 65 to 100 %.
-_MOST_VIEWS = 16, 64
 _LIKELY = 0.5  # probability from which on a cause is named
 _OVER = {"points": "errors are correlated between a target's points", "curves": "errors are correlated along lines"}
 
@@ -295,8 +292,11 @@ def measure_scatter(
         problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
             problem says there.
     """
+    # Views of a camera that are asked whether anything goes together, and where it likely does, how: by other 16 of 60 or
+    # 120 views of a crooked lens the 95 % intervals were by up to a quarter shorter or longer, and held 65 to 100 %.
+    few, many = 16, 64
     scatter = None
-    for most_views in _MOST_VIEWS:
+    for most_views in (few, many):
         model = sampled(problem, there, estimate, reduced, most_views)
         if model is None or not model.root.shape[1]:
             return None

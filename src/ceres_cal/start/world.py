@@ -21,9 +21,6 @@ from ceres_cal.start.search import BestCameras, apart, best_of, information, sea
 from ceres_cal.start.sightlines import Beforehand, Candidates, Sightlines
 
 _MOST = (20, 12)  # points, and places of each curve, by which a camera is searched for
-# Times as many, by which the best come to their minima: by these or other twelve of a curve a wide lens' field was found
-# or lost, and phi was told or guessed.
-_FINALLY = 16
 _HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
 _SCALES = 8.0  # of the residuals, within which a row lies near: no clean one is farther
 _ROUGH = 0.01  # of the half diagonal, beyond which no row lies near, whatever the scale: a wrong place has a large one
@@ -118,7 +115,9 @@ def _at_rest(
     """The best places and what fits alike, by nearly all rows of a sight in place of some."""
     most_places = 5  # handed on: along a valley there are as many as were tried, and the solve goes down it from any
     alike = [n for n in apart(found.poses, found.costs, _APART) if found.costs[n] <= found.costs[0] + _ALIKE]
-    every = _lines_of(sight, profile, lines.known, _rows_of(sight, (_FINALLY * _MOST[0], _FINALLY * _MOST[1])))
+    # By these or other twelve places of a curve a wide lens' field was found or lost, and phi was told or guessed.
+    times = 16  # as many as it is searched for by
+    every = _lines_of(sight, profile, lines.known, _rows_of(sight, (times * _MOST[0], times * _MOST[1])))
     return every, profile, best_of(every, found.poses.take(np.array(alike[:most_places])))
 
 
