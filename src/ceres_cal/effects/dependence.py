@@ -292,8 +292,8 @@ def measure_scatter(
         problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
             problem says there.
     """
-    # Views of a camera that are asked whether anything goes together, and where it likely does, how: by other 16 of 60 or
-    # 120 views of a crooked lens the 95 % intervals were by up to a quarter shorter or longer, and held 65 to 100 %.
+    # Views of a camera that are asked whether anything goes together, and where it likely does, how: by other 16 of 60
+    # or 120 views of a crooked lens the 95 % intervals were by up to a quarter shorter or longer, and held 65 to 100 %.
     few, many = 16, 64
     scatter = None
     for most_views in (few, many):
