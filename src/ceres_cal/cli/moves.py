@@ -152,6 +152,7 @@ def _scored(answer: moves.Agreements, before: Calibration) -> Document:
     ratios = dict(zip(("points", "curves"), cameras[0].misfit.noise, strict=True))
     known = [f"noise of {kind} {ratio:.2f} times the calibration's" for kind, ratio in ratios.items() if ratio == ratio]
     numbers = {
+        "holds": answer.holds,
         "fit": posed.fit,
         "rms_px": posed.fit.rms_px,
         "calibration_rms_px": before.fit.rms_px,
@@ -161,8 +162,7 @@ def _scored(answer: moves.Agreements, before: Calibration) -> Document:
     parts = {"cameras": list(map(_misfit_data, cameras)), "views": list(map(_misfit_data, views))}
     return Document(
         (
-            Section("score", [f"{one.name} {one.words}" for one in cameras], {"holds": answer.holds}),
-            Section("noise", ["intrinsics held, poses alone solved for", *known], numbers),
+            Section("score", [*(f"{one.name} {one.words}" for one in cameras), *known], numbers),
             *(Section("camera", [f"{one.name}: {_left(one)}"]) for one in cameras),
             Section("worst", worst, parts),
         )
