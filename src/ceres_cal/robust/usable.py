@@ -41,11 +41,11 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
         met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
         met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
         if 2 * met < len(own.point_rows) + len(own.curve_rows):
-            raise SolutionError(
-                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
-                "check labels, target dimensions and which lens it is, or show more of the targets",
-                name,
-            )
+            count, checks = own.equations, "check labels, target dimensions and which lens it is"
+            few = count < 4 * (len(camera.lens.values) + 10)  # of a camera with its pose: too few to tell
+            what = f"show it more of the targets, which it has only {count} numbers of, or {checks}" if few else checks
+            missed = f"the best solution misses half of its observations by more than {limit_px:.0f} px"
+            raise SolutionError(f"camera {name!r}: {missed}: {what}", name)
 
 
 def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -> None:
