@@ -195,7 +195,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         if chosen.choice.chosen != before.choice.chosen:
             seen, chosen = chosen.first_solved(seen_with, simple, start)
     said = []
-    while chosen.among is not None and (other := chosen.among.instead(*seen.outlier_masks)):
+    while chosen.among is not None and (other := chosen.among.instead(seen.outlier_masks, seen.scales)):
         # reads: "another lens explains observations that were taken out, ..."
         found = attempt(partial(seen_with, other))
         if isinstance(found, CalibrationError):

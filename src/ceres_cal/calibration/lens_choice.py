@@ -160,17 +160,17 @@ class Comparison(Frozen):
         start = replace(start, estimate=near, is_near=not form.blank.roughness, others=others)
         return Chosen(form.of(self.seen.options), start, _choice(self), self)
 
-    def instead(self, points: Mask, curves: Mask) -> Chosen | None:
+    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float]) -> Chosen | None:
         """The lens in place of the chosen one, where others explain what it takes out of the observations; None where
         none does. Of very many observations some were compared, and the rest is not looked at. What predicts clearly
         better, a lens without a formula, stays.
 
         Args:
-            points, curves: (N,), (M,) the observations that it takes out.
+            taken_out: (N,), (M,) the observations that it takes out. scales: of the noise beside it.
         """
         if self.share < 1.0 or self.chosen.form.blank.roughness:
             return None
-        if not explained_by_another(self.seen, self.tried, self.chosen, points, curves):
+        if not explained_by_another(self.seen, self.tried, self.chosen, taken_out, scales):
             return None
         found = self._excluding(lambda one: one is self.chosen, _EXPLAINED)
         return None if found is None else found.outcome

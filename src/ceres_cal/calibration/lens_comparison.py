@@ -42,34 +42,39 @@ _PRICE = 13.0
 
 
 def explained_by_another(
-    seen: InlierRows, tried: Sequence[Candidate], chosen: Candidate, points: Mask, curves: Mask
+    seen: InlierRows,
+    tried: Sequence[Candidate],
+    chosen: Candidate,
+    taken_out: tuple[Mask, Mask],
+    scales: tuple[float, float],
 ) -> bool:
     """Whether another lens explains so much of what the chosen one takes out that it is the likelier one.
 
     Args:
-        points, curves: (N,), (M,) what the chosen one takes out of all observations.
+        taken_out: (N,), (M,) what the chosen one takes out of all observations. scales: of its noise; by a larger one
+            another lens would explain what the chosen one leaves no larger, but knows to be no noise.
     """
     sights = seen.sights
-    out = points[sights.point_rows], curves[sights.curve_rows]
+    out = taken_out[0][sights.point_rows], taken_out[1][sights.curve_rows]
     if not (out[0].any() or out[1].any()):
         return False
     price = float(np.log(sights.equations))
     for other in tried:
         if other is chosen or other.squares is None:
             continue
-        explained = _explained(seen, other, out) or 0
+        explained = _explained(seen, other, out, scales) or 0
         if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
             return True
     return False
 
 
 @or_none  # quiet: a lens that cannot be solved for explains nothing
-def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask]) -> int:
+def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask], scales: tuple[float, float]) -> int:
     """How many equations of what is taken out a lens explains, less those that would be taken out instead."""
     # Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
     explained = 3.0
     farthest = seen.options.reject_sigma
-    points, curves = seen.in_sigmas(seen.solved_near(other))
+    points, curves = seen.in_sigmas(seen.solved_near(other), scales)
     count = 0
     for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
         count += equations * int(np.count_nonzero(own & (off < explained)))

@@ -258,13 +258,14 @@ class InlierRows(Frozen):
         """Whether placements are too few to be held out whole."""
         return any(key.placement for key in self.sights.keys) and not _placed(self.sights).any()
 
-    def in_sigmas(self, estimate: Estimate) -> tuple[Array, Array]:
-        """(N, 2), (M,) residuals of points and curve observations, in standard deviations.
+    def in_sigmas(self, estimate: Estimate, scales: tuple[float, float] | None = None) -> tuple[Array, Array]:
+        """(N, 2), (M,) residuals of points and curve observations, in standard deviations, by these scales of the noise
+        or those of the solve.
 
         Raises:
             DegenerateError: something is not seen.
         """
-        there, sights, scales = self._shown(estimate), self.sights, self.end.problem.weighting.scales
+        there, sights, scales = self._shown(estimate), self.sights, scales or self.end.problem.weighting.scales
         points = there.points[sights.point_rows] / (scales[0] * sights.sigma_px[:, None])
         return points, there.curves[sights.curve_rows] / (scales[1] * sights.curve_sigma_px)
 

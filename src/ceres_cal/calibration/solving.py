@@ -107,6 +107,11 @@ class Explained(Frozen):
         return self.came_out.outlier_masks(self.problem.observations)
 
     @property
+    def scales(self) -> tuple[float, float]:
+        """Of the noise of points and curves."""
+        return self.end.problem.weighting.scales
+
+    @property
     def came_out(self) -> Calibration:
         """The calibration, not assessed."""
         if self.digest is not None:
