@@ -128,6 +128,7 @@ def test_another_zoom_or_focus_is_named(calibration: Calibration) -> None:
     focused = replace(CAMERA, lens=Radial((-4.2e-5, 6.1e-7)))
     found = check(calibration, lines(HOME, 7, NOISE, focused))["overhead"]
     assert not found.holds and found.cause == "iris" and "another iris or focus" in found.words
+    assert _checked_station(found).data["stations"]["overhead"]["cause"] == "iris"  # in the JSON of the command, too
 
 
 def test_without_a_field_to_map_the_movement_alone_is_said(calibration: Calibration) -> None:

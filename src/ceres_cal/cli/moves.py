@@ -87,7 +87,7 @@ def _photographed(
 def _checked_station(one: moves.Agreement) -> Section:
     lines, change, misfit = [f"{one.name} {one.words}"], one.change, one.misfit
     used, noise = misfit.points + misfit.curves, misfit.noise[0]
-    data = {name: getattr(one, name) for name in ("holds", "probability", "statistic", "degrees", "words")}
+    data = {name: getattr(one, name) for name in ("holds", "cause", "probability", "statistic", "degrees", "words")}
     data |= {"station": one.name, "used": used, "outliers": misfit.outliers, "noise": noise}
     sizes: dict[str, float | None] = dict.fromkeys(("moved_mm", "turned_deg", "phi_change", "shift_px"))
     maps = [(height_m, math.nan, math.nan) for height_m in HEIGHTS_M]
