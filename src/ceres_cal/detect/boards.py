@@ -200,11 +200,10 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
         if (seen := look(levels, columns, rows)) is None:
             continue
         one = right_handed(seen), measure_saddles(image, right_handed(seen))
-        if not (_is_even(seen) and is_whole(image, one[1])):
-            continue
-        found.append(one)
-        if not np.isnan(found[-1][1].contrast).any():
-            break
+        if _is_even(seen) and is_whole(image, one[1]):
+            found.append(one)
+            if not np.isnan(one[1].contrast).any():
+                break
     if not found and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
         return _placing(part_of_board(image, seed, columns, rows))
     if not found:
