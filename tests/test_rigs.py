@@ -200,6 +200,19 @@ def test_a_camera_of_which_nothing_is_left_gets_the_same_kind_of_lens() -> None:
     assert {name: camera.lens.kind for name, camera in seen.cameras.items()} == {"left": "radial", "right": "radial"}
 
 
+def test_exchanged_frames_take_out_no_others() -> None:
+    """As displaced views they spoke for a principal point that moves by 60 px, and half of all was taken out."""
+    seen = _rig(checkerboard(9, 6, 0.1))
+    views = list(seen.views)
+    at = [n for n, v in enumerate(views) if v.station == "right" and v.frame in ("board_05", "board_08")]
+    for here, there in (at, at[::-1]):
+        views[here] = replace(seen.views[here], frame=seen.views[there].frame, placement=seen.views[there].placement)
+    calibration = calibrate(replace(seen, views=tuple(views)))
+    assert np.array_equal(calibration.outlier_masks(seen)[0], np.isin(seen.points.view, at))
+    (pair,) = calibration.uncertainty.rig
+    assert abs(pair.baseline_m - _BASELINE_M) < 3.0 * pair.baseline_sd_m < 1e-3
+
+
 # ---- as typed -------------------------------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@ of boards; but without them lenses predict other views worse.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 
@@ -117,7 +117,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
     estimate = end.estimate
 
     def seen(some: Problem, there: Estimate = estimate) -> tuple[Equations, Weights]:
-        return _equations(there, end.residuals, end.weights_of, before, some)
+        return _equations(there, end.residuals, end.weights_of, before, some, problem.private)
 
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
@@ -147,7 +147,8 @@ def without_unsteadiness(
         return problem
     there = residuals(problem.sights, estimate)
     weights_of = partial(equation_weights, problem.weighting, there=there, taking_part=taking_part)
-    model = make_linear_model(problem, estimate, *_equations(estimate, there, weights_of, None, problem))
+    speaking = _equations(estimate, there, weights_of, None, problem, problem.private)
+    model = make_linear_model(problem, estimate, *speaking)
     return _predicted(model, problem, estimate, sizes, 1.0).taken_off(problem)
 
 
@@ -157,16 +158,19 @@ def _equations(
     weights_of: Callable[[Equations], Weights],
     before: Unsteady | None,
     problem: Problem,
+    seen_once: Collection[str | None],
 ) -> tuple[Equations, Weights]:
     """Of a problem's sights, with the residuals `before` anything was taken off; views that were taken out as a whole
-    speak again, for they may be those that are displaced most. What takes part counts whole: a robust weight is that of
-    an observation whose view is displaced.
+    speak again, for they may be those that are displaced most. Of a placement that is not `seen_once` another camera
+    says where it is, and what contradicts that may be of another moment. What takes part counts whole: a robust weight
+    is that of an observation whose view is displaced.
     """
     equations = write_equations(problem.sights, estimate, there)
     if before is not None:
         equations = replace(equations, residual=equations.residual - equations.along(before.displacement))
     weights = weights_of(equations)
     silent = np.bincount(equations.sight, weights.used, len(equations.bounds) - 1) == 0.0
+    silent &= [key.placement in seen_once for key in equations.sights.keys]
     used = weights.used | silent[equations.sight]
     return equations, Weights(weights.inverse_sigma, used, np.ones_like(weights.robust))
 
