@@ -112,7 +112,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("effects.evidence", "FEATURE_ASIDE.absent VIEW_ASIDE.absent OFFSETS_SCATTER.absent", "calibrate"),
     *_of("effects.evidence", "DEPENDENCE.absent", "verdicts"),
     *_of("robust.as_built", "_REPEATS", "calibrate", "diagnose"),
-    *_of("effects.evidence", "AS_BUILT.absent", "calibrate", "diagnose"),
+    *_of("effects.evidence", "AS_BUILT.absent STRETCHED.absent", "calibrate", "diagnose"),
     *_of("effects.evidence", "LIKELY", "calibrate"),
     *_of("robust.competing", "FEWEST", "calibrate"),
     *_of("problem.bundle", "_POSED", "calibrate"),

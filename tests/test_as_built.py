@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 from accuracy import accuracy
 from accuracy import scenes as accuracy_scenes
-from accuracy.as_built import CAMERAS, Board, observed, sigmas_off
+from accuracy.as_built import CAMERAS, Board, built, observed, sigmas_off
+from scenery import BoardRanges, board_scene
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects.effect import AsBuilt
-from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance, make_structure, numbers_by_kind
 from ceres_cal.scene.targets import checkerboard
+from ceres_cal.simulate import Disturbance, simulate
 
 BUILT = Options(lens="radial")
 DRAWN = replace(BUILT, as_built="as drawn")
@@ -68,6 +71,23 @@ def test_the_heights_of_corners_are_solved_for() -> None:
         assert np.max(np.abs(sigmas_off(as_built, scene))) < 4.5  # 2.8 measured
         errors.append([abs(phi_of(one) - CAMERAS["camera"].phi) for one in (as_built, drawn)])
     assert np.mean(errors, axis=0)[0] < 0.4 * np.mean(errors, axis=0)[1]  # 0.23 measured
+
+
+def test_a_board_printed_longer_one_way_leaves_its_size_open() -> None:
+    """Its columns stand 0.5 % farther apart: the baseline was off by 7 of its standard deviations."""
+    cameras = {"left": CAMERAS["camera"], "right": CAMERAS["camera"]}
+    baseline = Pose(np.eye(3), np.array([-0.12, 0.0, 0.0]))
+    stations = {"left": Station("left", Pose.identity()), "right": Station("right", baseline)}
+    drawn = checkerboard(9, 6, 0.05)
+    printed = built(drawn, Board(stretch=5e-3), 0)
+    scene = board_scene(printed, cameras, stations, 10, seed=0, held=BoardRanges((0.6, 1.2)))
+    seen = simulate(scene, Disturbance(points_sigma_px=0.1), 0).observations
+    calibration = calibrate(replace(seen, targets={"board": drawn}), BUILT)
+    (stretched,) = calibration.as_built
+    assert stretched.stretch == pytest.approx((0.005, 0.0025), rel=0.1)
+    assert stretched.words == "it is 0.48 % longer along x than along y, and its size is known to 0.24 %"
+    (pair,) = calibration.uncertainty.rig
+    assert abs(pair.baseline_m - 0.12) < 2.0 * pair.baseline_sd_m < 0.001
 
 
 def test_few_numbers_are_held_by_little() -> None:

@@ -287,6 +287,20 @@ def test_what_disturbs_does_not_hide_the_field(kind: str, seed: int) -> None:
     assert np.median(away) < 0.01  # 0.002 m at most
 
 
+def test_a_field_under_boxes_is_followed() -> None:
+    """They cover some lines wholly and leave others, as where a field is elsewhere."""
+    shot = disturbed.taken("covered", 5, FIELD)
+    floor = FIELD.point_array
+    away = [
+        np.median(
+            np.linalg.norm(camera.at(camera.cam_from_world @ turn).project(floor) - shot.camera.project(floor), axis=1)
+        )
+        for camera, grid in candidates(prepare_search(light(shot.image), FIELD, NAMES, disturbed.AUTO))
+        for turn in grid.turns
+    ]
+    assert min(away) < 5.0  # 1.5 px
+
+
 def test_lines_that_motion_makes_faint_are_seen() -> None:
     """Those across the way of the camera are a sixth as bright as those along it."""
     shot = disturbed.taken("motion", 105, FIELD)

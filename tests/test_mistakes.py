@@ -113,7 +113,10 @@ ON_THE_COMMAND_LINE = [
     ("locate CAL 640,480 --height-mm 15x", "'15x' is no length: write a number of mm, or 5m, 150mm"),
     ("calibrate OBS --prior heigth_m=4:0.01", "there is no quantity 'heigth_m': did you mean 'height_m'?"),
     ("calibrate OBS --prior height_m=4", "write OWNER.NAME=VALUE:SIGMA, such as overhead.height_m=4.02:0.01"),
-    ("calibrate OBS --tolerance field.line_m=0.01", "write TARGET.lines_m|points_m|warp_m|heights_m=SIGMA, such as"),
+    (
+        "calibrate OBS --tolerance field.line_m=0.01",
+        "write TARGET.lines_m|points_m|warp_m|heights_m|stretch_m=SIGMA, such as",
+    ),
     ("calibrate OBS --fix k3", "--fix 'k3': write NAME=VALUE, such as k3=0"),
     ("calibrate OBS -o nowhere/c.json", "there is no folder 'nowhere': make it first"),
     ("calibrate OBS --report page.pdf", "page.pdf: a report is written as .html or .htm: give one of these endings"),

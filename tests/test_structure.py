@@ -167,7 +167,7 @@ def test_what_each_number_moves() -> None:
     "tolerances, message",
     [
         ({"pitch": Tolerance(lines_m=0.01)}, "a tolerance: there is no target 'pitch'"),
-        ({"field": Tolerance(warp_m=0.01)}, "a warp or heights are for checkerboards"),
+        ({"field": Tolerance(warp_m=0.01)}, "a warp, heights or a stretch are for checkerboards"),
         ({"field": Tolerance(heights_m=0.01)}, "does not bow"),
     ],
 )

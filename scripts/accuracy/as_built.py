@@ -43,12 +43,14 @@ class Board:
     """How a board is built, and how often it is seen.
 
     Attributes:
-        points_m, bow_m, heights_m: standard deviations. views: of it. columns, rows: of its corners.
+        points_m, bow_m, heights_m: standard deviations. stretch: by what share it is longer along x. views: of it.
+        columns, rows: of its corners.
     """
 
     points_m: float = 0.0
     bow_m: float = 0.0
     heights_m: float = 0.0
+    stretch: float = 0.0
     views: int = 12
     columns: int = 9
     rows: int = 6
@@ -73,6 +75,7 @@ def built(drawn: Target, board: Board, seed: int) -> Target:
     rng, places = np.random.default_rng([seed, 5]), drawn.point_array.copy()
     low, high = drawn.box
     relative = (2.0 * places[:, :2] - low - high) / (high - low)
+    places[:, 0] *= 1.0 + board.stretch
     places[:, :2] += board.points_m * rng.standard_normal((len(places), 2))
     places[:, 2] += (1.0 - relative**2) @ (board.bow_m * rng.standard_normal(2))
     places[:, 2] += board.heights_m * rng.standard_normal(len(places))
@@ -101,7 +104,7 @@ def _both(board: Board, seed: int) -> tuple[Scene, Calibration, Calibration]:
 def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
     """The figures of one kind of board."""
     found, offs, squares, spreads = [], [], [], []
-    sigmas: dict[str, list[float]] = {"points": [], "warp": [], "heights": []}
+    sigmas: dict[str, list[float]] = {"points": [], "warp": [], "heights": [], "stretch": []}
     for scene, as_built, drawn in over(partial(_both, board), range(runs)):
         found.append(bool(as_built.as_built))
         offs.append(sigmas_off(as_built, scene))
@@ -111,7 +114,7 @@ def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
         squares.append([float(np.mean((error / widths[1]) ** 2)) for error in errors])
         for one in as_built.as_built:
             sigmas[one.kind].append(one.sigma_m)
-    flat = board.points_m == board.bow_m == board.heights_m == 0.0
+    flat = board.points_m == board.bow_m == board.heights_m == board.stretch == 0.0
     share, note = float(np.mean(found)), f"{runs} boards of {board.views} views"
     yield Row(case, "share found not as drawn", share, share_error(share, runs), 0.0, 0.1 if flat else 1.0, note)
     held = np.mean(np.abs(offs) < NORMAL_95, axis=1)
@@ -150,6 +153,7 @@ CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "bent": partial(board_rows, "bent by 1 mm", Board(bow_m=1e-3)),
     "both, few views": partial(board_rows, "both, few views", Board(2e-4, 1e-3, views=5)),
     "heights": partial(board_rows, "corners 0.5 mm high or low", Board(heights_m=5e-4)),
+    "stretched": partial(board_rows, "0.5 % longer along x", Board(stretch=5e-3)),
     "real": real_rows,
 }
 

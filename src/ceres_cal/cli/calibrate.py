@@ -214,11 +214,11 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
 
 
 def _tolerances(specs: Sequence[str]) -> dict[str, Tolerance]:
-    """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m|heights_m=SIGMA."""
+    """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m|heights_m|stretch_m=SIGMA."""
     from ceres_cal.problem.structure import Tolerance
 
     given: dict[str, dict[str, Any]] = {}
-    names = ("lines_m", "points_m", "warp_m", "heights_m")
+    names = ("lines_m", "points_m", "warp_m", "heights_m", "stretch_m")
     for spec in specs:
         left, equals, value = spec.rpartition("=")
         target, dot, what = left.strip().rpartition(".")

@@ -43,8 +43,10 @@ class AsBuilt(Frozen, eq=True):
     """By how much the features of one kind lie off a target's drawing.
 
     Attributes:
-        target, kind: "lines", "points", "warp" or "heights". sigma_m: the standard deviation that their offsets were
-            solved for under. probability: that they are off at all. rms_m: of the offsets.
+        target, kind: "lines", "points", "warp", "heights" or "stretch". sigma_m: the standard deviation that their
+            offsets were solved for under. probability: that they are off at all. rms_m: of the offsets.
+        stretch: of a board that is stretched, by what share it is longer along x than along y, and the standard
+            deviation that its size then has; None of all else.
     """
 
     target: str
@@ -52,10 +54,15 @@ class AsBuilt(Frozen, eq=True):
     sigma_m: float
     probability: float
     rms_m: float = 0.0
+    stretch: tuple[float, float] | None = None
 
     @property
     def words(self) -> str:
         """What it says, without the target."""
+        if self.stretch is not None:
+            longer, sd = self.stretch
+            sides = "x than along y" if longer > 0.0 else "y than along x"
+            return f"it is {100 * abs(longer):.2f} % longer along {sides}, and its size is known to {100 * sd:.2g} %"
         amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
         if self.kind == "heights":
             return f"its surface is uneven by {amount}"

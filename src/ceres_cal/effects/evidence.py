@@ -82,6 +82,11 @@ HEIGHTS = SizePrior(0.8, AS_BUILT.sizes)
 """Of how high a board's points lie beside its bows. A few distant views say nothing of that, so even odds would be left
 as they are, and taken for waves by two of twelve flat boards. Of eight public sets seven say it at a probability of 1.
 """
+STRETCHED = SizePrior(0.8, tuple(np.geomspace(1e-5, 5e-3, 24).tolist()))
+"""Of by how much a board is stretched along each of its sides: a printer's rollers and its paper do half a percent, and
+what does more is another size of page. Both sides alike is what no view shows, so what is open of that is as likely.
+As rare as HEIGHTS: where all views show the board turned alike nothing is said of it, either.
+"""
 FLOOR_OFF = SizePrior(0.8, (0.0005,))
 """Of how much higher or lower a floor's edges are than its middle, and of how far a field's are out of square, over
 half of its longer side: 2 mm of a field of 9 m. Four of five are flat and square.

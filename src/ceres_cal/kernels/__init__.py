@@ -49,8 +49,10 @@ class Optics(NamedTuple):
     unit: float
 
 
-BUILT = 8
-"""Numbers at most that move an observation on its target: of a point x, y and what a board's warp is made of."""
+BUILT = 10
+"""Numbers at most that move an observation on its target: of a point x, y, its board's warp, its height, and
+its board's stretches.
+"""
 
 
 class PointColumns(NamedTuple):
@@ -194,8 +196,8 @@ def curve_residuals(optics: Optics, poses: Array, curves: CurveColumns, residual
 
 
 def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) -> None:
-    """d project(X) / d [intrinsics | 6 pose | x, y, the warp's numbers] into `rows` (N, 2, intrinsics + 6 + BUILT); NaN
-    where a sight has points that cannot be projected.
+    """d project(X) / d [intrinsics | 6 pose | what moves it on its target] into `rows` (N, 2, intrinsics + 6 + BUILT);
+    NaN where a sight has points that cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.

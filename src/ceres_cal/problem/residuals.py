@@ -193,7 +193,7 @@ class Equations(Frozen):
         intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients, skew], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
             moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
-        built: (E, BUILT) px per metre of what moves it on its target: of a point x, y and what a warp is made of; of a
+        built: (E, BUILT) px per metre of what moves it on its target: of a point what `Structure.point_slots` has; of a
             segment its offset to the left; of an arc x, y and radius; 0 for the rest.
     """
 
@@ -281,7 +281,8 @@ def whole_structure(targets: Mapping[str, Target], in_waves: Collection[str] | N
     """Everything that could be built otherwise than it is drawn; heights of the points of some boards, or of all."""
     boards = {name for name, target in targets.items() if target.bows}
     waves = boards if in_waves is None else boards & set(in_waves)
-    every = {name: Tolerance(1.0, 1.0, float(name in boards), float(name in waves)) for name in targets}
+    is_board = {name: float(name in boards) for name in targets}
+    every = {name: Tolerance(1.0, 1.0, is_board[name], float(name in waves), is_board[name]) for name in targets}
     return make_structure(targets, every)
 
 

@@ -2,8 +2,9 @@
 
 One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
 arc its centre's x and y and its radius, for each point its x and y, for each board its warp: two bows, a twist and two
-waves, and the height of each of its points besides; all in metres, 0 is the nominal target. Behind them come dimensions
-of targets that are not known, such as a field's length: each moves the offsets of many features at once.
+waves, the height of each of its points besides, and its stretch along columns and along rows; all in metres, 0 is the
+nominal target. Behind them come dimensions of targets that are not known, such as a field's length: each moves the
+offsets of many features at once.
 
 The lengths that targets are drawn by, and how another value of one moves points and curves.
 """
@@ -21,9 +22,10 @@ from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
 from ceres_cal.scene import Arc, Curve, Segment, Target, target_from_spec
+from ceres_cal.scene.targets.target import STRETCH as STRETCH
 from ceres_cal.scene.targets.target import WARP as WARP
 
-Kind = Literal["lines", "points", "warp", "heights"]
+Kind = Literal["lines", "points", "warp", "heights", "stretch"]
 """What a tolerance speaks of."""
 
 
@@ -35,6 +37,7 @@ class Tolerance(Frozen, eq=True):
         points_m: of each point's x and y.
         warp_m: of each of WARP, where it is largest: a board's bow along each side, its twist, a wave along each side.
         heights_m: of the height of each of a board's points, beside its warp.
+        stretch_m: of each of STRETCH: by how much a board is longer along a side, in proportion to the longer one.
         curve_m: name of a curve -> the same as lines_m, of that one in place of it.
     """
 
@@ -42,6 +45,7 @@ class Tolerance(Frozen, eq=True):
     points_m: float = 0.0
     warp_m: float = 0.0
     heights_m: float = 0.0
+    stretch_m: float = 0.0
     curve_m: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,8 +70,9 @@ class Structure(Frozen):
         names: (Z) "target/feature" or "target/feature.x": what each number moves; the last D are dimensions,
             "target/dimension". values: (Z,) offsets, m, and lengths of dimensions, m. sigma_m: (Z,) tolerance of each;
             infinite of a dimension, which has a prior, or none.
-        point_slots: (P, 2 + W + 1) which offset moves each point of all targets: x, y, each of WARP and its own height;
-            -1 for none. bends: (P, W + 1) how much of each of them a point gets, along +z.
+        point_slots: (P, 2 + W + 3) which offset moves each point of all targets: x, y, each of WARP, its own height and
+            each of STRETCH; -1 for none. bends: (P, W + 3) how much of those of its board a point gets, along +z, and
+            along x and y.
         track_slots: (T, 3) which offset moves each track: of a segment the offset, of an arc x, y and radius.
             These three are empty where nothing moves at all.
         slopes: (Q, D) by how much a dimension moves each of the Q offsets: the numbers' own, and those of features that
@@ -180,8 +185,8 @@ class Structure(Frozen):
         if not len(self.values):
             return points
         moved = np.append(self.offsets, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
-        bow = np.sum(moved[:, 2:] * self.bends[feature], axis=1)
-        return np.asarray(points + np.column_stack([moved[:, :2], bow]))
+        heights, stretches = np.split(moved[:, 2:] * self.bends[feature], [-len(STRETCH)], axis=1)
+        return np.asarray(points + np.column_stack([moved[:, :2] + stretches, heights.sum(axis=1)]))
 
     def _tracks(self, given: Array, is_arc: Mask) -> Array:
         if not len(self.values):
@@ -202,8 +207,8 @@ EXACT = Structure(
     (),
     np.empty(0),
     np.empty(0),
-    np.empty((0, 3 + len(WARP)), dtype=np.int32),
-    np.empty((0, 1 + len(WARP))),
+    np.empty((0, 3 + len(WARP) + len(STRETCH)), dtype=np.int32),
+    np.empty((0, 1 + len(WARP) + len(STRETCH))),
     np.empty((0, 3), dtype=np.int32),
 )
 """All targets as drawn."""
@@ -247,9 +252,9 @@ def make_structure(
 
 def _tolerated(name: str, target: Target, tolerance: Tolerance) -> tuple[list[str], Array]:
     """Everything of a target that may be offset, and its tolerance, in the order of the solver's numbers."""
-    if max(tolerance.warp_m, tolerance.heights_m) > 0.0 and not target.bows:
+    if max(tolerance.warp_m, tolerance.heights_m, tolerance.stretch_m) > 0.0 and not target.bows:
         raise InputError(
-            "a warp or heights are for checkerboards and boards like them: "
+            "a warp, heights or a stretch are for checkerboards and boards like them: "
             f"target {name!r}, of kind {target.kind!r}, does not bow"
         )
     curves = [(one, part) for one, curve in target.curves.items() for part in _parts_of(curve)]
@@ -258,10 +263,12 @@ def _tolerated(name: str, target: Target, tolerance: Tolerance) -> tuple[list[st
         *[f"{name}/{part}" for part in WARP],
         *[f"{name}/{one}.{axis}" for one in target.points for axis in "xy"],
         *[f"{name}/{one}.z" for one in target.points],
+        *[f"{name}/{part}" for part in STRETCH],
     ]
     sigmas = [tolerance.curve_m.get(one, tolerance.lines_m) for one, _ in curves]
-    others, count = (tolerance.warp_m, tolerance.points_m, tolerance.heights_m), len(target.points)
-    return names, np.concatenate([sigmas, np.repeat(others, (len(WARP), 2 * count, count))])
+    others = (tolerance.warp_m, tolerance.points_m, tolerance.heights_m, tolerance.stretch_m)
+    count = len(target.points)
+    return names, np.concatenate([sigmas, np.repeat(others, (len(WARP), 2 * count, count, len(STRETCH)))])
 
 
 def _parts_of(curve: Curve) -> tuple[str, ...]:
@@ -279,10 +286,12 @@ def _slots(targets: Mapping[str, Target], place: Indices32) -> tuple[Indices32, 
             curves.append([*place[start : start + parts], *[none] * (3 - parts)])
             start += parts
         track_slots += curves * 3  # the paint's centre and both edges move together
-        count, ends = len(target.points), start + len(WARP)
-        warp, flat, heights = np.split(place[start : ends + 3 * count], [len(WARP), len(WARP) + 2 * count])
-        point_slots.append(np.column_stack([flat.reshape(-1, 2), np.tile(warp, (count, 1)), heights]))
-        start = ends + 3 * count
+        count = len(target.points)
+        ends = np.cumsum([len(WARP), 2 * count, count, len(STRETCH)])
+        warp, flat, heights, stretch, _ = np.split(place[start:], ends)
+        warp, stretch = (np.tile(part, (count, 1)) for part in (warp, stretch))
+        point_slots.append(np.column_stack([flat.reshape(-1, 2), warp, heights, stretch]))
+        start += int(ends[-1])
     return (
         np.concatenate(point_slots),
         np.concatenate([target.bends for target in targets.values()]),
@@ -301,7 +310,8 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
         own = structure.point_slots[points[place] : points[place + 1]]
         tracks = structure.track_slots[curves[place] : curves[place + 1]]
         kinds: tuple[tuple[Kind, Indices32], ...] = (
-            ("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:-1]), ("heights", own[:, -1:])
+            ("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2 : 2 + len(WARP)]),
+            ("heights", own[:, 2 + len(WARP), None]), ("stretch", own[:, -len(STRETCH) :]),
         )  # fmt: skip
         every = {
             (name, kind): distinct(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)

@@ -23,7 +23,7 @@ from ceres_cal.base import Array, DegenerateError, Frozen, Indices, field, repla
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.effect import AsBuilt
-from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, RepeatedAmounts, agreement
+from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, STRETCHED, RepeatedAmounts, agreement
 from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior, Sights
 from ceres_cal.problem import Estimate, Options, Problem, gather_priors, unit_px
@@ -165,7 +165,14 @@ def _measured(every: Sequence[AsBuilt], structure: Structure, targets: Mapping[s
     """The same with the offsets that came out."""
     numbers = numbers_by_kind(structure, targets)
     for one in every:
-        yield replace(one, rms_m=rms(structure.values[numbers[one.target, one.kind]]))
+        values, size_m = structure.values[numbers[one.target, one.kind]], _longer_side_m(targets[one.target])
+        # No view tells both sides' stretch alike, which has the scatter of their mean.
+        stretch = (float(values[0] - values[1]) / size_m, one.sigma_m / size_m / 2.0**0.5)
+        yield replace(one, rms_m=rms(values), stretch=stretch if one.kind == "stretch" else None)
+
+
+def _longer_side_m(target: Target) -> float:
+    return float(np.max(np.ptp(target.box, axis=0)))
 
 
 # Of a dimension, its standard deviation from which on it is not measured. What nothing measures has an infinite one,
@@ -338,8 +345,9 @@ def _likely(
     repeats: RepeatedAmounts, kinds: Mapping[tuple[str, Kind], Indices], targets: Mapping[str, Target]
 ) -> Iterator[AsBuilt]:
     """The kinds that more likely scatter than not, each beside those of the others that do."""
-    extents = {target: float(np.max(np.ptp(targets[target].box, axis=0))) for target, _ in kinds}
-    priors = {of: (HEIGHTS if of[1] == "heights" else AS_BUILT).times(extents[of[0]]) for of in kinds}
+    extents = {target: _longer_side_m(targets[target]) for target, _ in kinds}
+    rare = {"heights": HEIGHTS, "stretch": STRETCHED}
+    priors = {of: rare.get(of[1], AS_BUILT).times(extents[of[0]]) for of in kinds}
     sizes = repeats.sizes(kinds, priors)
     for target, kind in kinds:
         sigma, probability = sizes.get((target, kind), (0.0, 0.0))

@@ -391,9 +391,8 @@ def _leverages(
 
     How targets were built is held: what it would add is its own scatter.
     """
-    rest = np.array([not key.is_structure for key in reduced.shared.keys], dtype=bool)
     keys = [key for key in reduced.shared.keys if not key.is_structure]
-    covariance = reduced.shared.inverse[np.ix_(rest, rest)]
+    covariance = reduced.shared.given(keys).inverse
     shared = shared_columns(equations, estimate, keys) * weight[:, None]
     private, own = np.zeros((2, len(equations), 6))
     for part in reduced.eliminated:

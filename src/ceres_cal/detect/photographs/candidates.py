@@ -179,13 +179,17 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
 
 
 def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> list[tuple[Camera, LineGrid]]:
-    """Those by which the target's own lines are seen in the picture about as well as by the best, the best first."""
+    """Those by which the target's own lines are seen in the picture about as well as by the best, the best first, and
+    the one that was given first.
+    """
     # who asks says that it ended early
     in_time = ((grid.target, camera) for camera, grid in cameras if not search.is_out_of_time)
     likelihood = likelihoods_of_places(search.grey, in_time, search.grid.curves)
-    order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST]
+    order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST].tolist()
     best = likelihood[order[0]] if likelihood else 0.0
-    return [cameras[row] for row in order if likelihood[row] >= min(_LIKELY * best, best)]
+    likely = [row for row in order if likelihood[row] >= min(_LIKELY * best, best)]
+    # What strokes match best is followed, too: boxes on the floor cover one line wholly and leave another.
+    return [cameras[row] for row in dict.fromkeys([*likely, *range(len(cameras))[:1]])]
 
 
 # ---- one coefficient and lenses -------------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
-"""The target as built (a line, an arc or a point aside, a board that is bent), and the floor: bowed as a whole, higher
-at one place than around it, or with a field that is painted out of square.
+"""The target as built (a line, an arc or a point aside, a board that is bent or stretched), and the floor: bowed as a
+whole, higher at one place than around it, or with a field that is painted out of square.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.effects.evidence import FLOOR_OFF
 from ceres_cal.observations import Observations
-from ceres_cal.problem.structure import WARP, dimension_slopes, dimensions_of
+from ceres_cal.problem.structure import STRETCH, WARP, dimension_slopes, dimensions_of
 from ceres_cal.scene.targets import Arc, Segment
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
@@ -68,9 +68,9 @@ def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
 
 def feature_of(name: str) -> str:
     """The feature of a structure number: field/CenterCircle.x -> field/CenterCircle."""
-    for ending in (".x", ".y"):
+    for ending in (".x", ".y", "/bow", "/stretch"):
         name = name.removesuffix(ending)
-    return name.removesuffix("/bow")
+    return name
 
 
 def _of_curve(evidence: Evidence) -> Words:
@@ -140,6 +140,25 @@ def _of_board(evidence: Evidence) -> Words:
         f"along y{''.join(f', {one}' for one in further)} ({evidence.size})",
         f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
         amounts(WARP, mm, sd, "mm"),
+    )
+
+
+def _stretched(case: Case) -> Iterator[EffectColumns]:
+    """A board is longer along x and as much shorter along y: both alike is what no view shows."""
+    for both in _offsets(_STRETCHES, case):
+        yield replace(both, columns=both.columns @ np.array([[0.5], [-0.5]]))
+
+
+def _of_stretch(evidence: Evidence) -> Words:
+    name = evidence.score.subject
+    size_m = float(np.max(np.ptp(evidence.case.problem.observations.targets[name].box, axis=0)))
+    longer, sd = (100.0 * float(one[0]) / size_m for one in (evidence.score.amount, evidence.score.sd))
+    mm, sd_mm = evidence.in_mm
+    sides = "x than along y" if longer > 0.0 else "y than along x"
+    return Words(
+        f"board {name} is {abs(longer):.2f} ± {sd:.2f} % longer along {sides} ({evidence.size})",
+        f"measure both of its sides, print it undistorted, or solve for it: --tolerance {name}.stretch_m=0.002",
+        amounts(("x over y",), mm, sd_mm, "mm"),
     )
 
 
@@ -264,6 +283,9 @@ POINT_ASIDE = _of_target("point aside", partial(_offsets, slice(0, 2)), _of_poin
 """A point does not lie where it is drawn."""
 BOARD_BENT = _of_target("board bent", partial(_offsets, slice(2, 2 + len(WARP))), _of_board, built="warp")
 """A board is bowed along its sides, twisted or wavy."""
+_STRETCHES = slice(-len(STRETCH), None)
+BOARD_STRETCHED = _of_target("board stretched", _stretched, _of_stretch, built="stretch")
+"""A board is printed longer one way than the other."""
 _of_floor = partial(Effect, absorbed=True, prior=FLOOR_OFF, reach=_reach_m, concerns=_has_floor)
 EFFECTS = (
     _of_floor("floor bowed", _bowed, _of_bow),
@@ -273,4 +295,5 @@ EFFECTS = (
     CURVE_ASIDE,
     POINT_ASIDE,
     BOARD_BENT,
+    BOARD_STRETCHED,
 )

@@ -8,7 +8,7 @@
 
 namespace ceres_cal {
 
-constexpr int BUILT = 8;     // structure numbers at most that move a point
+constexpr int BUILT = 10;    // structure numbers at most that move a point
 constexpr int ON_TRACK = 3;  // and a track
 
 // RESIDUALS of each observation, and by how many structure numbers at most it is MOVED; moved(k): where k's slots are.

@@ -103,10 +103,13 @@ class Projection {
         left[0] = -y / length, left[1] = x / length;
     }
 
-    // Where a point goes: along x and y, and along z as much as each part of its board's warp says.
+    // Where a point goes: along x and y, along z as much as each part of its board's warp says, and again along x and
+    // y as much as the board's stretches say.
     void directions(const Points& points, int64_t k, int, double (&rows)[BUILT][3]) const {
         rows[0][0] = rows[1][1] = 1.0;
-        for (int a = 2; a < BUILT; ++a) rows[a][2] = points.bends[(BUILT - 2) * k + a - 2];
+        const double* bends = points.bends + (BUILT - 2) * k - 2;
+        for (int a = 2; a < BUILT - 2; ++a) rows[a][2] = bends[a];
+        for (int axis = 0; axis < 2; ++axis) rows[BUILT - 2 + axis][axis] = bends[BUILT - 2 + axis];
     }
 
   private:

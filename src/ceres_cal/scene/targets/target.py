@@ -53,6 +53,8 @@ MOST_FEATURES = 100_000
 
 WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
 """What the warp of a board is made of: see `Target.bends`."""
+STRETCH = ("stretch.x", "stretch.y")
+"""Along its columns and along its rows, as printers stretch a board: see `Target.bends`."""
 LARGEST_M = 1e7
 """Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
 
@@ -104,7 +106,7 @@ class Target(Frozen):
         points: name -> (x, y, z) m.
         curves: name -> Segment or Arc.
         movable: whether it lies where somebody put it; what is not movable is the world.
-        bows: whether it is a board that may be bent: then a tolerance may have a warp.
+        bows: whether it is a board that may be bent or stretched: then a tolerance may have a warp.
         grid: how its points stand in columns and rows; None where they do not.
         paper: the sheet that it is printed on; None for what is painted on the floor.
         mistaken_for: in words -> spec of another target that has features of the same names.
@@ -194,17 +196,20 @@ class Target(Frozen):
 
     @cached_property
     def bends(self) -> Array:
-        """(P, W + 1) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a
-        side, x (1 - x^2) and y (1 - y^2) with 1 as their largest, and 1 for a height; 0 where it does not bow.
+        """(P, W + 3) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a
+        side, x (1 - x^2) and y (1 - y^2) with 1 as their largest, and 1 for a height; then its places along x and y
+        from the middle, over its longer side. 0 where it does not bow.
         """
         if not self.bows or not self.points:
-            return np.zeros((len(self.points), len(WARP) + 1))
+            return np.zeros((len(self.points), len(WARP) + 1 + len(STRETCH)))
         flat = self.point_array[:, :2]
         half = 0.5 * np.ptp(flat, axis=0)
-        across = (flat - flat.min(axis=0) - half) / half
+        from_middle = flat - flat.min(axis=0) - half
+        across = from_middle / half
         bows = 1.0 - across**2
         waves = 1.5 * np.sqrt(3.0) * across * bows
-        return np.column_stack([bows, across[:, 0] * across[:, 1], waves, np.ones(len(flat))])
+        stretches = 0.5 * from_middle / np.max(half)
+        return np.column_stack([bows, across[:, 0] * across[:, 1], waves, np.ones(len(flat)), stretches])
 
     @property
     def reach_m(self) -> float:
