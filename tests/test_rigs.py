@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import scenes
 from scenery import BoardRanges, board_scene
 from test_cli import Say, refused, say
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -203,14 +204,51 @@ def test_a_camera_of_which_nothing_is_left_gets_the_same_kind_of_lens() -> None:
 def test_exchanged_frames_take_out_no_others() -> None:
     """As displaced views they spoke for a principal point that moves by 60 px, and half of all was taken out."""
     seen = _rig(checkerboard(9, 6, 0.1))
-    views = list(seen.views)
-    at = [n for n, v in enumerate(views) if v.station == "right" and v.frame in ("board_05", "board_08")]
-    for here, there in (at, at[::-1]):
-        views[here] = replace(seen.views[here], frame=seen.views[there].frame, placement=seen.views[there].placement)
-    calibration = calibrate(replace(seen, views=tuple(views)))
+    exchanged = _in_other_frames(seen, {"board_05": "board_08", "board_08": "board_05"})
+    calibration = calibrate(exchanged)
+    at = [n for n, view in enumerate(seen.views) if view != exchanged.views[n]]
     assert np.array_equal(calibration.outlier_masks(seen)[0], np.isin(seen.points.view, at))
+    assert "it shows the board where another camera sees it at 'board_05'" in calibration.warnings[0]
     (pair,) = calibration.uncertainty.rig
     assert abs(pair.baseline_m - _BASELINE_M) < 3.0 * pair.baseline_sd_m < 1e-3
+
+
+def test_a_camera_one_frame_late_is_named() -> None:
+    """It missed half of its observations: "check labels, target dimensions and which lens it is"."""
+    seen = _rig(checkerboard(9, 6, 0.1), 8)
+    names = list(dict.fromkeys(view.frame for view in seen.views))
+    late = _in_other_frames(seen, dict(zip(names, names[1:] + names[:1], strict=True)))
+    with pytest.raises(SolutionError, match=r"'left' and 'right' do not show the same moments.* shows 1 frame later"):
+        calibrate(late, _BROWN)
+
+
+def test_a_board_that_moves_between_two_shutters_is_named() -> None:
+    """By 3 mm: one of ten such rigs was usable with limits, and numbers were hundreds of standard deviations off."""
+    scene = board_scene(
+        checkerboard(9, 6, 0.05), {"left": _LEFT, "right": _LEFT}, _STATIONS, 8, 3, BoardRanges((0.6, 1.2))
+    )
+    shifts = np.random.default_rng(0).normal(0.0, 0.003, (len(scene.placements), 3))
+    moved = {
+        name: Pose(pose.rotation, pose.translation + shift)
+        for (name, pose), shift in zip(scene.placements.items(), shifts, strict=True)
+    }
+    sides = [
+        simulate(one, Disturbance(points_sigma_px=0.1), seed=3).observations.of_station(station)
+        for one, station in ((scene, "left"), (replace(scene, placements=moved), "right"))
+    ]
+    with pytest.raises(SolutionError, match="at most moments 'left' and 'right' see a board at different places"):
+        calibrate(combine(sides), _BROWN)
+
+
+def _in_other_frames(observations: Observations, frames: Mapping[str, str]) -> Observations:
+    """What the right camera shows in some frames under the names of others."""
+    views = [
+        replace(view, frame=frames[view.frame], placement=frames[view.frame])
+        if view.station == "right" and view.frame in frames
+        else view
+        for view in observations.views
+    ]
+    return replace(observations, views=tuple(views))
 
 
 # ---- as typed -------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
+from ceres_cal.start.same_moments import require_same_moments, shifted
 
 if TYPE_CHECKING:
     from ceres_cal.calibration.lens_choice import Chosen
@@ -70,6 +71,8 @@ def calibrate(
         except (DegenerateError, SolutionError) as error:
             if odd := next(unfilled(observations), None):
                 raise type(error)(f"{error}; {odd}") from None
+            if apart := next(shifted(observations), None):
+                raise type(error)(f"{apart}: {error}") from None
             free = _without_priors(observations, options)
             if free is None:
                 raise type(error)(f"{error}{_others_can(error, observations, options)}", error.camera) from None
@@ -121,7 +124,7 @@ def _measured(observations: Observations, options: Options, progress: SolveProgr
     # and outliers are those of the right drawing; and how many there may be.
     redrawn, most_drawings = 0.005, 4
     for _ in range(most_drawings):
-        calibration = _calibrated(observations, options, progress, client)
+        calibration = _of_same_moments(_calibrated(observations, options, progress, client), observations)
         before = calibration.estimate.structure
         calibration = calibration.redrawn()
         moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
@@ -130,6 +133,18 @@ def _measured(observations: Observations, options: Options, progress: SolveProgr
             break
         observations = calibration.as_taken(observations).at_noise(noise)
     return calibration
+
+
+def _of_same_moments(calibration: Calibration, observations: Observations) -> Calibration:
+    """With a warning where the cameras of a rig contradict one another at most moments.
+
+    Raises:
+        SolutionError: they do by more than noise.
+    """
+    if len(observations.cameras) < 2 or is_bulk(observations) or not calibration.rounds:
+        return calibration
+    words = require_same_moments(calibration.problem(observations), calibration.estimate)
+    return replace(calibration, warnings=(*calibration.warnings, words)) if words else calibration
 
 
 def _noise_of_cameras(calibration: Calibration, observations: Observations) -> Mapping[str, float]:

@@ -19,6 +19,7 @@ from ceres_cal.problem import Estimate, Problem, Residuals
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
+from ceres_cal.start.same_moments import shown_elsewhere
 
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
@@ -194,7 +195,13 @@ def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterato
     used = inliers.rows
     for rows in wholes:
         used |= rows
-    shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
-    for number in np.flatnonzero(shares < 0.5):
-        out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
-        yield f"{problem.sights.keys[number]}: {out}: check its labels, do not use its pose"
+    sights = problem.sights
+    shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
+    lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < 0.5)]
+    in_rig = any(key.placement not in (None, *sights.seen_once) for key, _ in lost)
+    elsewhere = shown_elsewhere(problem.observations) if in_rig else {}
+    for key, share in lost:
+        checks, other = "check its labels, do not use its pose", elsewhere.get((key.station, str(key.placement)))
+        if other is not None:
+            checks = f"it shows the board where another camera sees it at {other!r}: exchange their frames"
+        yield f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"

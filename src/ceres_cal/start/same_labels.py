@@ -120,17 +120,17 @@ def _turns(
     depth = median(np.array([poses[b].position @ poses[b].position for _, b in shared])) ** 0.5
     answers = []
     for pose in (one for own in between for one in own):
-        off = [[_apart(pose, other, depth) for other in own] for own in between]
+        off = [[apart(pose, other, depth) for other in own] for own in between]
         answers.append((float(np.mean(np.min([row + [np.inf] * (4 - len(row)) for row in off], axis=1))), off, pose))
     cost, off, best = min(answers, key=lambda answer: answer[0])
-    others = [answer[0] for answer in answers if _apart(answer[2], best, depth) > alike]
+    others = [answer[0] for answer in answers if apart(answer[2], best, depth) > alike]
     if len(shared) < 2 or (others and min(others) < clearly * max(cost, 0.01)):
         return None
     numbers = [int(np.argmin(row)) for row in off]
     return [own[number] if number else None for own, number in zip(turns, numbers, strict=True)]
 
 
-def _apart(a: Pose, b: Pose, depth: float) -> float:
+def apart(a: Pose, b: Pose, depth: float) -> float:
     """Between two poses of a camera: the angle's sine and the shift over a depth."""
     turn = np.linalg.norm(a.rotation - b.rotation) / np.sqrt(8.0)
     return float(turn + np.linalg.norm(a.position - b.position) / depth)

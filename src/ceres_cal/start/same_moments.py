@@ -1,0 +1,156 @@
+"""Whether the cameras of a rig show a board at the same moments: names of frames may be exchanged or one off, cameras
+may be out of step while a board moves, and somebody may have turned a camera.
+
+A camera shows by itself where a board is. At one moment that is where the others see it, but for the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from ceres_cal.base import Array, CalibrationError, Pose, SolutionError, attempt, counted, median
+from ceres_cal.effects.evidence import LEAST_PX
+from ceres_cal.observations import Observations, gather_sights
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.problem import Estimate, Options, Problem
+from ceres_cal.problem.residuals import residuals, write_equations
+from ceres_cal.start.initialise import posed_sights
+from ceres_cal.start.same_labels import apart
+
+_FEWEST = 4  # moments that say how cameras stand: of three, two agree by chance
+# By how much another frame must suit better, as a factor, and what a start leaves at least (see `same_labels`).
+_CLEARLY, _ALIKE = 3.0, 0.01
+_MOST = 40  # moments in a row that are asked, which takes the third power of their number
+_ADVICE = (
+    "they are not of the same moment, or a camera was moved: take all of them at once, hold the board still meanwhile, "
+    "or leave frames that several cameras show to one of them"
+)
+
+
+def require_same_moments(problem: Problem, estimate: Estimate) -> str:
+    """A warning where cameras contradict one another about most boards by more than their noise, "" where they do not.
+
+    Raises:
+        SolutionError: they do by so much that nothing that they show together can be used.
+    """
+    # Times the noise. Beside boards that moved by 0.3 mm between two shutters, 0.5 to 1.1 times, the numbers of the
+    # cameras are within what is stated; beside 1 mm, 1.8 to 9 times, they were thousands of standard deviations off.
+    named, refused = 1.0, 1.5
+    shares = _by_own_poses(problem, estimate)
+    if len(shares) < _FEWEST:
+        return ""
+    share = median(np.array(list(shares.values())))
+    times = float(np.sqrt(share / max(1.0 - share, 1e-9)))
+    if times < named:
+        return ""
+    stations = " and ".join(map(repr, problem.observations.stations))
+    words = f"at most moments {stations} see a board at different places, {times:.1f} times the noise apart"
+    if times > refused:
+        raise SolutionError(f"{next(shifted(problem.observations), words)}: {_ADVICE}")
+    return f"{words}: {_ADVICE}"
+
+
+def _by_own_poses(problem: Problem, estimate: Estimate) -> dict[str, float]:
+    """Placement that several sights show -> share of the squared residuals of one of them that a pose of its own would
+    explain, of the one that it explains most of. None where a field says where cameras stand: it may be wrong.
+    """
+    sights, alone = problem.sights, problem.sights.seen_once
+    shared = [n for n, key in enumerate(sights.keys) if key.placement not in (None, *alone)]
+    if not shared or sights.of_world:
+        return {}
+    own = sights.take(np.array(shared))
+    equations = write_equations(own, estimate, residuals(own, estimate))
+    found: dict[str, float] = {}
+    for key, start, stop in zip(equations.sights.keys, equations.bounds[:-1], equations.bounds[1:], strict=True):
+        left = equations.residual[start:stop]
+        basis = np.linalg.qr(equations.pose[start:stop])[0]
+        share = float(np.sum((left @ basis) ** 2) / (left @ left + LEAST_PX**2 * len(left)))
+        found[str(key.placement)] = max(share, found.get(str(key.placement), 0.0))
+    return found
+
+
+def shifted(observations: Observations) -> Iterator[str]:
+    """In words, of each station whose frames suit those of the first one by another count."""
+    for moments in _moments(observations):
+        costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
+        best = min(costs, key=costs.__getitem__)
+        if costs[0] > _CLEARLY * max(costs[best], _ALIKE):
+            where = f"{counted(abs(best), 'frame')} {'later' if best > 0 else 'earlier'}"
+            yield (
+                f"{moments.first!r} and {moments.second!r} do not show the same moments: what {moments.first!r} shows "
+                f"in a frame {moments.second!r} shows {where}"
+            )
+
+
+def shown_elsewhere(observations: Observations) -> dict[tuple[str, str], str]:
+    """Station and placement -> the placement at which the other camera sees the board there."""
+    found: dict[tuple[str, str], str] = {}
+    for moments in _moments(observations):
+        found |= dict(moments.exchanged())
+    return found
+
+
+class _Moments:
+    """Two stations, and where both see boards by themselves, moment by moment."""
+
+    def __init__(self, first: str, second: str, poses: Mapping[str, tuple[Pose, Pose]]) -> None:
+        self.first, self.second, self._names = first, second, list(poses)[:_MOST]
+        seen = [poses[name] for name in self._names]
+        self._depth = median(np.array([np.linalg.norm(b.position) for _, b in seen]))
+        # Where the second camera stands before the first, by what they show at moments i and j.
+        self._between = [[b @ a.inverse for _, b in seen] for a, _ in seen]
+
+    @property
+    def most_shift(self) -> int:
+        return len(self._names) // 2
+
+    def _apart(self, pose: Pose, other: Pose) -> float:
+        return apart(pose, other, self._depth)
+
+    def _at(self, shift: int) -> list[Pose]:
+        return [self._between[i][i + shift] for i in range(len(self._names)) if 0 <= i + shift < len(self._names)]
+
+    def _off(self, shift: int) -> Array:
+        """(N, N) by how much all moments disagree about where the cameras stand."""
+        poses = self._at(shift)
+        return np.array([[self._apart(one, other) for other in poses] for one in poses])
+
+    def cost(self, shift: int) -> float:
+        """By how much most moments disagree at least, infinite of too few."""
+        off = self._off(shift)
+        return float(np.min(np.median(off, axis=1))) if len(off) >= _FEWEST else np.inf
+
+    def exchanged(self) -> Iterator[tuple[tuple[str, str], str]]:
+        """The second station's placements that suit others of the first, and which."""
+        off = self._off(0)
+        likeliest = self._at(0)[int(np.argmin(np.median(off, axis=1)))]
+        suits = np.array([[self._apart(one, likeliest) for one in row] for row in self._between])
+        for number, name in enumerate(self._names):
+            best = int(np.argmin(suits[:, number]))
+            if suits[number, number] > _CLEARLY * max(suits[best, number], _ALIKE):
+                yield (self.second, name), self._names[best]
+                yield (self.first, self._names[best]), name
+
+
+def _moments(observations: Observations) -> Iterator[_Moments]:
+    """Of the first station and each other that sees boards with it."""
+    sights = gather_sights(observations)
+    # quiet: this only adds a cause to what the user reads of it
+    posed = attempt(lambda: posed_sights(sights, Options(lens="radial")))
+    if isinstance(posed, CalibrationError):
+        return
+    poses: dict[SightKey, Pose] = {
+        sights.keys[number]: Pose(pose[:, :3], pose[:, 3])
+        for number, pose in zip(posed.numbers.tolist(), posed.poses, strict=True)
+    }
+    boards: dict[str, dict[str, Pose]] = {}
+    for key, pose in poses.items():
+        if key.placement is not None:
+            boards.setdefault(key.station, {})[key.placement] = pose
+    first, *others = boards or [""]
+    for second in others:
+        both = {name: (boards[first][name], pose) for name, pose in boards[second].items() if name in boards[first]}
+        if len(both) >= _FEWEST:
+            yield _Moments(first, second, both)
