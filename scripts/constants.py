@@ -165,7 +165,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.photographs.grid", "_FACES _AS_WELL _NEARER_DEG _SHORT", "auto"),
     *_of("detect.photographs.candidates", "_SURE _COMPARABLE _ALIKE _LIKELY BUDGET_S", "auto"),
     *_of("detect.photographs.painted", "BY_CHANCE _LACKS _SURELY", "auto"),
-    *_of("detect.photographs.as_built", "_OTHER_FIELD _SURELY _FARTHEST _MOST_MISFIT", "lines", "auto"),
+    *_of("detect.photographs.as_built", "_OTHER_FIELD _SURELY _FARTHEST", "lines", "auto"),
     *_of("detect.photographs.judgement", "_NEAR_PX _EXPLAINED _OF_ALL _FEWEST_PLACES _FEWEST_CURVES", "auto"),
     *_of("detect.photographs.judgement", "_LEAST_UPRIGHT _SAME_FLOOR _NO_CHANCE _BY_ANY _IF_ANY", "auto"),
     *_of("detect.photographs.matching", "_PEAK _LEAST_PEAK _PARALLEL _CELL _PAIRS _LEAST_IN_VIEW", "auto"),

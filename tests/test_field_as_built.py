@@ -10,6 +10,7 @@ from photos import shots as script
 from photos.disturbed import AUTO, taken
 from scenery import overhead_pose
 
+from ceres_cal.base import Pose
 from ceres_cal.base.errors import NothingShownError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -22,9 +23,10 @@ from ceres_cal.detect.photographs.as_built import FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.by_hand import unknown_optics
 from ceres_cal.detect.photographs.field import _observations
 from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.grid import Facing
 from ceres_cal.detect.photographs.matching import StrokeMap
 from ceres_cal.detect.photographs.refit import observations_of
-from ceres_cal.detect.photographs.search import search
+from ceres_cal.detect.photographs.search import _contradiction, search
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
 from ceres_cal.observations import Observations, Prior
@@ -90,12 +92,22 @@ def test_lines_that_are_bent_as_by_no_lens_are_another_field_s() -> None:
     """As when the camera is bent until a field of another width fits in parts; tape that wanders does less."""
     course = predict(FIELD, CAMERA, FIELD.curve_names, 8.0, 8.0)
     every = np.ones(len(course), dtype=bool)
-    for wave_px, is_other in ((0.15, False), (1.0, True)):
+    for wave_px, wander_m, is_other in ((0.15, 0.0, False), (0.35, 0.004, False), (1.0, 0.013, True)):
         wave = wave_px * np.sin(course.pixels @ np.array([0.05, 0.04]))
         lines = Lines(course, every, wave, np.full(len(course), 0.1), np.full(len(course), 50.0), 0.8, 1.0)
         built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA, None).priors)
-        assert built.is_other == is_other, built.misfit
+        assert built.is_other == is_other and built.wander_m == pytest.approx(wander_m, rel=0.2)
         assert is_other == any("bent as by no lens" in words for words in built.words())
+
+
+def test_two_sides_tell_a_mirrored_picture() -> None:
+    ways = [CAMERA, CAMERA.at(CAMERA.cam_from_world @ Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)))]
+    for sides, said in (
+        (("left", "bottom"), "in a mirrored picture only"),
+        (("top", "left"), "not with Left"),
+    ):
+        facing = [Facing(name, side) for name, side in zip(("LeftGoalLine", "TopTouchLine"), sides, strict=True)]
+        assert said in _contradiction(ways, facing, FIELD, FIELD.curve_names)
 
 
 def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, Frozen, Indices, SolutionError, attempt, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, Indices, SolutionError, attempt, median, replace
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects
@@ -33,9 +33,6 @@ _BEAM, _MOST = 24, 9
 # that is not flat make of one is less.
 _OTHER_FIELD, _LONGER = 0.02, 4.0
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
-# Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
-# wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
-_MOST_MISFIT = 6.0
 _APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
 
 
@@ -49,7 +46,8 @@ class FieldAsBuilt(Frozen):
         drawn: name of a dimension -> its value by the target, m. names: of the curves that tell it.
         usual_m: by how much a curve lies aside that does. scatter_m: by how much all the others do, where
             it is seen.
-        misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
+        wander_m: by how much lines wander that none of that explains, nor what is stated of their places; infinite
+            where the camera shows none.
     """
 
     aside_m: Mapping[str, float]
@@ -59,7 +57,7 @@ class FieldAsBuilt(Frozen):
     names: tuple[str, ...]
     usual_m: float
     scatter_m: float = 0.0
-    misfit: float = 0.0
+    wander_m: float = 0.0
 
     @property
     def laid_m(self) -> Mapping[str, float]:
@@ -79,7 +77,12 @@ class FieldAsBuilt(Frozen):
         )
         far = float(np.linalg.norm(list(self.aside_m.values())))
         elsewhere = far > _FARTHEST * self.usual_m or 2 * len(self.aside_m) > len(self.names)
-        return changed or elsewhere or self.misfit > _MOST_MISFIT
+        return changed or elsewhere or self._is_bent
+
+    @property
+    def _is_bent(self) -> bool:
+        """Whether its lines wander farther than paint scatters. Tape that was laid by hand wanders by 3 mm of 9 m."""
+        return not self.wander_m < _SCATTER[-1] * self.usual_m
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""
@@ -92,8 +95,8 @@ class FieldAsBuilt(Frozen):
             f"{name} lies {1e3 * abs(aside):.0f} ± {1e3 * self.sd_m[name]:.0f} mm beside its drawing"
             for name, aside in self.aside_m.items()
         ]
-        bent = f"its lines are bent as by no lens, {self.misfit**0.5:.1f} times what is stated"
-        return (*dimensions, *curves, *([bent] if self.misfit > _MOST_MISFIT else []))
+        bent = f"its lines are bent as by no lens, by {1e3 * self.wander_m:.0f} mm"
+        return (*dimensions, *curves, *([bent] if self._is_bent else []))
 
 
 AS_DRAWN = FieldAsBuilt({}, {}, {}, {}, (), np.inf)
@@ -136,7 +139,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     # reads: "..." of `AsBuilt.words`: this is another field
     equations = attempt(lambda: write_equations(problem.sights, estimate, left), SolutionError)
     if isinstance(equations, CalibrationError):
-        return replace(AS_DRAWN, misfit=np.inf)
+        return replace(AS_DRAWN, wander_m=np.inf)
     every = np.ones(len(equations), dtype=bool)
     weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))
     model = make_linear_model(problem, estimate, equations, weights)
@@ -152,7 +155,19 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
     shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, usual_aside_m(target))
-    return replace(shape.explained(), misfit=misfit)
+    wander_m = _wander_m(lines, target, bent.left_over * sigma[equations.observation], equations.observation)
+    return replace(shape.explained(), wander_m=wander_m)
+
+
+def _wander_m(lines: Lines, target: Target, left_px: Array, places: Indices) -> float:
+    """By how much paint wanders from what is drawn, m, by what is left of places that were found: nothing up to twice
+    what is stated, which a calibration estimates as noise.
+    """
+    found, usual = lines.take(lines.found).take(places), 0.6745  # of a standard deviation, the median
+    times = median(np.abs(left_px) / found.sigma_px) / usual
+    wide_m = np.array([target.curves[name].width_m for name in target.curve_names])
+    left_m = np.abs(left_px) * wide_m[found.course.curve] / found.course.width_px
+    return median(left_m) / usual * (1.0 - times**-2) ** 0.5 if times > 2.0 else 0.0
 
 
 def _places_together(residuals: Array, curve: Indices) -> float:

@@ -21,6 +21,7 @@ from ceres_cal.detect.photographs.candidates import (
 from ceres_cal.detect.photographs.follow import Tracker
 from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.grid import (
+    Facing,
     agreeing_with_facing,
     distinguishing_feature,
     grid_of,
@@ -196,8 +197,7 @@ def _one_way(problem: FieldSearch, distinct: Sequence[Followed]) -> SearchResult
     if against := objection(problem, followed):
         return SearchResult(None, against, seen=followed)
     if not agreeing:
-        given = ", ".join(f"{one.feature}={one.side}" for one in problem.asked.facing)
-        raise SeveralWaysError(f"not with {given}: in this photograph {_sides(ways, target, curves)}", followed)
+        raise SeveralWaysError(_contradiction(ways, problem.asked.facing, target, curves), followed)
     if len(agreeing) > 1:
         raise SeveralWaysError(
             f"the field is found, but it looks alike in {len(agreeing)} ways: "
@@ -215,6 +215,14 @@ def _consistent(problem: FieldSearch, cameras: Sequence[Camera]) -> list[int]:
     if problem.asked.before is not None and len(cameras) > 1:
         return nearest_to_before(cameras, problem.asked.before)
     return list(range(len(cameras)))
+
+
+def _contradiction(ways: Sequence[Camera], facing: Sequence[Facing], target: Target, curves: Collection[str]) -> str:
+    """That no way agrees with all of what is known."""
+    given = ", ".join(f"{one.feature}={one.side}" for one in facing)
+    if len(facing) > 1 and all(agreeing_with_facing(ways, [one], target, curves) for one in facing):
+        return f"{given} hold together in a mirrored picture only: mirror it back, or check them"
+    return f"not with {given}: in this photograph {_sides(ways, target, curves)}"
 
 
 def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -> str:
