@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -173,7 +173,7 @@ def _taken(column: AnyArray, rows: Indices | Indices32 | Mask) -> AnyArray:
     return np.concatenate([read_rows(rows_of(column, start, start + count)) for start, count in runs])
 
 
-class FileRows(NamedTuple):
+class FileRows(Frozen, eq=True):
     """Rows of a column in a file, which are read without becoming part of the process's memory for good."""
 
     path: str

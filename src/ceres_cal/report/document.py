@@ -1,8 +1,7 @@
 """What is said of a result: a document of sections, made once, rendered as text, as JSON or as a page (`report.page`).
 
 A section holds one subject in the three ways in which it is shown: lines for a terminal, data for scripts, and pieces
-of a page. So what is said of one thing stands in one place. All are named tuples: every command defines them at its
-start, six times as fast as frozen dataclasses.
+of a page. So what is said of one thing stands in one place.
 """
 
 from __future__ import annotations
@@ -10,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import chain
 from textwrap import wrap
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.base.frozen import Frozen, field
 
 if TYPE_CHECKING:
     from ceres_cal.report.canvas import Draw, Hover
@@ -30,20 +30,20 @@ def wrapped(*texts: str) -> list[str]:
 # ---- pieces of a page -----------------------------------------------------------------------------------------------
 
 
-class Text(NamedTuple):
+class Text(Frozen, eq=True):
     """A paragraph; `kind` is a class of the style sheet."""
 
     text: str
     kind: str = ""
 
 
-class BulletList(NamedTuple):
+class BulletList(Frozen, eq=True):
     """A list; each line begins with a mark that its level has: "good", "care", "no" or ""."""
 
     lines: tuple[tuple[str, str], ...]
 
 
-class Table(NamedTuple):
+class Table(Frozen, eq=True):
     """Columns under their heads, which say the unit; the first column names its row.
 
     Of more than `most` rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
@@ -68,7 +68,7 @@ class Table(NamedTuple):
         ]
 
 
-class Figure(NamedTuple):
+class Figure(Frozen, eq=True):
     """A picture with a title, a sentence that says how to read it, and the table behind it.
 
     One that has a `wide_height` is drawn twice, for a wide and for a narrow window; heights are over the width. `hover`
@@ -85,7 +85,7 @@ class Figure(NamedTuple):
     hover: Hover | None = None
 
 
-class PhotoFigure(NamedTuple):
+class PhotoFigure(Frozen, eq=True):
     """A picture that is an image (JPEG), across both columns, and a sentence on what it shows."""
 
     name: str
@@ -94,20 +94,20 @@ class PhotoFigure(NamedTuple):
     jpeg: bytes
 
 
-class Gallery(NamedTuple):
+class Gallery(Frozen, eq=True):
     """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
 
     pictures: tuple[Figure | PhotoFigure, ...]
 
 
-class Folded(NamedTuple):
+class Folded(Frozen, eq=True):
     """Pieces that are there when somebody asks for them."""
 
     title: str
     pieces: tuple[Piece, ...]
 
 
-class Tile(NamedTuple):
+class Tile(Frozen, eq=True):
     """One large number: what it is, the number, its unit, and what to know about it."""
 
     label: str
@@ -117,13 +117,13 @@ class Tile(NamedTuple):
     level: str = ""
 
 
-class Tiles(NamedTuple):
+class Tiles(Frozen, eq=True):
     """Tiles in a row."""
 
     tiles: tuple[Tile, ...]
 
 
-class Card(NamedTuple):
+class Card(Frozen, eq=True):
     """One finding: a sentence, what to do where that is known, small facts, and a file beside the page to look at."""
 
     level: str
@@ -140,7 +140,7 @@ class Card(NamedTuple):
 Piece = Text | BulletList | Table | Gallery | Folded | Tiles | Card
 
 
-class Chapter(NamedTuple):
+class Chapter(Frozen, eq=True):
     """A part of a page under a title; `level` colours it where it is a verdict."""
 
     name: str
@@ -152,7 +152,7 @@ class Chapter(NamedTuple):
 # ---- the document ---------------------------------------------------------------------------------------------------
 
 
-class Section(NamedTuple):
+class Section(Frozen, eq=True):
     """One subject.
 
     Attributes:
@@ -163,7 +163,7 @@ class Section(NamedTuple):
 
     title: str = ""
     lines: Iterable[str] = ()
-    data: Mapping[str, Any] = MappingProxyType({})
+    data: Mapping[str, Any] = field(default_factory=dict)
     pieces: tuple[Piece, ...] = ()
 
     def shown(self) -> Iterator[str]:
@@ -173,7 +173,7 @@ class Section(NamedTuple):
             yield f"{'' if number else self.title:9} {line}" if self.title else line
 
 
-class Document(NamedTuple):
+class Document(Frozen, eq=True):
     """What a command answers: sections in the order in which they are read.
 
     Attributes:

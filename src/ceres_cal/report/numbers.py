@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, euler_from_rotation, rotation_exp
+from ceres_cal.base import Array, euler_from_rotation, replace, rotation_exp
 from ceres_cal.base.words import (
     DASH,
     at_precision,
@@ -221,7 +221,7 @@ def _station(quality: Quality, name: str) -> Section:
     known = [quality.verdicts.get(("station", name, word)) for word in ("x", "y", "height")]
     places = zip(("position x", "position y", "height"), camera.position.tolist(), known, strict=True)
     rows = [number_row(word, value, "m", verdict) for word, value, verdict in places]
-    return _listed("station", title, [*rows, *_angles(quality, name, camera)])._replace(data=data)
+    return replace(_listed("station", title, [*rows, *_angles(quality, name, camera)]), data=data)
 
 
 def _angles(quality: Quality, name: str, camera: Camera) -> Iterator[_Row]:
@@ -289,7 +289,7 @@ def _as_built(quality: Quality) -> Section:
         rows.append((structure.names[i], shown, *(f"{short(1e3 * sd)} mm" for sd in widths)))
     table = Table(("", "off its drawing", "± sd", "tolerance"), tuple(rows), "Targets as built", stacked=True)
     words = [f"{sentence(one)}." for one in words_of(as_built)]
-    lines = [*wrapped(*words), *table._replace(rows=table.rows[:_MOST_FEATURES]).lines()]
+    lines = [*wrapped(*words), *replace(table, rows=table.rows[:_MOST_FEATURES]).lines()]
     if rest := len(order[_MOST_FEATURES:]):
         lines.append(f"and {plural(rest, 'smaller correction')}")
     pieces: list[Piece] = [*map(Text, words), table]

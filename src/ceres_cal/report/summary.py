@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base import answer_or_reason, rms
+from ceres_cal.base import answer_or_reason, replace, rms
 from ceres_cal.base.words import (
     DASH,
     HEIGHTS_M,
@@ -174,7 +174,7 @@ def verdict_chapter(material: Material) -> Chapter:
     tiles = tuple(_tiles(material))
     if not grounds.promises(material):  # the verdict's colour, not that of a number nobody vouches for
         tiles = tuple(
-            tile._replace(level=grounds.worst(judged.level, tile.level)) if tile.level else tile for tile in tiles
+            replace(tile, level=grounds.worst(judged.level, tile.level)) if tile.level else tile for tile in tiles
         )
     pieces: list[Piece] = [Tiles(tiles), BulletList(judged.reasons)]
     if material.maps:

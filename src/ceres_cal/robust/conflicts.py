@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -45,7 +44,7 @@ LARGEST_FREEDOM = 1e6
 _LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
 
 
-class Rest(NamedTuple):
+class Rest(Frozen):
     """What everything else says of a statement's numbers: a step from an estimate, and how well that is known."""
 
     estimate: Estimate
@@ -192,7 +191,7 @@ class Conflicts(Frozen):
         return (*(one.words for one in self.every), *(one.words for one in self.doubts))
 
 
-class Doubt(NamedTuple):
+class Doubt(Frozen):
     """That a prior may be wrong: its numbers, how probable that is, (K,) by how much everything moves without it."""
 
     keys: tuple[Key, ...]
