@@ -38,7 +38,7 @@ from benchmarks.problems import (
     field_observations,
     wide_lens,
 )
-from benchmarks.process import process_rows
+from benchmarks.process import OURS_ALONE, process_rows
 from benchmarks.scale import FOLDER, folder_for, frames_in_turns, stored_growth, write_field
 from scenery import overhead_pose
 
@@ -104,7 +104,7 @@ def answer_apart(name: str, warm_up_s: float, corners: Corners) -> Answer:
 def run(name: str, *arguments: str) -> str:
     """What the Python of a solver prints; another than this must not find this one's packages."""
     strange = python_of(name) != sys.executable
-    variables = {k: v for k, v in os.environ.items() if not (strange and k.startswith("PYTHON"))}
+    variables = {k: v for k, v in os.environ.items() if k != OURS_ALONE and not (strange and k.startswith("PYTHON"))}
     command = [python_of(name), *arguments]
     try:
         return subprocess.run(command, env=variables, capture_output=True, text=True, check=True).stdout
