@@ -20,9 +20,6 @@ from ceres_cal.start.initialise import posed_sights
 from ceres_cal.start.same_labels import apart
 
 _FEWEST = 4  # moments that say how cameras stand: of three, two agree by chance
-# By how much another frame must suit better, as a factor, and what a start leaves at least (see `same_labels`).
-_CLEARLY, _ALIKE = 3.0, 0.01
-_MOST = 40  # moments in a row that are asked, which takes the third power of their number
 _ADVICE = (
     "they are not of the same moment, or a camera was moved: take all of them at once, hold the board still meanwhile, "
     "or leave frames that several cameras show to one of them"
@@ -76,7 +73,7 @@ def shifted(observations: Observations) -> Iterator[str]:
     for moments in _moments(observations):
         costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
         best = min(costs, key=costs.__getitem__)
-        if costs[0] > _CLEARLY * max(costs[best], _ALIKE):
+        if _is_clear(costs[0], costs[best]):
             where = f"{counted(abs(best), 'frame')} {'later' if best > 0 else 'earlier'}"
             yield (
                 f"{moments.first!r} and {moments.second!r} do not show the same moments: what {moments.first!r} shows "
@@ -96,7 +93,8 @@ class _Moments:
     """Two stations, and where both see boards by themselves, moment by moment."""
 
     def __init__(self, first: str, second: str, poses: Mapping[str, tuple[Pose, Pose]]) -> None:
-        self.first, self.second, self._names = first, second, list(poses)[:_MOST]
+        most = 40  # in a row, of which all are compared with all, by all shifts
+        self.first, self.second, self._names = first, second, list(poses)[:most]
         seen = [poses[name] for name in self._names]
         self._depth = median(np.array([np.linalg.norm(b.position) for _, b in seen]))
         # Where the second camera stands before the first, by what they show at moments i and j.
@@ -129,9 +127,15 @@ class _Moments:
         suits = np.array([[self._apart(one, likeliest) for one in row] for row in self._between])
         for number, name in enumerate(self._names):
             best = int(np.argmin(suits[:, number]))
-            if suits[number, number] > _CLEARLY * max(suits[best, number], _ALIKE):
+            if _is_clear(suits[number, number], suits[best, number]):
                 yield (self.second, name), self._names[best]
                 yield (self.first, self._names[best]), name
+
+
+def _is_clear(own: float, other: float) -> bool:
+    """Whether another frame suits better than its own, by these distances."""
+    clearly, alike = 3.0, 0.01  # as a factor, and what a start leaves at least (see `same_labels`)
+    return own > clearly * max(other, alike)
 
 
 def _moments(observations: Observations) -> Iterator[_Moments]:
