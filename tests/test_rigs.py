@@ -24,6 +24,7 @@ from ceres_cal.observations.same_frame import with_same_frames
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate, Options, Station
 from ceres_cal.problem.structure import EXACT
+from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.targets import Target, checkerboard
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.same_labels import with_same_labels
@@ -238,6 +239,16 @@ def test_a_board_that_moves_between_two_shutters_is_named() -> None:
     ]
     with pytest.raises(SolutionError, match="at most moments 'left' and 'right' see a board at different places"):
         calibrate(combine(sides), _BROWN)
+
+
+def test_a_lost_board_that_both_cameras_see_is_posed_again() -> None:
+    """Lenses had been compared by other boards: it stayed where the start put it, and both views were taken out."""
+    seen = _rig(checkerboard(9, 6, 0.1), 5)
+    calibration = calibrate(seen, _BROWN)
+    name, pose = next(iter(calibration.placements.items()))
+    lost = {**calibration.placements, name: Pose(pose.rotation, pose.translation + np.array([0.3, 0.2, 0.5]))}
+    end = solve_robustly(calibration.problem(seen), replace(calibration.estimate, placements=lost), is_near=True)
+    assert end.inliers.points.all()
 
 
 def _in_other_frames(observations: Observations, frames: Mapping[str, str]) -> Observations:

@@ -21,6 +21,7 @@ from ceres_cal.base import Array, Indices, median, or_none, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem import Estimate, Information, Problem, Solution, Weighting, placement_costs, solve
 from ceres_cal.problem.quantities import difference, natural_sizes
+from ceres_cal.problem.residuals import residuals_alone
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import pose_from_homography
@@ -125,7 +126,7 @@ _FEWEST = 6
 
 
 def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimate) -> tuple[Estimate, int]:
-    """The estimate with lost private placements posed again where that lowers their cost, and how many were.
+    """The estimate with lost placements posed again where that lowers their cost, and how many were.
 
     Args:
         problem: of all observations, those rejected too, weighted with a loss that bears outliers.
@@ -133,16 +134,36 @@ def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimat
     sights, weighting, count = problem.sights, problem.weighting, 0
     for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):
         sight = sights[int(number)]
-        pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in problem.private else None
+        pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in problem.layout.placements else None
         if pose is None:
             continue
-        as_is, _ = placement_costs(sight, estimate, weighting, estimate.pose_stack(sight.keys))
         tried = [placement_costs(sight, estimate, weighting, p) for p in (pose, mirrored(sight, pose))]
         cost, best = min(tried, key=lambda one: float(one[0][0]))
-        if cost[0] < 0.99 * as_is[0]:
-            estimate = estimate.with_placements(sight.keys, best)
+        there = estimate.with_placements(sight.keys, best)
+        if sight.key.placement in problem.private:
+            as_is, _ = placement_costs(sight, estimate, weighting, estimate.pose_stack(sight.keys))
+            is_better = cost[0] < 0.99 * as_is[0]
+        else:
+            is_better = _suits_all(
+                sights.take(sights.numbers(placements=sight.keys[0][2:])), there, estimate, weighting
+            )
+        if is_better:
+            estimate = there
             count += 1
     return estimate, count
+
+
+def _suits_all(sights: Sights, there: Estimate, before: Estimate, weighting: Weighting) -> bool:
+    """Whether all sights of a placement suit where it lies there by much better than where it lay before: what of two
+    cameras shows another moment suits either as badly.
+    """
+    much = 0.5  # of Cauchy's cost
+    costs = []
+    for estimate in (there, before):
+        points, _ = residuals_alone(sights, estimate).lengths
+        far = np.nan_to_num(points / (weighting.point_scale * weighting.loss_scale * sights.sigma_px), nan=np.inf)
+        costs.append(float(np.sum(np.log1p(np.minimum(far, 1e6) ** 2))))  # what is not shown at all is very far
+    return costs[0] < much * costs[1]
 
 
 def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Array | None:
