@@ -32,7 +32,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.posterior.bent import valley
 from ceres_cal.posterior.maps import locate_slopes, located_by, read, spread_of_points, visible_pixels
-from ceres_cal.posterior.mixture import quantiles, radii
+from ceres_cal.posterior.mixture import moments, quantiles, radii
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import predicted
@@ -601,3 +601,10 @@ def test_a_place_whose_slopes_nothing_tells_is_unknown() -> None:
         warnings.simplefilter("error")
         said = read(known.posterior, known.estimate, replace(places, slopes=slopes), "overhead")
     assert np.isinf(said.radius_95).tolist() == [True, False] and np.isfinite(said.sd).tolist() == [False, True]
+
+
+def test_a_component_without_weight_tells_nothing() -> None:
+    """Of a valley whose far end is unknown and next to impossible, 0 times infinity was not a number."""
+    means, variances = np.array([[1.0, 0.0], [0.0, np.inf], [2.0, 1.0]]), np.array([[1.0], [1.0], [np.inf]])
+    known, unknown = moments(np.array([0.25, 0.75, 0.0]), means, variances * np.ones(2))
+    assert known == pytest.approx(1.25**0.5) and unknown == np.inf

@@ -268,7 +268,7 @@ def _mixed(between: Array, values: Array) -> Array:
 
 def moments(weights: Array, means: Array, variances: Array) -> Array:
     """(...) root mean squares about the estimate, of means and variances (F, ...)."""
-    return np.asarray(np.sqrt(np.tensordot(weights, variances + means**2, axes=1)))
+    return np.asarray(np.sqrt(_mixed(weights[None], variances + means**2)[0]))
 
 
 def quantiles(weights: Array, means: Array, variances: Array, half_width: float) -> tuple[Array, Array]:
