@@ -65,9 +65,8 @@ def _steps_across(image: Image, grid: Array) -> Array:
     """(rows, columns) half the step between dark and bright about each corner; NaN where it is not all in the picture.
     Where a board ends three of the four quarters are alike, or two are: it is half of what it is within.
     """
-    squares = (np.gradient(grid[1:-1, 1:-1], axis=axis) for axis in (1, 0))
-    along, across = (_padded(one, mode="edge")[..., None, None, :] for one in squares)
-    places = grid[..., None, None, :] + _QUARTERS[:, None] * along + _QUARTERS[:, None, None] * across
+    u, v = (_padded(np.gradient(grid[1:-1, 1:-1], axis=axis), mode="edge")[..., None, None, :] for axis in (1, 0))
+    places = grid[..., None, None, :] + _QUARTERS[:, None] * u + _QUARTERS[:, None, None] * v
     inside = _inside(places, image.shape, 0.0)
     x, y = np.moveaxis(np.where(inside[..., None], places, 0.0).round().astype(int), -1, 0)
     levels = np.where(inside, image[y, x], np.nan) * np.sign(np.outer(_QUARTERS, _QUARTERS))
@@ -81,29 +80,21 @@ def _grown(image: Image, seed: Array, most: int) -> Saddles:
     """All corners that the seed leads to, at most so many each way; measured once more when all are there."""
     known = _trimmed(_clean(measure_saddles(image, seed), image.shape))
     for _ in range(2 * most):
-        wider, measured, fresh = _around(image, known)
+        wider = Saddles(*map(_padded, vars(known).values()))
+        unknown = np.isnan(wider.contrast)
+        measured = _clean(fit_saddles(image, _foreseen(wider.grid), unknown), image.shape)
+        fresh = unknown & _strong(measured.contrast, wider.contrast)
         if not np.any(fresh):
             break
-        pairs = ((getattr(measured, name), getattr(wider, name)) for name in ("contrast", "misfit"))
-        grid = np.where(fresh[..., None], measured.grid, wider.grid)
-        known = _trimmed(Saddles(grid, *(np.where(fresh, new, old) for new, old in pairs)))
+        pairs = zip(vars(measured).values(), vars(wider).values(), strict=True)
+        known = _trimmed(Saddles(*(np.where(fresh.T, new.T, old.T).T for new, old in pairs)))
     return _trimmed(_clean(measure_saddles(image, known.grid), image.shape))
-
-
-def _around(image: Image, known: Saddles) -> tuple[Saddles, Saddles, Mask]:
-    """What is known with a border, what is measured where nothing is known, and which of that are corners."""
-    wider = Saddles(*(_padded(values) for values in (known.grid, known.contrast, known.misfit)))
-    unknown = np.isnan(wider.contrast)
-    measured = _clean(fit_saddles(image, _foreseen(wider.grid), unknown), image.shape)
-    return wider, measured, unknown & _strong(measured.contrast, wider.contrast)
 
 
 def _clean(saddles: Saddles, shape: tuple[int, ...]) -> Saddles:
     """Without what is no saddle, or too near to the border to be measured."""
     with np.errstate(invalid="ignore"):
-        bad = ~(_inside(saddles.grid, shape, _BORDER_PX) & (saddles.misfit < _MISFIT))
-    grid = np.where(bad[..., None], np.nan, saddles.grid)
-    return Saddles(grid, *(np.where(bad, np.nan, values) for values in (saddles.contrast, saddles.misfit)))
+        return saddles.without(~(_inside(saddles.grid, shape, _BORDER_PX) & (saddles.misfit < _MISFIT)))
 
 
 def _padded(values: Array, **how: Any) -> Array:

@@ -64,6 +64,10 @@ class Saddles(Frozen):
     contrast: Array
     misfit: Array
 
+    def without(self, wrong: Mask) -> Saddles:
+        """With some corners (rows, columns) left out."""
+        return Saddles(*(np.where(wrong.T, np.nan, values.T).T for values in vars(self).values()))
+
 
 def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddles:
     """The corners of a board near where a detector saw them.
@@ -82,9 +86,7 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
     rows, columns = np.indices(fitted.contrast.shape)
     signed = np.where((rows + columns) % 2 == 0, fitted.contrast, -fitted.contrast)
     usual = float(medians_known(signed.ravel()))
-    wrong = ~(signed * np.sign(usual) > max(_FAINT * np.abs(usual), _ROUNDING * float(np.max(image))))
-    contrast, misfit = (np.where(wrong, np.nan, values) for values in (fitted.contrast, fitted.misfit))
-    return Saddles(np.where(wrong[..., None], np.nan, fitted.grid), contrast, misfit)
+    return fitted.without(~(signed * np.sign(usual) > max(_FAINT * np.abs(usual), _ROUNDING * float(np.max(image)))))
 
 
 def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH) -> Saddles:
