@@ -70,10 +70,11 @@ def _by_own_poses(problem: Problem, estimate: Estimate) -> dict[str, float]:
 
 def shifted(observations: Observations) -> Iterator[str]:
     """In words, of each station whose frames suit those of the first one by another count."""
+    alike = 0.15  # what a start leaves of poses that are the same, see `same_labels`
     for moments in _moments(observations):
         costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
         best = min(costs, key=costs.__getitem__)
-        if _is_clear(costs[0], costs[best]):
+        if _is_clear(costs[0], costs[best]) and costs[best] < alike:
             where = f"{counted(abs(best), 'frame')} {'later' if best > 0 else 'earlier'}"
             yield (
                 f"{moments.first!r} and {moments.second!r} do not show the same moments: what {moments.first!r} shows "
@@ -123,11 +124,13 @@ class _Moments:
     def exchanged(self) -> Iterator[tuple[tuple[str, str], str]]:
         """The second station's placements that suit others of the first, and which."""
         off = self._off(0)
-        likeliest = self._at(0)[int(np.argmin(np.median(off, axis=1)))]
+        likeliest, usual = self._at(0)[int(np.argmin(np.median(off, axis=1)))], self.cost(0)
         suits = np.array([[self._apart(one, likeliest) for one in row] for row in self._between])
         for number, name in enumerate(self._names):
             best = int(np.argmin(suits[:, number]))
-            if _is_clear(suits[number, number], suits[best, number]):
+            # As well as the others do, or it is something else: labels that are turned suit another frame by chance.
+            as_well = not _is_clear(suits[best, number], usual)
+            if as_well and _is_clear(suits[number, number], suits[best, number]):
                 yield (self.second, name), self._names[best]
                 yield (self.first, self._names[best]), name
 
