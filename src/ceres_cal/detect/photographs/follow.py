@@ -234,7 +234,7 @@ class Tracker:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
         whole = self._with(followed)
         followed = whole.without_aside(followed)
-        if followed.built.is_other and followed.built.wander_m:  # as by a polynomial for a strong lens
+        if followed.built.is_other:  # as by a lens that does not suit: a polynomial bends a strong one's lines
             followed = whole.without_aside(whole.with_best_lens(followed))
         if followed.built.is_other:
             followed = self.as_drawn(followed)
