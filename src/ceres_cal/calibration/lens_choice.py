@@ -104,13 +104,6 @@ class Comparison(Frozen):
     there: Estimate
     passed: Candidate | None = None
 
-    @cached_property
-    def probabilities(self) -> tuple[float, ...]:
-        """That each lens that was tried is the one that predicts best; 0 where it gives no answer."""
-        known = {i: one.squares for i, one in enumerate(self.tried) if one.squares is not None}
-        likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
-        return tuple(likely.get(i, 0.0) for i in range(len(self.tried)))
-
     @property
     def worse_than_passed(self) -> float:
         """By how many standard errors it predicts worse than the one that was passed over; 0 where that is as good."""
@@ -125,10 +118,11 @@ class Comparison(Frozen):
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
+        told = [one for one in self.tried if not one.form.blank.roughness]
         each = [
             (one, likely)
-            for one, likely in zip(self.tried, self.probabilities, strict=True)
-            if one is not self.chosen and likely >= least_probability and not (one.form.blank.roughness or one.fault)
+            for one, likely in zip(told, _probabilities(told), strict=True)
+            if one is not self.chosen and likely >= least_probability and not one.fault
         ]
         if self.chosen.form.blank.roughness or not each:
             return found
@@ -284,16 +278,22 @@ def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
     return any(other.refutes(tried[number]) for other in tried)
 
 
+def _probabilities(among: Sequence[Candidate]) -> list[float]:
+    """That each of some lenses is the one of them that predicts best; 0 where it gives no answer."""
+    known = {i: one.squares for i, one in enumerate(among) if one.squares is not None}
+    likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
+    return [likely.get(i, 0.0) for i in range(len(among))]
+
+
 def _choice(among: Comparison) -> LensChoice:
-    chosen = among.chosen
+    chosen, likely = among.chosen, _probabilities(among.tried)
 
     def as_told(one: Candidate) -> TriedLens:
         label, count = one.form.label, len(one.form.names)
         if one.squares is None or chosen.squares is None:
             return TriedLens(label, count, failed=one.failed)
-        likely = among.probabilities[among.tried.index(one)]
         worse = among.worse_than_passed if one is chosen else standard_errors(one.squares, chosen.squares)
-        return TriedLens(label, count, one.rms_px, worse, probability=likely)
+        return TriedLens(label, count, one.rms_px, worse, probability=likely[among.tried.index(one)])
 
     order = sorted(among.tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
     groups = 0 if chosen.squares is None else len(chosen.squares)

@@ -177,11 +177,11 @@ def last_resort(seen: InlierRows, chosen: Candidate, *, by_most: bool = False) -
     predicted, too. Nor where some camera has one view, of a floor: a line that is painted aside bends there as by a
     lens.
     """
-    views = [len(seen.sights.of_camera(name)) for name in seen.sights.cameras]
-    if min(views) == 1 or seen.splits_placements:
+    if seen.splits_placements:
         return
     if by_most or _between_cells(seen, chosen.of) > _TOGETHER:
-        for forms in without_formula():
+        fewest = min(len(seen.sights.of_camera(name)) for name in seen.sights.cameras)
+        for forms in without_formula(of_one_view=fewest == 1):
             yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
 
 

@@ -124,9 +124,14 @@ def kinds() -> Iterator[tuple[Form, ...]]:
     return (forms_of(kind) for kind, lens in LENSES.items() if not lens.set_at_start)
 
 
-def without_formula() -> Iterator[tuple[Form, ...]]:
-    """The lenses of all other kinds."""
-    return ((Form.among(Options(lens=kind)),) for kind, lens in LENSES.items() if lens.set_at_start)
+def without_formula(*, of_one_view: bool) -> Iterator[tuple[Form, ...]]:
+    """The lenses of all other kinds.
+
+    Args:
+        of_one_view: without what one view of a floor does not tell from a field that is longer or wider than drawn.
+    """
+    powers = (2,) if of_one_view else ()
+    return ((Form.among(Options(lens=kind, powers=powers)),) for kind, lens in LENSES.items() if lens.set_at_start)
 
 
 # How much worse than the best, in standard errors of the difference, is as good: at 1 the paper's lens is missed more
