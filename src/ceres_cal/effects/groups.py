@@ -228,30 +228,40 @@ def compare_groups(groups: GroupNormals, scatter: Array, whole: Array) -> tuple[
     values, vectors = np.linalg.eigh(whole)
     values = np.maximum(values, 1e-12 * values[-1])
     white, root = (vectors * values**-0.5) @ vectors.T, (vectors * values**0.5) @ vectors.T
-    expected, spread = _expected(groups.normal, scatter, whole, white)
+    seen = _seen_by(groups)  # of the placements of a rig only those of the views that are asked
+    turn, own_white = np.linalg.qr(white @ seen)
+    normal, gradient = seen.T @ groups.normal @ seen, groups.gradient @ seen
+    expected, spread = _expected(normal, seen.T @ scatter @ seen, seen.T @ whole @ seen, own_white.T)
     mean = float(np.sum(np.trace(expected, axis1=1, axis2=2)))
     if mean < _LEAST_LEFT:
         return None
-    ratio, degrees = float(np.sum((groups.gradient @ white) ** 2)) / mean, 2.0 * mean**2 / spread
+    ratio, degrees = float(np.sum((gradient @ own_white.T) ** 2)) / mean, 2.0 * mean**2 / spread
     variance, probability = _averaged(ratio, degrees, float(np.trace(whole)) / len(whole))
     size, traces = len(whole), np.trace(groups.normal, axis1=1, axis2=2)
     alike = (
         float(np.sum(traces) ** 2 / np.sum(traces**2)) - 1.0
     )  # groups beyond the first that say as much as one another
     weight = probability * alike / (alike + size)
-    jackknife = _jackknife(groups, expected, white, root)
+    jackknife = size * turn @ _jackknife(normal, gradient, expected, own_white.T) @ turn.T
     factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife
     widened = _widened(factor, white @ (whole - groups.known) @ white)
     return GroupScatter(len(scatter), variance, probability, degrees), root @ widened @ root
 
 
+def _seen_by(groups: GroupNormals) -> Array:
+    """(P, R) an orthonormal basis of the directions that any of the groups tells of."""
+    rounding = 1e-13  # of the direction that they tell most of
+    values, vectors = np.linalg.eigh(groups.normal.sum(axis=0))
+    return np.asarray(vectors[:, values > rounding * values[-1]])
+
+
 def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:
-    """(G, P, P) covariance of each group's score, whitened, and the variance of the sum of their squared lengths."""
+    """(G, R, R) covariance of each group's score, whitened, and the variance of the sum of their squared lengths."""
     a, m, size = informations @ white, scatter @ white, len(white)
     left = np.concatenate([a, -m], axis=1)  # Cov(g_i, g_j) is left_i^T right_j for others, and more for i = j
     right = np.concatenate([whole @ a - m, a], axis=1)
     cross = np.swapaxes(left, 1, 2) @ right
-    own = cross + white @ m
+    own = cross + white.T @ m
     lefts, rights = (np.swapaxes(part, 0, 1).reshape(2 * size, -1) for part in (left, right))
     pairs = float(np.sum((lefts @ lefts.T) * (rights @ rights.T)))
     return own, 2.0 * (pairs - float(np.sum(cross**2)) + float(np.sum(own**2)))
@@ -274,14 +284,12 @@ def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, floa
     return float(weights @ np.exp(logs)), float(1.0 - weights[0])
 
 
-def _jackknife(groups: GroupNormals, expected: Array, white: Array, root: Array) -> Array:
-    """(P, P) how leaving out one group after the other moves it, whitened; 1 on average where they agree."""
-    size = len(white)
-    moves = white @ np.linalg.inv((1.0 + _RIDGE) * np.eye(size) - groups.normal)
-    steps = np.einsum("gij,gj->gi", moves, groups.gradient)
-    turned = moves @ root
-    mean = float(np.sum(turned * (turned @ expected)))
-    return np.asarray(steps.T @ steps * (size / mean))
+def _jackknife(normal: Array, gradient: Array, expected: Array, white: Array) -> Array:
+    """(R, R) how leaving out one group after the other moves it, whitened; of trace 1 on average where they agree."""
+    moves = white.T @ np.linalg.inv((1.0 + _RIDGE) * np.eye(len(white)) - normal)
+    steps = np.einsum("gij,gj->gi", moves, gradient)
+    turned = moves @ np.linalg.inv(white.T)
+    return np.asarray(steps.T @ steps / float(np.sum(turned * (turned @ expected))))
 
 
 def _widened(factor: Array, observed: Array) -> Array:
