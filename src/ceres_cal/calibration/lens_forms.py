@@ -128,10 +128,17 @@ def without_formula(*, of_one_view: bool) -> Iterator[tuple[Form, ...]]:
     """The lenses of all other kinds.
 
     Args:
-        of_one_view: without what one view of a floor does not tell from a field that is longer or wider than drawn.
+        of_one_view: a profile along the radius and a decentring alone. One view of a floor tells nothing else from a
+            field of other dimensions, or from a tilt of the sensor, by which places at a height were 76 mm off.
     """
-    powers = (2,) if of_one_view else ()
-    return ((Form.among(Options(lens=kind, powers=powers)),) for kind, lens in LENSES.items() if lens.set_at_start)
+    for kind, lens in LENSES.items():
+        if lens.set_at_start and of_one_view:
+            blank = make_lens(kind, (2,))
+            own = {*blank.set_at_start, *blank.roughness[0].names, "p1", "p2"}
+            told = tuple(name for name in blank.names if name in own)
+            yield (Form.among(Options(lens=kind, powers=(2,), coefficients=told)),)
+        elif lens.set_at_start:
+            yield (Form.among(Options(lens=kind)),)
 
 
 # How much worse than the best, in standard errors of the difference, is as good: at 1 the paper's lens is missed more

@@ -19,6 +19,7 @@ from ceres_cal.posterior.maps import FieldMap
 from ceres_cal.posterior.uncertainty import Verdict
 from ceres_cal.report.quality import FaultyMap, Quality
 from ceres_cal.robust.as_built import words_of
+from ceres_cal.scene.targets.target import PAINT_WANDERS
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
@@ -90,9 +91,15 @@ def disputed(quality: Quality) -> bool:
 
 
 def noise_ratio(quality: Quality) -> float:
-    """The noise over what was stated, the larger one of points and curves; 0 where nothing was stated."""
+    """The noise over what was stated, the larger one of points and curves; 0 where nothing was stated, and of curves
+    where paint that wanders as it usually does makes as much: photographs state what their pixels do.
+    """
     every = () if quality.diagnosis is None else quality.diagnosis.noise
-    return max((one.scale for one in every if np.isfinite(one.stated_px)), default=0.0)
+    paint_mm = 1e3 * PAINT_WANDERS * min((target.usual_aside_m for target in quality.fields), default=0.0)
+    found = [one for one in quality.findings if one.kind == "noise" and one.subject == "curves"]
+    is_paint = any(one.effect_mm <= paint_mm for one in found)
+    told = [one for one in every if np.isfinite(one.stated_px) and not (is_paint and one.kind == "curves")]
+    return max((one.scale for one in told), default=0.0)
 
 
 def misfit_mm(quality: Quality) -> float:

@@ -21,11 +21,11 @@ from ceres_cal.observations import Prior
 from ceres_cal.problem import dimension_slopes, dimensions_of, intrinsic_names
 from ceres_cal.problem.residuals import residuals, whole_structure, write_equations
 from ceres_cal.scene import Camera, Target
+from ceres_cal.scene.targets.target import PAINT_WANDERS
 
 # Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
 # lie aside, root sum of squares: farther, they are others.
-_SCATTER, _FARTHEST = np.array([0.0125, 0.025, 0.05, 0.1, 0.2]), 3.0
-_ASIDE = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
+_SCATTER, _FARTHEST = PAINT_WANDERS * 0.5 ** np.arange(4.0, -1.0, -1.0), 3.0
 _OTHER = 0.1  # of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 _BEAM, _MOST = 24, 9
@@ -103,13 +103,6 @@ AS_DRAWN = FieldAsBuilt({}, {}, {}, {}, (), np.inf)
 """Nothing is known of how a target is painted."""
 
 
-def usual_aside_m(target: Target) -> float:
-    """By how much a curve of a target lies aside that does: as it states, or as people lay out what is so large."""
-    widths = [curve.width_m for curve in target.curves.values() if curve.width_m > 0.0]
-    usual = _ASIDE * float(np.sqrt(np.median(widths) * 1e-3 * np.max(np.ptp(target.box, axis=0))))
-    return target.tolerance_m or usual
-
-
 def _spoken(name: str) -> str:
     """center_circle_radius_m -> the center circle radius"""
     return f"the {name.removesuffix('_m').replace('_', ' ')}"
@@ -154,7 +147,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
-    shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, usual_aside_m(target))
+    shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, target.usual_aside_m)
     wander_m = _wander_m(lines, target, bent.left_over * sigma[equations.observation], equations.observation)
     return replace(shape.explained(), wander_m=wander_m)
 

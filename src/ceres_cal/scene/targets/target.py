@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, convert, field
+from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, convert, field, median
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
@@ -60,6 +60,8 @@ LARGEST_M = 1e7
 
 
 HANDY_M = 50.0  # of a target that somebody holds before a camera, from its origin
+PAINT_WANDERS = 0.2
+"""Of `Target.usual_aside_m`: by how much lines wander about where they are drawn, tape by 3 to 8 mm of 9 m."""
 
 
 def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
@@ -215,6 +217,15 @@ class Target(Frozen):
     def reach_m(self) -> float:
         """How far the farthest of `places` lies from its origin."""
         return float(np.max(np.linalg.norm(self.places, axis=1), initial=0.0))
+
+    @property
+    def usual_aside_m(self) -> float:
+        """By how much a curve lies aside that does: as it states, or as people lay out what is so large; 0 without."""
+        aside = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
+        widths = [curve.width_m for curve in self.curves.values() if curve.width_m > 0.0]
+        if self.tolerance_m or not widths:
+            return self.tolerance_m or 0.0
+        return aside * float(np.sqrt(median(np.array(widths)) * 1e-3 * np.max(np.ptp(self.box, axis=0))))
 
     @cached_property
     def box(self) -> Array:
