@@ -25,9 +25,10 @@ from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects.columns import EffectColumns, ScoreTest
 from ceres_cal.effects.table.camera import motion_columns
+from ceres_cal.observations import NO_POINTS
 from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
-from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, reaches, worst
+from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, noise_ratio, reaches, worst
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.quality import Material, quality_of
 from ceres_cal.report.residual_pictures import significant_means
@@ -240,6 +241,17 @@ def test_no_accuracy_is_stated_where_the_noise_is_three_times_the_stated_one() -
     judged = judge_quality(quality_of(calibrate(stated, RADIAL), stated))
     assert judged.level == "care"
     assert judged.headline == "Usable with limits, without a stated accuracy: the noise is 3.5 times the stated sigma."
+
+
+@pytest.mark.parametrize("noise_px, ratio", [(0.5, 0.0), (2.5, 5.0)])
+def test_noise_of_curves_as_paint_wanders_is_no_doubt(noise_px: float, ratio: float) -> None:
+    """2.5 mm, and 13."""
+    station = Station("c", overhead_pose(0.0, 0.0, 4.2, 12.0, 8.0, 0.0))
+    scene = field_scene(ssl_field("B"), {"c": camera("brown")}, {"s": station}, spacing_m=0.25)
+    observations = simulate(scene, Disturbance(0.1, noise_px), 1).observations
+    curves = replace(observations.curves, sigma_px=np.full(len(observations.curves), noise_px / 5.0))
+    stated = replace(observations, points=NO_POINTS, curves=curves)
+    assert noise_ratio(quality_of(calibrate(stated, Options(lens="brown")), stated)) == pytest.approx(ratio, rel=0.15)
 
 
 def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
