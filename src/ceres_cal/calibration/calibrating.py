@@ -26,7 +26,6 @@ from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.start.same_moments import require_same_moments, shifted
 
 if TYPE_CHECKING:
     from ceres_cal.calibration.lens_choice import Chosen
@@ -71,6 +70,8 @@ def calibrate(
         except (DegenerateError, SolutionError) as error:
             if odd := next(unfilled(observations), None):
                 raise type(error)(f"{error}; {odd}") from None
+            from ceres_cal.start.same_moments import shifted
+
             if apart := next(shifted(observations), None):
                 raise type(error)(f"{apart}: {error}") from None
             free = _without_priors(observations, options)
@@ -143,6 +144,8 @@ def _of_same_moments(calibration: Calibration, observations: Observations) -> Ca
     """
     if len(observations.cameras) < 2 or is_bulk(observations) or not calibration.rounds:
         return calibration
+    from ceres_cal.start.same_moments import require_same_moments
+
     words = require_same_moments(calibration.problem(observations), calibration.estimate)
     return replace(calibration, warnings=(*calibration.warnings, words)) if words else calibration
 

@@ -9,7 +9,7 @@ pictures, too, turned about the principal point; residuals tell nothing of any o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from ceres_cal.problem import Estimate, Problem, Residuals
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
-from ceres_cal.start.same_moments import shown_elsewhere
 
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
@@ -198,8 +197,11 @@ def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterato
     sights = problem.sights
     shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < 0.5)]
-    in_rig = any(key.placement not in (None, *sights.seen_once) for key, _ in lost)
-    elsewhere = shown_elsewhere(problem.observations) if in_rig else {}
+    elsewhere: Mapping[tuple[str, str], str] = {}
+    if any(key.placement not in (None, *sights.seen_once) for key, _ in lost):  # of a rig
+        from ceres_cal.start.same_moments import shown_elsewhere
+
+        elsewhere = shown_elsewhere(problem.observations)
     for key, share in lost:
         checks, other = "check its labels, do not use its pose", elsewhere.get((key.station, str(key.placement)))
         if other is not None:
