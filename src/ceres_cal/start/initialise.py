@@ -59,7 +59,8 @@ def initialise(sights: Sights, options: Options) -> Start:
     """A start for everything the observations show.
 
     A camera over a field alone, of whose principal point nothing is stated, may show a part of a sensor: where a start
-    from the picture's middle leaves much, those from its quarters are tried, too. Boards tell it by themselves.
+    from the picture's middle leaves much, those from its quarters are tried, too, where a homography holds: about a
+    right quarter one does, about a wrong one a search only takes its time. Boards tell it by themselves.
 
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
@@ -78,7 +79,7 @@ def initialise(sights: Sights, options: Options) -> Start:
         for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_sigmas else ():
             there = Prior("camera", name, "principal_point", (x * size[0], y * size[1]), (1.0, 1.0))
             moved = replace(given, priors=(*given.priors, there))
-            other = attempt(partial(_initialised, sights, moved))  # quiet: it is one of five
+            other = attempt(partial(_initialised, sights, moved, may_search=False))  # quiet: it is one of five
             if isinstance(other, tuple) and (left := _left(sights, own, *other)) < least:
                 (start, _), least, options = other, left, moved
     return start
@@ -93,9 +94,11 @@ def _left(sights: Sights, own: Indices, start: Start, places: Mapping[int, Camer
     return median(np.concatenate([left_of(seen[i], places[number]) for i, number in enumerate(own.tolist())]))
 
 
-def _initialised(sights: Sights, options: Options) -> tuple[Start, Mapping[int, CameraPlace]]:
+def _initialised(
+    sights: Sights, options: Options, *, may_search: bool = True
+) -> tuple[Start, Mapping[int, CameraPlace]]:
     """A start, and from where each sight of the world is seen there."""
-    posed = posed_sights(sights, options)
+    posed = posed_sights(sights, options, may_search=may_search)
     stations, placements = chained_poses(sights, posed.numbers, posed.poses, open_numbers=posed.open)
     structure = options.structure_of(sights.observations.targets)
     estimate = Estimate(posed.cameras, stations, placements, structure)
@@ -129,15 +132,20 @@ class PosedSights(Frozen):
     open: dict[int, tuple[str, ...]]
 
 
-def posed_sights(sights: Sights, options: Options) -> PosedSights:
-    """Every camera with the sights that pose it, each camera by itself."""
+def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -> PosedSights:
+    """Every camera with the sights that pose it, each camera by itself.
+
+    Raises:
+        SolutionError: see `placed`.
+    """
     priors = (*sights.observations.priors, *options.priors)
     parts: list[PosedSights] = []
     for name, image_size in sights.observations.cameras.items():
         blank = _blank_camera(name, image_size, options, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
-        one = _start_camera(name, blank, seen, options, [p for p in priors if _concerns(p, name, seen)])
+        own_priors = [p for p in priors if _concerns(p, name, seen)]
+        one = _start_camera(name, blank, seen, options, own_priors, may_search=may_search)
         places, there = ({int(own[n]): value for n, value in part.items()} for part in (one.places, one.open))
         parts.append(replace(one, numbers=own[one.numbers], places=places, open=there))
     return PosedSights(
@@ -154,7 +162,9 @@ def posed_sights(sights: Sights, options: Options) -> PosedSights:
 # ---- one camera -----------------------------------------------------------------------------------------------------
 
 
-def _start_camera(name: str, blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior]) -> PosedSights:
+def _start_camera(
+    name: str, blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior], *, may_search: bool
+) -> PosedSights:
     """From the sights of one camera about its principal point, and the priors that concern it."""
     unit = unit_px(blank)
     given = _held_profile(blank, sights, options)
@@ -169,7 +179,8 @@ def _start_camera(name: str, blank: Camera, sights: Sights, options: Options, pr
     for number in of_world:
         known = beforehand(priors, sights.keys[number].station, _known_phi(phi, told, unit, priors))
         may_bend = given is None and not told
-        one = placed(sights[number], profile, known, poses.get(number), float(np.log(phi)), may_bend=may_bend)
+        guess = poses.get(number), float(np.log(phi))
+        one = placed(sights[number], profile, known, *guess, may_bend=may_bend, may_search=may_search)
         found[number], best = one, one.places[0]
         if not told:
             phi, profile = best.phi, best.profile

@@ -69,16 +69,24 @@ def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, floa
 
 
 def placed(
-    sight: Sights, profile: RadialProfile, known: Beforehand, proposed: Array | None, log_phi: float, *, may_bend: bool
+    sight: Sights,
+    profile: RadialProfile,
+    known: Beforehand,
+    proposed: Array | None,
+    log_phi: float,
+    *,
+    may_bend: bool,
+    may_search: bool = True,
 ) -> Placed:
     """The places of a camera by one sight about it.
 
     Args:
         proposed: cam_from_world (3, 4) of a homography at this log phi, where there is one.
         may_bend: whether the profile may be another one: wrong labels decide about it, too, where nothing holds.
+        may_search: whether a camera is searched for where what is proposed does not hold.
 
     Raises:
-        SolutionError: only a mirrored picture of the floor holds.
+        SolutionError: only a mirrored picture of the floor holds, or nothing does and none is searched for.
     """
     bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
     lines = _lines_of(sight, profile, known, _rows_of(sight))
@@ -90,6 +98,8 @@ def placed(
             if known.held[6]:  # other sights told phi and lens: their homography is as near as what is seen here
                 return _answered(lines, profile, replace(found, poses=given, costs=found.costs[:1]))
             return _answered(*_at_rest(sight, lines, profile, found))
+    if not may_search:
+        raise SolutionError(f"station {sight.keys[0].station!r}: {what_poses(sight)}")
     known = replace(known, bend_sd=bend_sd if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
     profiles = (profile, none) if may_bend else (profile,)
