@@ -852,6 +852,36 @@ def test_no_saddle_is_looked_for_outside_of_a_picture() -> None:
     assert np.isnan(fitted).all()
 
 
+# ---- profiles -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("smear_px, lean", [(0.0, 0.0), (2.5, 0.7), (4.0, -1.0)])
+def test_the_equations_of_profiles_are_those_of_their_formula(smear_px: float, lean: float) -> None:
+    """Of `detect.profiles`, its smear a mean over many parts, its derivatives differences; of more than one chunk."""
+    rng, edges, heights, share = np.random.default_rng(1), np.array([-1.4, 1.3]), np.array([80.0, -70.0]), 20_000
+    distance, values = rng.uniform(-9.0, 9.0, 301), rng.uniform(0.0, 255.0, 301)
+    u = (np.arange(share) + 0.5) / share if smear_px else np.array([0.5])
+
+    def model(numbers: Array) -> Array:
+        b, g, first, second, c, log_blur, log_stretch, log_smear = numbers
+        away, smear = distance - c, smear_px * np.exp(log_smear)
+        total = b + g * away
+        for height, edge in zip((first, second), edges * np.exp(log_stretch), strict=True):
+            t = away[:, None] - edge + (0.5 - lean / 6.0 - u) * smear
+            total += height * np.mean((1.0 + lean * (1.0 - 2.0 * u)) * norm.cdf(t / np.exp(log_blur)), axis=1)
+        return np.asarray(total)
+
+    at, free = np.array([0.0, 0.0, *heights, 0.2, np.log(0.9), 0.0, 0.0]), 3 if smear_px else 2
+    steps = 1e-4 * np.eye(8)[: 5 + free]
+    columns = np.array([(model(at + step) - model(at - step)) / 2e-4 for step in steps])
+    normals, rights = np.empty((1, 5 + free, 5 + free)), np.empty((1, 5 + free))
+    shape = np.array([[0.9, smear_px, lean, 0.2]])
+    kernels.profile_equations(distance[None], values[None], edges[None], shape, heights[None], free, normals, rights)
+    sizes = np.linalg.norm(columns, axis=1)
+    assert np.max(np.abs(normals[0] - columns @ columns.T) / np.outer(sizes, sizes)) < 1e-6  # 1.2e-8  # 3e-8
+    assert np.max(np.abs(rights[0] - columns @ values) / sizes / np.linalg.norm(values)) < 1e-6
+
+
 def test_the_normal_distribution_is_told_far_out() -> None:
     """As far as there are numbers, of any shape."""
     x = np.array([[-37.0, -8.0, -1.0], [0.0, 2.0, 9.0]])

@@ -7,7 +7,8 @@ import pytest
 
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.detect.blur import blur_of, no_blur
-from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape, normal_step
+from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
+from ceres_cal.kernels import normal_cdf
 
 WIDTH_PX = 2.4
 COUNT = 200
@@ -23,8 +24,8 @@ def stripe(
     # The pixel's own square comes from averaging; the small squares' too, which is 1 / 12 / fine^2 of variance.
     s = np.sqrt(blur**2 - 1.0 / 12.0 / fine**2)
     light = left + slope * t
-    light += (190.0 - left) * normal_step((t + 0.5 * WIDTH_PX) / s)[0]
-    light += (right - 190.0) * normal_step((t - 0.5 * WIDTH_PX) / s)[0]
+    light += (190.0 - left) * normal_cdf((t + 0.5 * WIDTH_PX) / s)
+    light += (right - 190.0) * normal_cdf((t - 0.5 * WIDTH_PX) / s)
     return np.asarray(light.reshape(61, fine, 61, fine).mean(axis=(1, 3)))
 
 
@@ -103,7 +104,7 @@ def test_sigma_is_the_scatter() -> None:
 def test_curves_bend() -> None:
     y, x = np.indices((61, 61)) - 30.0
     radius = np.hypot(x, y + 40.0)  # a circle of 40 px radius whose lowest place is the middle
-    image: Array32 = (200.0 * normal_step((41.3 - radius) / 0.8)[0]).astype(np.float32)
+    image: Array32 = (200.0 * normal_cdf((41.3 - radius) / 0.8)).astype(np.float32)
     normal = np.array([[0.0, 1.0]])
     bent = cut_windows(image, np.array([[30.0, 30.0]]), normal, np.array([-1.0 / 40.0]), 5.0, 4)
     straight = cut_windows(image, np.array([[30.0, 30.0]]), normal, np.zeros(1), 5.0, 4)
@@ -119,14 +120,6 @@ def test_windows_at_the_border_and_without_light_tell_nothing() -> None:
     assert windows.inside.tolist() == [True, False]
     found = fit_profiles(windows, np.array([[-1.0, 1.0], [-1.0, 1.0]]), 0.8, 2.0)
     assert np.isnan(found.offset_px[1]) and np.max(np.abs(found.heights)) < 1e-3
-
-
-def test_normal_step() -> None:
-    scipy = pytest.importorskip("scipy.stats")
-    x = np.linspace(-6.0, 6.0, 1001)
-    step, bell = normal_step(x)
-    assert np.max(np.abs(step - scipy.norm.cdf(x))) < 1e-15
-    assert np.max(np.abs(bell - scipy.norm.pdf(x))) < 1e-15
 
 
 def test_a_blur_is_told_where_nothing_is_bright() -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.frozen import Frozen, Rows
-from ceres_cal.kernels import normal_cdf
+from ceres_cal.kernels import profile_equations
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
@@ -130,7 +130,7 @@ def fit_profiles(
     """
     offset = np.zeros(len(windows.values))
     steps = _Steps(edges, *(np.broadcast_to(np.asarray(one, float), offset.shape) for one in (blur_px, smear_px, lean)))
-    normal, right = _normal(_columns(windows, steps, offset, None), windows.values)
+    normal, right = steps.equations(windows, offset, None)
     heights = _solve(normal, right)[:, 2:]
     squares = np.sum(windows.values**2, axis=1)
     variance = (squares - np.sum(_solve(normal, right) * right, axis=1)) / windows.values.shape[1]
@@ -138,15 +138,14 @@ def fit_profiles(
     level[2:-1] = 1.0 if edges.shape[1] > 1 else 0.0
     for _ in range(_STEPS):
         known = np.maximum(variance, 0.0)[:, None, None] * np.outer(level, level) / _LEVEL_SIGMA**2
-        columns = _columns(windows, steps, offset, heights)
-        normal, right = _normal(columns, windows.values)
+        normal, right = steps.equations(windows, offset, heights)
         solution = _solve(normal + known, right)
         variance = _misfit(squares, normal, right, solution) / windows.values.shape[1]
         step = np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
         offset, heights = np.clip(offset + step, -reach_px - 1.0, reach_px + 1.0), solution[:, 2:-1]
         if np.all(np.abs(step) < 1e-3):
             break
-    freedom = windows.values.shape[1] - columns.shape[1]
+    freedom = windows.values.shape[1] - right.shape[1]
     misfit = np.maximum(_misfit(squares, normal, right, solution), 0.0)
     noise = np.sqrt(misfit / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
     sigma = noise * np.sqrt(np.maximum(np.linalg.inv(normal + known + _ridge(normal + known))[:, -1, -1], 0.0))
@@ -182,9 +181,8 @@ def fit_shape(
         now = np.exp(shape)
         steps = _Steps(edges * now[1], now[0] * ones, (now[2] if free > 2 else 0.0) * length, lean)
         if heights is None:
-            heights = _solve(*_normal(_columns(windows, steps, offset, None), windows.values))[:, 2:]
-        columns = _columns(windows, steps, offset, heights, free=free)
-        normal, right = _normal(columns, windows.values)
+            heights = _solve(*steps.equations(windows, offset, None))[:, 2:]
+        normal, right = steps.equations(windows, offset, heights, free=free)
         own, squares = normal[:, :-free, :-free], np.sum(windows.values**2, axis=1)
         solution = _solve(own, right[:, :-free])
         noise = np.maximum(squares - np.sum(solution * right[:, :-free], axis=1), 1.0) / windows.values.shape[1]
@@ -207,11 +205,6 @@ def fit_shape(
     return EdgeShape(*np.exp(shape).tolist())
 
 
-def normal_step(x: Array) -> tuple[Array, Array]:
-    """The normal distribution's Phi(x), and its density."""
-    return normal_cdf(x), np.exp(-0.5 * x * x) * (1.0 / np.sqrt(2.0 * np.pi))
-
-
 # ---- least squares over many small problems -------------------------------------------------------------------------
 
 
@@ -223,53 +216,20 @@ class _Steps(Frozen):
     smear: Array
     lean: Array
 
-    def rise(self, number: int, distance: Array) -> tuple[Array, Array, Array, Array]:
-        """(N, K) how high step `number` is at distances from c, and the derivatives of that by the distance and by the
-        logarithms of blur and smear.
+    def equations(
+        self, windows: Windows, offset: Array, heights: Array | None, *, free: int = 0
+    ) -> tuple[Array, Array]:
+        """Normal equations (N, P, P) and (N, P) of the model: by b, g, each height; with heights by c too; and by as
+        many as are `free` of the logarithms of blur, the edges' stretch and smear.
         """
-        away, blur = distance - self.edges[:, number, None], self.blur[:, None]
-        if not np.any(self.smear):
-            high, bell = normal_step(away / blur)
-            return high, bell / blur, -bell * away / blur, np.zeros_like(high)
-        length, lean = np.maximum(self.smear, LEAST_SMEAR_PX)[:, None] / blur, self.lean[:, None]
-        mean = 0.5 - lean / 6.0
-        first, last = (_antiderivatives(away / blur + part * length) for part in (mean, mean - 1.0))
-        ends = [((1.0 + lean) * one - (1.0 - lean) * other) / length for one, other in zip(first, last, strict=True)]
-        between = [2.0 * lean * (one - other) / length**2 for one, other in zip(first, last, strict=True)]
-        by_blur, slope, rise = (ends[n] - between[n + 1] for n in range(3))
-        moved = (1.0 + lean) * mean * first[1] + (1.0 - lean) * (1.0 - mean) * last[1]
-        moved -= 2.0 * lean * (mean * first[2] + (1.0 - mean) * last[2]) / length
-        return rise, slope / blur, by_blur, moved + between[3] - rise
-
-
-def _antiderivatives(x: Array) -> tuple[Array, Array, Array, Array]:
-    """The normal density, its integral Phi, and the integrals of that, once and twice."""
-    high, bell = normal_step(x)
-    return bell, high, x * high + bell, 0.5 * ((x * x + 1.0) * high + x * bell)
-
-
-def _columns(windows: Windows, steps: _Steps, offset: Array, heights: Array | None, *, free: int = 0) -> Array:
-    """(N, P, K) derivatives of the model: by b, g, each height; with heights by c too; and by as many as are `free` of
-    the logarithms of blur, the edges' stretch and smear.
-    """
-    (count, pixels), number = windows.distance.shape, steps.edges.shape[1]
-    columns = np.zeros((count, 2 + number + (0 if heights is None else 1 + free), pixels))
-    away = windows.distance - offset[:, None]
-    columns[:, 0], columns[:, 1] = 1.0, away
-    for j in range(number):
-        columns[:, 2 + j], slope, by_blur, by_smear = steps.rise(j, away)
-        if heights is None:
-            continue
-        columns[:, 2 + number] -= heights[:, j, None] * slope
-        if free:
-            by_shape = (by_blur, -steps.edges[:, j, None] * slope, by_smear)
-            for k in range(free):
-                columns[:, 3 + number + k] += heights[:, j, None] * by_shape[k]
-    return columns
-
-
-def _normal(columns: Array, values: Array) -> tuple[Array, Array]:
-    return np.matmul(columns, np.swapaxes(columns, 1, 2)), np.matmul(columns, values[:, :, None])[:, :, 0]
+        count, edges = self.edges.shape
+        smear = np.maximum(self.smear, LEAST_SMEAR_PX) if np.any(self.smear) else self.smear
+        shapes = np.column_stack([self.blur, smear, self.lean, offset])
+        size = 2 + edges + (0 if heights is None else 1 + free)
+        normals, rights = np.empty((count, size, size)), np.empty((count, size))
+        steps = np.empty((0, edges)) if heights is None else heights
+        profile_equations(windows.distance, windows.values, self.edges, shapes, steps, free, normals, rights)
+        return normals, rights
 
 
 def _ridge(normal: Array) -> Array:

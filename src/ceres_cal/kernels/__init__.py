@@ -247,6 +247,27 @@ def fit_saddles(levels: Array32, starts: Array, fitted: Array) -> None:
     core().fit_saddles(levels, starts, fitted)
 
 
+def profile_equations(
+    distance: Array,
+    values: Array,
+    edges: Array,
+    shapes: Array,
+    heights: Array,
+    free: int,
+    normals: Array,
+    rights: Array,
+) -> None:
+    """The normal equations of `detect.profiles` in each of N windows, by the numbers of its model.
+
+    Args:
+        distance, values: (N, K) of the pixels: how far along the normal, px, and grey levels. edges: (N, E) px.
+        shapes: (N, 4) blur, smear, how that leans, and c, px. heights: (N, E) of each step, or (0, E) where c is held.
+        free: how many of the logarithms of blur, stretch and smear are asked for besides.
+        normals, rights: (N, P, P) and (N, P), filled: by b, g and each height, by c, and by these.
+    """
+    core().profile_equations(distance, values, edges, shapes, heights, free, normals, rights)
+
+
 # ---- the solve ------------------------------------------------------------------------------------------------------
 
 

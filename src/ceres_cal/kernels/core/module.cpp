@@ -6,6 +6,7 @@
 
 #include "arguments.hpp"
 #include "planes.hpp"
+#include "profiles.hpp"
 #include "saddles.hpp"
 #include "strands.hpp"
 #include "sums.hpp"
@@ -220,6 +221,32 @@ void fit_saddles(const Array<const float, N, N>& levels, const Read<N, Saddles::
     });
 }
 
+void profile_equations(const Read<N, N>& distance, const Read<N, N>& values, const Read<N, N>& edges,
+                       const Read<N, 4>& shapes, const Read<N, N>& heights, int free, const Filled<N, N, N>& normals,
+                       const Filled<N, N>& rights) {
+    const size_t windows = values.shape(0), count = edges.shape(1);
+    const bool moves = heights.shape(0) > 0;
+    require(distance.shape(0) == windows && distance.shape(1) == values.shape(1) && edges.shape(0) == windows &&
+                shapes.shape(0) == windows && (!moves || heights.shape(0) == windows) && heights.shape(1) == count,
+            "distance and values are (N, K), edges and heights (N, E), shapes (N, 4)");
+    require(free >= 0 && free <= 3, "free: none to three of blur, stretch and smear");
+    bool smears = false;
+    for (size_t k = 0; k < windows; ++k) smears |= row(shapes, static_cast<int64_t>(k))[1] != 0.0;
+    ProfileEquations equations(whole(count), moves, free, smears);
+    const size_t size = static_cast<size_t>(equations.size());
+    require(normals.shape(0) == windows && normals.shape(1) == size && normals.shape(2) == size &&
+                rights.shape(0) == windows && rights.shape(1) == size,
+            "normals are (N, P, P), rights (N, P)");
+    unlocked([&] {
+        for (int64_t k = 0; k < static_cast<int64_t>(windows); ++k) {
+            const double* const shape = row(shapes, k);
+            const Blurred at{shape[0], shape[1], shape[2], shape[3], row(edges, k), moves ? row(heights, k) : nullptr};
+            equations.add_up(at, row(distance, k), row(values, k), static_cast<int64_t>(values.shape(1)),
+                             row(normals, k), row(rights, k));
+        }
+    });
+}
+
 int64_t strands_left(const Read<N, N>& values, const Bounds& bounds, const Bounds& group, const Read<N, N, N>& rows,
                      const Read<N>& shares, const Filled<N>& logs, const Filled<N, N, N>& left) {
     const size_t shapes = values.shape(0), size = rows.shape(0), strands = rows.shape(1), numbers = rows.shape(2);
@@ -271,6 +298,7 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("curve_residuals", &find_residuals<CurvesGiven, 1>);
     m.def("point_rows", &find_rows<PointsGiven, 2>);
     m.def("fit_saddles", &fit_saddles);
+    m.def("profile_equations", &profile_equations);
     m.def("curve_rows", &find_rows<CurvesGiven, 1>);
     m.def("strands_left", &strands_left);
 }
