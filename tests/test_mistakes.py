@@ -102,6 +102,7 @@ ON_THE_COMMAND_LINE = [
     ("detect boards x.png", "detect what: did you mean 'detect board'?"),
     ("detect", "detect what: one of detect board, detect rings, detect field?"),
     ("calibrate OBS --lense radial", "did you mean '--lens'?"),
+    ("calibrate OBS --auto", "--auto, which is an option of `detect field`: leave it out"),
     ("calibrate OBS --lens radail", "did you mean 'radial'?"),
     ("calibrate OBS --loss hubre", "did you mean 'huber'?"),
     ("calibrate nowhere.json", "nowhere.json: no such file"),

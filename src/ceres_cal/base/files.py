@@ -152,6 +152,8 @@ def parse_json(content: bytes, where: str) -> Any:
 
     NaN and Infinity, as Python's own writer spells them, are let through to the checks that can name their place.
     """
+    if not content.strip():
+        raise InputError(f"{where}: not valid JSON (cut short?): it is empty")
     _require_few_marks(content, where)
     try:
         data = json.loads(content.decode("utf-8-sig"), parse_int=_whole)

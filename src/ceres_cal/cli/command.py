@@ -207,7 +207,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         meant = ""
         if wrong := re.match(r"unrecognized arguments: (-[\w-]+)", message):
-            meant = did_you_mean(wrong[1], self._option_string_actions)
+            meant = _of_others(wrong[1]) or did_you_mean(wrong[1], self._option_string_actions)
         elif wrong := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
             meant = did_you_mean(wrong[1], re.findall(r"[\w.-]+", wrong[2]))
         raise InputError(f"{message}{meant or f': see `{self.prog} --help`'}")
@@ -277,6 +277,16 @@ class Command(Frozen, eq=True):
         """Add all of its arguments to a parser."""
         add_options(parser, self.arguments)
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
+
+
+def _of_others(option: str) -> str:
+    """The end of a message: of which other commands it is an option, as far as there are few."""
+    owners, few = list[str](), 3
+    for name, one in COMMANDS.items():
+        parser = Parser(add_help=False)
+        one.fill(parser)
+        owners += [f"`{name}`"] * (option in parser._option_string_actions)
+    return f", which is an option of {' and '.join(owners)}: leave it out" if 0 < len(owners) <= few else ""
 
 
 def command(name: str, summary: str, *examples: str) -> Callable[[Callable[..., Document]], Command]:
