@@ -100,7 +100,8 @@ def lens_by_held_out(observations: Observations, options: Options) -> LensChoice
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options, *, knows: bool = True) -> Calibration:
-    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be.
+    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be:
+    where it stands, but for how what is known of it bends.
 
     Args:
         knows: whether it is asked what is then known of its numbers: else phi may be anywhere along its valley.
@@ -114,7 +115,7 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     there = Estimate({name: camera}, {station: Station(name, camera.cam_from_world)}, {}, structure)
     start = Start(seen_through(there, options, profiles_of(there, sights)), {name: "prior"})
     with for_small_matrices(), at_most(options.threads):
-        return _of_lens(Task(knows=knows), start, sights, options).redrawn()
+        return _of_lens(Task(knows=knows, bends=False), start, sights, options).redrawn()
 
 
 def _measured(observations: Observations, options: Options, progress: SolveProgress | None, client: Any) -> Calibration:

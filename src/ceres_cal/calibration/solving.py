@@ -56,8 +56,8 @@ class Task(Frozen):
         progress: called at every iteration. settle: where the observations are a part, what solves for all of them
             from the end of the part, see `Bulk.settled`.
         tested: whether what was stated is held against everything else. knows: whether it is then asked what is known
-            of the numbers. chosen: whether the data chose the lens: what one that is too simple leaves looks like a
-            principal point that moves.
+            of the numbers; bends: and how that bends. chosen: whether the data chose the lens: what one that is too
+            simple leaves looks like a principal point that moves.
         before: of a calibration that is taken up again, the layout of everything that is known by a posterior, also
             where the solve holds it. scales: noise scales of points and curves that were seen before it.
     """
@@ -66,6 +66,7 @@ class Task(Frozen):
     settle: Callable[..., Settled] | None = None
     tested: bool = True
     knows: bool = True
+    bends: bool = True
     chosen: bool = False
     before: Layout | None = None
     scales: tuple[float, float] | None = None
@@ -305,7 +306,7 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
         return measure_scatter(known, found, there, says)
 
     freedom = end.inliers.degrees_of_freedom
-    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, seen.shifts_at)
+    assessed, posterior = assess(known, estimate, reduced, freedom, scatter_at, seen.shifts_at, bends=seen.task.bends)
     return (end if assessed is estimate else end.moved_to(assessed, seen.problem)), posterior
 
 

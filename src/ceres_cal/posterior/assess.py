@@ -43,6 +43,8 @@ def assess(
     degrees_of_freedom: float,
     scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
     shifts_at: ShiftsAt | None = None,
+    *,
+    bends: bool = True,
 ) -> tuple[Estimate, Posterior]:
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
@@ -57,6 +59,7 @@ def assess(
         scatter_at: how the data scatter at an estimate, of which the problem says so much.
         shifts_at: numbers, and shifts by which they scatter besides, at an estimate. Along a valley the profile is as
             much wider, and what is across it with phi held.
+        bends: whether what bends is asked besides: of where the estimate rests it says nothing.
 
     Raises:
         SolutionError: no possible lens fits.
@@ -87,7 +90,7 @@ def assess(
         posterior = known(estimate, reduced)
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
     posterior = replace(posterior, mixtures=mixtures)
-    return estimate, _with_bends(posterior, problem, estimate)
+    return estimate, _with_bends(posterior, problem, estimate) if bends else posterior
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
