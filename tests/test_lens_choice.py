@@ -78,6 +78,20 @@ def test_a_lens_that_no_formula_has_in_one_view_of_a_floor() -> None:
     assert np.sqrt(np.mean(off**2)) < 1e-3  # 0.4 mm, of 1.3 stated
 
 
+def test_what_longer_lenses_leave_open_straight_from_above_is_stated() -> None:
+    """One coefficient predicts a floor as well as four, which the lens has, and would know phi three times as well."""
+    camera = Camera((780, 580), 430.0, (391.0, 287.0), KannalaBrandt((-0.02, 0.003, -0.002, 0.0004)))
+    station = Station("c", overhead_pose(0.1, -0.3, 4.2, 1.0, -1.0, 2.0))
+    scene = field_scene(ssl_field("B"), {"c": camera}, {"s": station}, spacing_m=0.15)
+    observations = simulate(scene, Disturbance(0.05, 0.05), 0).observations
+    calibration = calibrate(observations)
+    assert calibration.options.coefficients == ("k1", "p1", "p2")
+    alone = calibrate(observations, calibration.options)
+    stated, sd = (one.uncertainty.posterior.sd_of("camera", "c", "phi") for one in (calibration, alone))
+    off = abs(calibration.cameras["c"].phi - camera.phi)
+    assert stated > 2.5 * sd and off < 2.0 * stated
+
+
 @pytest.mark.parametrize("mix", ["boards", "lines-arcs", "field-boards"])
 def test_the_papers_lens_is_recognised(mix: str) -> None:
     choices = [calibrate(_seen("radial-2-3", mix, seed)).lens_choice for seed in range(5)]
@@ -324,10 +338,11 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
     start = initialise(gather_sights(observations), options)
     every = choose_lens(observations, Options(), start).among
-    assert every is not None and every.others.others
+    posterior = calibrate(observations, options).uncertainty.posterior
+    assert every is not None and every.others(posterior).others
     monkeypatch.setattr(seen, "solve", solved)
     few = choose_lens(observations, Options(), start).among
-    assert few is not None and not few.others.others
+    assert few is not None and not few.others(posterior).others
 
 
 def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -335,9 +350,10 @@ def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: 
     observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
     start = initialise(gather_sights(observations), options)
     chosen = choose_lens(observations, Options(), start)
+    posterior = calibrate(observations, options).uncertainty.posterior
     monkeypatch.setattr(seen, "_KEPT", 0.0)
     assert chosen.among is not None
-    few = chosen.among.others
+    few = chosen.among.others(posterior)
     assert not few.others and not few.failed
 
 

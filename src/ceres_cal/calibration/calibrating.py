@@ -229,7 +229,7 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
 
     calibration, chosen = last.first_solved(known_with, simple, start)
     if calibration.posterior is not None and chosen.among is not None:
-        others = chosen.among.others
+        others = chosen.among.others(calibration.posterior)
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
         if others.failed:

@@ -15,7 +15,7 @@ from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem import Estimate, Key, Options, Problem, moved, problem_of, solve, values_of
+from ceres_cal.problem import Estimate, Information, Key, Options, Problem, moved, problem_of, solve, values_of
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.as_built import Built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
@@ -58,15 +58,19 @@ class Kind(Frozen):
         """A lens with its errors of prediction."""
         if self.normals is None:
             return Candidate(form, self, failed=self.failed)
-        lens = set(self.forms[0].names) - set(form.names)
-        squares, step = self.normals.held_out({key: step for key, step in self._to_nothing.items() if key[2] in lens})
+        squares, step = self.normals.held_out(self.to_nothing(form))
         rms_px = self.sigma_px * float(np.sqrt(max(squares.sum(), 0.0) / self.normals.counts.sum()))
         least = self.normals.squares_at(step)
         return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step, least)
 
+    def to_nothing(self, form: Form) -> dict[Key, float]:
+        """How far from where they stand the coefficients that one of its lenses does not have are 0."""
+        lens = set(self.forms[0].names) - set(form.names)
+        return {key: step for key, step in self._to_nothing.items() if key[2] in lens}
+
     @cached_property
     def _to_nothing(self) -> dict[Key, float]:
-        """How far from where they stand the coefficients of its longest lens are 0."""
+        """The same of all coefficients of its longest lens."""
         names = set(self.forms[0].names)
         keys = (
             [key for key in self.normals.keys if key.kind == "camera" and key.quantity in names] if self.normals else []
@@ -138,6 +142,13 @@ class Candidate(Frozen):
             return False
         return standard_errors(other.squares, self.squares) > least
 
+    def extends(self, other: Candidate, as_good: float) -> bool:
+        """Whether it is the other lens with more coefficients and predicts as well: no data say that these are 0."""
+        if self.of is not other.of or self.squares is None or other.squares is None:
+            return False
+        is_longer = {*self.form.names} > {*other.form.names}
+        return is_longer and standard_errors(self.squares, other.squares) <= as_good
+
     @cached_property
     def estimate(self) -> Estimate:
         """Near its best.
@@ -153,6 +164,21 @@ class Candidate(Frozen):
             lens = blank.with_values([values[n] if n in self.form.names else 0.0 for n in blank.names])
             cameras[name] = replace(camera, lens=lens)
         return replace(there, cameras=cameras)
+
+    def along_phi(self, stated: Information) -> dict[Key, dict[Key, float]]:
+        """phi of each camera -> how all numbers vary by a standard deviation of it.
+
+        Args:
+            stated: what is known besides.
+        """
+        if self.of.normals is None:
+            return {}
+        keys = self.of.normals.keys
+        besides = stated.marginal(stated.among(keys)).over(keys).matrix
+        root = self.of.normals.root(self.of.to_nothing(self.form), besides)
+        phis = {key: own for key, own in zip(keys, root, strict=True) if key[::2] == ("camera", "phi")}
+        each = {phi: (root @ own / np.linalg.norm(own)).tolist() for phi, own in phis.items()}
+        return {phi: {key: v for key, v in zip(keys, step, strict=True) if v} for phi, step in each.items()}
 
     @property
     def is_near(self) -> bool:
@@ -280,11 +306,14 @@ class InlierRows(Frozen):
         solution = solve(problem, candidate.estimate, precision=_PRECISION)
         return solution.estimate if 2.0 * solution.cost <= self._kept(candidate) else None
 
-    def solved_near(self, candidate: Candidate, *, as_promised: bool = False) -> Estimate:
+    def solved_near(
+        self, candidate: Candidate, *, as_promised: bool = False, there: Estimate | None = None
+    ) -> Estimate:
         """Where a lens is at its best, solved for from where the normal equations have it.
 
         Args:
             as_promised: whether what leaves more than these promise is no answer.
+            there: from where else; phi stays as it is there.
 
         Raises:
             CalibrationError: it cannot be solved for.
@@ -292,8 +321,11 @@ class InlierRows(Frozen):
         # Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected;
         # and of all, where the next step is of a thousandth of a standard deviation.
         at_best = 1e-6
-        problem = self._problem(candidate.form.of(self.options), candidate.estimate)
-        solution = solve(problem, candidate.estimate, precision=at_best, posed=at_best)
+        start = there or candidate.estimate
+        problem = self._problem(candidate.form.of(self.options), start)
+        for name in () if there is None else start.cameras:
+            problem = problem.holding(name, 0)
+        solution = solve(problem, start, precision=at_best, posed=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
         if as_promised and 2.0 * solution.cost > self._kept(candidate):

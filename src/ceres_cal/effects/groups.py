@@ -19,7 +19,7 @@ number of views that would say as much if all said the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Collection, Iterator, Mapping, Set
 
 import numpy as np
 
@@ -97,11 +97,7 @@ class GroupNormals(Frozen):
         """(G,) squared errors of each group predicted from all others, and the step (K,) to where the least squares
         are, when some of the numbers are held so far from where they stand.
         """
-        free = np.array([i for i, key in enumerate(self.keys) if key not in held], dtype=np.int64)
-        step = np.array([held.get(key, 0.0) for key in self.keys])
-        of_free = inverse_root(self._whole[np.ix_(free, free)], self.sizes[free], SINGULAR)
-        root = np.zeros((len(self.keys), of_free.shape[1]))
-        root[free] = of_free
+        step, root = np.array([held.get(key, 0.0) for key in self.keys]), self.root(held)
         step -= root @ (root.T @ (self._slope + self._whole @ step))
         moved = self.normal @ step
         squares = self.squares + 2.0 * (self.gradient @ step) + moved @ step
@@ -110,6 +106,18 @@ class GroupNormals(Frozen):
         without = np.linalg.solve(rest, gradient[:, :, None])[:, :, 0]
         squares += np.einsum("gk,gk->g", 2.0 * gradient + np.einsum("gkl,gl->gk", own, without), without)
         return squares, step
+
+    def root(self, held: Collection[Key], stated: Array | float = 0.0) -> Array:
+        """(K, R) a root of the covariance of the numbers, when some are held.
+
+        Args:
+            stated: (K, K) information that there is of them besides.
+        """
+        free = np.array([i for i, key in enumerate(self.keys) if key not in held], dtype=np.int64)
+        of_free = inverse_root((self._whole + stated)[np.ix_(free, free)], self.sizes[free], SINGULAR)
+        root = np.zeros((len(self.keys), of_free.shape[1]))
+        root[free] = of_free
+        return root
 
     def _split(self, root: Array) -> tuple[Array, Array]:
         """(G, R, R) each group's share of the information along a root of everything's, and that of all others."""
