@@ -4,6 +4,7 @@ import json
 import shutil
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from ceres_cal.base.images import each_camera
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.command import COMMANDS
-from ceres_cal.cli.run import _short
+from ceres_cal.cli.run import RunArguments, _attempted, _calibrated, _short, _Step
 from ceres_cal.detect.video import sharpest_frames
 from ceres_cal.scene.targets import checkerboard
 
@@ -127,7 +128,9 @@ def test_a_plan_names_the_first_of_many_photographs() -> None:
     assert _short("ceres-cal detect field 0.jpg 1.jpg -o x") == "ceres-cal detect field 0.jpg 1.jpg -o x"
 
 
-def test_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_cameras(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One calibration of all of them, called like their folder or video, and a report with a picture of each: a field's
     video ended without a report, and two in a folder were "no images".
     """
@@ -143,9 +146,25 @@ def test_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(asked) == 2
     assert "say which, such as --facing left.LeftGoalLine=" in capsys.readouterr().err
     sides = ("--facing", "left.LeftGoalLine=top", "--facing", "right.LeftGoalLine=bottom")
+    advised: list[str] = []  # of one of them, where they are to be used with care
+
+    def cautiously(*given: Any) -> _Step:
+        step = _calibrated(*given)
+        step.data["verdict"]["level"] = "care"
+        return step
+
+    def attempted(args: RunArguments, name: str, arguments: list[str], most: int | None = None) -> _Step:
+        if name != "advise":
+            return _attempted(args, name, arguments, most)
+        advised.extend(arguments[1:])
+        return _Step(name, (), {}, 0)
+
+    monkeypatch.setattr("ceres_cal.cli.run._calibrated", cautiously)
+    monkeypatch.setattr("ceres_cal.cli.run._attempted", attempted)
     main([*asked, *sides, "--to", "opencv", "--to", "paper"])
     said = capsys.readouterr().out
     found = Calibration.load(out / "calibration.json")
+    assert advised[0] == "--station" and advised[1] in found.stations
     heights = [found.station(name).position[2] for name in ("left", "right")]
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     for made in ("opencv.yml", "left/paper.txt", "right/paper.txt", "report.html", "left/field.json"):

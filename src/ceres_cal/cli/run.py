@@ -82,7 +82,10 @@ def _run(args: RunArguments) -> Document:
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
-        steps.append(_attempted(args, "advise", [str(args.output / "calibration.json")], most=2))
+        maps = (calibrated.data["uncertainty"] or {}).get("maps", {})
+        least = max(maps, key=lambda name: maps[name][-1]["worst_sd_mm"], default="")  # known, of several
+        of_one = ["--station", least] if len(maps) > 1 else []
+        steps.append(_attempted(args, "advise", [str(args.output / "calibration.json"), *of_one], most=2))
     asked = [calibrated]
     if level != "no":
         asked += [step for form in forms for step in _exported(args, cameras, form)]
