@@ -19,7 +19,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.calibrating import calibrate, lens_by_held_out
+from ceres_cal.calibration.calibrating import calibrate, lenses_by_held_out
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, diagnose
@@ -373,8 +373,8 @@ def test_held_out_error_is_the_noise_and_what_the_fit_adds(
 
 def test_the_choice_is_the_lens_that_was_simulated() -> None:
     seen = simulate(scenes.overhead(frames=8, boards=2), scenes.NOISE, 4).observations
-    choice = lens_by_held_out(seen, Options(powers=(3,)))
-    assert choice is not None and choice.chosen == "radial 2,3"
+    (choice,) = lenses_by_held_out(seen, Options(powers=(3,))).values()
+    assert choice.chosen == "radial 2,3"
 
 
 def test_a_single_frame_cannot_be_held_out() -> None:
@@ -399,8 +399,8 @@ def test_two_coefficients_are_too_few_for_the_wide_camera_and_three_enough(gopro
     assert radius["two"] is not None and "too short" in radius["two"].sentence and "r^7" in radius["two"].sentence
     assert "let k3 free" in radius["two"].advice
     assert radius["three"] is None or radius["three"].effect_px < 0.5 * radius["two"].effect_px
-    choice = lens_by_held_out(seen, three)
-    assert choice is not None and choice.chosen == choice.tried[0].label == "spline 2,3"
+    (choice,) = lenses_by_held_out(seen, three).values()
+    assert choice.chosen == choice.tried[0].label == "spline 2,3"
     brown = next(tried for tried in choice.tried if tried.label.startswith("brown"))
     assert choice.tried[0].rms_px and brown.rms_px and choice.tried[0].rms_px < 0.75 * brown.rms_px
 

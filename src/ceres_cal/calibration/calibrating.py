@@ -28,7 +28,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
 
 if TYPE_CHECKING:
-    from ceres_cal.calibration.lens_choice import Chosen
+    from ceres_cal.calibration.lenses import ChosenLenses
     from ceres_cal.robust.bulk import Bulk, Subset
 
 
@@ -94,9 +94,9 @@ def _others_can(failure: CalibrationError, observations: Observations, options: 
     return f"; {others} can be calibrated without what {those} observed: leave that out"
 
 
-def lens_by_held_out(observations: Observations, options: Options) -> LensChoice | None:
-    """The lens that predicts held-out parts of the observations best, whichever the options name."""
-    return calibrate(observations, any_lens(options)).lens_choice
+def lenses_by_held_out(observations: Observations, options: Options) -> Mapping[str, LensChoice]:
+    """The lens of each camera that predicts held-out parts of its observations best, whichever the options name."""
+    return calibrate(observations, any_lens(options)).lens_choices
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options, *, knows: bool = True) -> Calibration:
@@ -187,34 +187,33 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
 
 
 def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
-    """With the lens that the data ask for."""
-    from ceres_cal.calibration.lens_choice import choose_lens
+    """With the lenses that the data ask for."""
     from ceres_cal.calibration.lens_forms import papers
+    from ceres_cal.calibration.lenses import choose_lenses
 
     simple = papers(options)
     start = initialise(sights, simple)
     if options.closed_form_only:
         return _of_lens(task, start, sights, simple)
 
-    def seen_with(one: Chosen) -> Explained:
-        named = replace(one.options, priors=options.priors).with_first_power(len(sights))  # compared without priors
-        problem = problem_of(sights, named, one.start.estimate)
-        return explained(task, one.start, problem, one.built)
+    def seen_with(lenses: ChosenLenses) -> Explained:
+        problem = problem_of(sights, lenses.options, lenses.start.estimate)
+        return explained(task, lenses.start, problem, lenses.built)
 
-    chosen = choose_lens(sights.observations, options, start)
-    seen, chosen = chosen.first_solved(seen_with, simple, start)
-    too_few = chosen.choice.share < 1.0 and seen.leaves_alike
-    if too_few or (seen.as_built and not chosen.built.every):
+    chosen = choose_lenses(sights, options, start)
+    seen, chosen = chosen.first_solved(seen_with)
+    too_few = {name for name in seen.leaving_alike if chosen.each[name].choice.share < 1.0}
+    anew = [*chosen.each] if seen.as_built and not chosen.built.every else sorted(too_few)
+    if anew:
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
         # all views leave in the same places need not show in the few of them that lenses were compared by.
         near = replace(seen.end.estimate, structure=EXACT)
-        before, anew = chosen, replace(start, estimate=near)
-        built = Built(seen.as_built, seen.end.estimate.structure)
-        chosen = choose_lens(sights.observations, options, anew, built, by_most=too_few)
-        if chosen.choice.chosen != before.choice.chosen:
-            seen, chosen = chosen.first_solved(seen_with, simple, start)
+        before, built = chosen, Built(seen.as_built, seen.end.estimate.structure)
+        chosen = chosen.anew(anew, near, built, too_few)
+        if chosen.labels != before.labels:
+            seen, chosen = chosen.first_solved(seen_with)
     said = []
-    while chosen.among is not None and (other := chosen.among.instead(seen.outlier_masks, seen.scales)):
+    while other := chosen.instead(seen.outlier_masks, seen.scales):
         # reads: "another lens explains observations that were taken out, ..."
         found = attempt(partial(seen_with, other))
         if isinstance(found, CalibrationError):
@@ -224,19 +223,19 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
         seen, chosen = found, other
     last = chosen
 
-    def known_with(one: Chosen) -> Calibration:
-        return known_of(seen if one is last else seen_with(one))
+    def known_with(lenses: ChosenLenses) -> Calibration:
+        return known_of(seen if lenses is last else seen_with(lenses))
 
-    calibration, chosen = last.first_solved(known_with, simple, start)
-    if calibration.posterior is not None and chosen.among is not None:
-        others = chosen.among.others(calibration.posterior)
+    calibration, chosen = last.first_solved(known_with)
+    if calibration.posterior is not None:
+        others = chosen.others(calibration.posterior, calibration.estimate)
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
         if others.failed:
             without = "the standard deviations do not include what they would say"
             said.append(f"other lenses could not be compared, so {without}: {others.failed}")
-    warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]), *said)
-    return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
+    choices = {name: one.choice for name, one in chosen.each.items()}
+    return replace(calibration, lens_choices=choices, warnings=(*calibration.warnings, *chosen.caveats, *said))
 
 
 def _part(bulk: Bulk, options: Options) -> Subset:

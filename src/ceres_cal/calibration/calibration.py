@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "remarks", "ambiguities", "digest", "versions", "conflicts", "lens_choice", "as_built"),
+    *("phi_from", "warnings", "remarks", "ambiguities", "digest", "versions", "conflicts", "lens_choices", "as_built"),
     "effects",
 )
 """What the file has as it is."""
@@ -64,7 +64,7 @@ class Calibration(Frozen):
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
         conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
-        lens_choice: how the lens was chosen; None where it was given.
+        lens_choices: camera -> how its lens was chosen; none where it was given.
         as_built: what of the targets is not where it is drawn, and was solved for under the sigmas that the data show;
             these are in the options' tolerances.
         effects: what else displaces the observations, and was solved for.
@@ -87,7 +87,7 @@ class Calibration(Frozen):
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
     conflicts: tuple[Conflict, ...] = ()
-    lens_choice: LensChoice | None = None
+    lens_choices: Mapping[str, LensChoice] = field(default_factory=dict)
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -102,6 +102,11 @@ class Calibration(Frozen):
         shown = self.stations.items()
         rows = [(name, repr(camera).removeprefix("Camera(").removesuffix(")")) for name, camera in shown]
         return html_of((f"Calibration, {self.rms_px:.3f} px rms", rows))
+
+    @property
+    def lens_choice(self) -> LensChoice | None:
+        """How the lens of the first camera was chosen; None where it was given."""
+        return next(iter(self.lens_choices.values()), None)
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -282,7 +287,7 @@ class Calibration(Frozen):
             posterior=posterior,
             refitted=None if data.refitted is None else data.refitted.refitted(known),
             notes=data.notes if isinstance(data.notes, dict) else {},
-            **{name: getattr(data, name) for name in _ALIKE},
+            **{name: getattr(data, name) for name in _ALIKE} | {"lens_choices": data.chosen_lenses},
         )
 
 

@@ -267,7 +267,7 @@ class RefittedFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A calibration."""
+    """A calibration; `lens_choice` is that of all cameras, in files of before."""
 
     format: str
     version: int
@@ -292,12 +292,18 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     posterior: PosteriorFile | None = None
     refitted: RefittedFile | None = None
     conflicts: tuple[Conflict, ...] = ()
-    lens_choice: LensChoice | None = None
+    lens_choices: dict[str, LensChoice] = {}
+    lens_choice: LensChoice | msgspec.UnsetType | None = msgspec.UNSET
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
     remarks: tuple[str, ...] = ()
     ambiguities: tuple[str, ...] = ()
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+
+    @property
+    def chosen_lenses(self) -> Mapping[str, LensChoice]:
+        """Camera -> how its lens was chosen."""
+        return dict.fromkeys(self.cameras, self.lens_choice) if self.lens_choice else self.lens_choices
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
         """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""

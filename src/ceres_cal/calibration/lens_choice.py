@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -37,7 +36,6 @@ from ceres_cal.problem.parameters import OF_PIXELS
 from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
 
-_T = TypeVar("_T")
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
 # Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
@@ -46,7 +44,7 @@ _VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m")
 
 
 class Chosen(Frozen):
-    """The lens that was chosen: options with it, where to start from, and what it was compared with.
+    """The lens that was chosen for a camera: options with it, where to start from, and what it was compared with.
 
     Attributes:
         among: the lenses it was chosen from; None where nothing could be compared.
@@ -57,26 +55,19 @@ class Chosen(Frozen):
     choice: LensChoice
     among: Comparison | None = None
 
-    def first_solved(self, solved: Callable[[Chosen], _T], options: Options, start: Start) -> tuple[_T, Chosen]:
-        """What is solved with it, or where all of the observations make no calibration with it, with the best lens of
-        another kind, or with the paper's at last; and with which.
+    def otherwise(self, failure: str, options: Options, start: Start) -> Chosen | None:
+        """Where all of the observations make no calibration with it, the best lens of another kind, or at last the
+        paper's; None after that.
 
         Args:
-            options: with the paper's lens. start: of everything.
-
-        Raises:
-            CalibrationError: none makes one.
+            options: with the paper's lens. start: with that, too.
         """
-        try:
-            return solved(self), self
-        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
-            if self.among is None:
-                raise
-            other = self.among.without_kind(str(error)) or self._papers(str(error), options, start)
-        return other.first_solved(solved, options, start)
+        if self.among is None:
+            return None
+        return self.among.without_kind(failure) or self._papers(failure, options, start)
 
     def _papers(self, failure: str, options: Options, start: Start) -> Chosen:
-        """The paper's lens in its place, from the start of everything."""
+        """The paper's lens in its place, from the first start."""
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
@@ -85,6 +76,10 @@ class Chosen(Frozen):
     def built(self) -> Built:
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
+
+    def others(self, posterior: Posterior) -> OtherLenses:
+        """What other lenses would say, as far as they are probable, see `Comparison.others`."""
+        return OtherLenses(self.start.estimate, (), (), {}) if self.among is None else self.among.others(posterior)
 
 
 class Comparison(Frozen):
@@ -192,17 +187,18 @@ class Comparison(Frozen):
         start = replace(start, estimate=near, is_near=not form.blank.roughness, others=others)
         return Chosen(form.of(self.seen.options), start, _choice(self), self)
 
-    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float]) -> Chosen | None:
+    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float], *, is_alone: bool) -> Chosen | None:
         """The lens in place of the chosen one, where others explain what it takes out of the observations; None where
         none does. Of very many observations some were compared, and the rest is not looked at. What predicts clearly
         better, a lens without a formula, stays.
 
         Args:
             taken_out: (N,), (M,) the observations that it takes out. scales: of the noise beside it.
+            is_alone: whether no other camera had a say in what is taken out.
         """
         if self.share < 1.0 or self.chosen.form.blank.roughness:
             return None
-        if not explained_by_another(self.seen, self.tried, self.chosen, taken_out, scales):
+        if not explained_by_another(self.seen, self.tried, self.chosen, taken_out, scales, is_alone=is_alone):
             return None
         found = self._excluding(lambda one: one is self.chosen, _EXPLAINED)
         return None if found is None else found.outcome
@@ -224,10 +220,10 @@ class Comparison(Frozen):
 def choose_lens(
     observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN, *, by_most: bool = False
 ) -> Chosen:
-    """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
+    """The lens that the observations of a camera ask for; the paper's where there is too little to tell by.
 
     Args:
-        options: their lens is not looked at. start: of everything, with whatever lens.
+        options: their lens is not looked at. start: of that camera, with whatever lens.
         built: how targets were found to be built; where nothing is given that is found, too.
         by_most: whether most of the observations are asked, not some of them, which left what goes together.
     """

@@ -47,22 +47,26 @@ def explained_by_another(
     chosen: Candidate,
     taken_out: tuple[Mask, Mask],
     scales: tuple[float, float],
+    *,
+    is_alone: bool = True,
 ) -> bool:
     """Whether another lens explains so much of what the chosen one takes out that it is the likelier one.
 
     Args:
         taken_out: (N,), (M,) what the chosen one takes out of all observations. scales: of its noise; by a larger one
             another lens would explain what the chosen one leaves no larger, but knows to be no noise.
+        is_alone: else what the chosen one explains by itself was taken out for what other cameras say.
     """
     sights = seen.sights
     out = taken_out[0][sights.point_rows], taken_out[1][sights.curve_rows]
     if not (out[0].any() or out[1].any()):
         return False
     price = float(np.log(sights.equations))
+    by_itself = 0 if is_alone else max(0, _explained(seen, chosen, out, scales) or 0)
     for other in tried:
         if other is chosen or other.squares is None:
             continue
-        explained = _explained(seen, other, out, scales) or 0
+        explained = (_explained(seen, other, out, scales) or 0) - by_itself
         if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
             return True
     return False

@@ -93,10 +93,14 @@ class Explained(Frozen):
     digest: Future[str] | None = None
 
     @cached_property
-    def leaves_alike(self) -> bool:
-        """Whether the lens leaves the same in one place of all views; one with a formula, in views of placements."""
-        rough, every = bool(self.end.problem.options.blank_lens.roughness), self.end.problem.sights
-        asked = every if rough else of_placements(every)
+    def leaving_alike(self) -> tuple[str, ...]:
+        """Cameras whose lens leaves the same in one place of all views; one with a formula, in views of placements."""
+        return tuple(filter(self._leaves_alike, self.end.estimate.cameras))
+
+    def _leaves_alike(self, camera: str) -> bool:
+        problem = self.end.problem
+        every = problem.sights.of_camera(camera)
+        asked = every if problem.options.of_camera(camera).is_rough else of_placements(every)
         return bool(len(asked)) and LeftOver.of_end(self.end, asked).asks_for_more
 
     @property
@@ -223,7 +227,7 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
             return None
         start = replace(seen.end.estimate, structure=first.start.estimate.structure)
         named = first.problem.options
-        options = replace(problem.options, powers=named.powers, terms=named.terms)
+        options = problem.options.with_lenses({name: named.of_camera(name) for name in problem.layout.free})
         again = problem_of(problem.sights, options, start)
         steady = unsteady.taken_off(again)
         end = solve_robustly(steady, start, None, task.progress, is_near=True)
@@ -284,8 +288,8 @@ def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]
     if is_new:
         require_lens_told(end.estimate, posterior)
     known = seen if end is seen.end else replace(seen, end=end)
-    if is_new and known.leaves_alike:
-        posterior = posterior.widened(*shifts_by_roughness(end))
+    if is_new and known.leaving_alike:
+        posterior = posterior.widened(*shifts_by_roughness(end, known.leaving_alike))
     return known, with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
@@ -319,22 +323,28 @@ def _start_of(others: Problem, some: Subproblem, first: Explained) -> Estimate:
 
 
 def _as_long_as_asked(seen: Explained) -> Explained:
-    """With the lens that the residuals ask for where nothing is stated of its powers.
+    """With the lenses that the residuals ask for where nothing is stated of their powers.
 
     A lens without a formula has all of its terms where residuals of different views agree from place to place. How
     large their numbers are the data say in any case (`effects/smoothness.py`): they cost time.
     """
-    options, progress = seen.problem.options, seen.task.progress
-    if options.powers:
+    each = {name: seen.problem.options.of_camera(name) for name in seen.problem.layout.free}
+    if all(one.powers for one in each.values()):
         return seen
     problem, end = _named(seen.problem), replace(seen.end, problem=_named(seen.end.problem))
-    longer = replace(options, terms=tuple(options.blank_lens.more_terms))
-    may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
-    if may_grow and LeftOver.of_end(end).in_cells > AGREES:
+
+    def grown(name: str, one: Options) -> Options:
+        may_grow = not one.powers and one.is_rough and one.coefficients is None and not one.terms
+        if may_grow and LeftOver.of_end(end, end.problem.sights.of_camera(name)).in_cells > AGREES:
+            return replace(one, terms=tuple(one.blank_lens.more_terms))
+        return one
+
+    longer = seen.problem.options.with_lenses({name: grown(name, one) for name, one in each.items()})
+    if longer != seen.problem.options:
         near = _seen_longer(end.estimate, longer)
         try_of = problem_of(problem.sights, longer, near)
         # quiet: the lens without these terms stays; what it leaves is diagnosed
-        found = attempt(lambda: solve_robustly(try_of, near, progress=progress))
+        found = attempt(lambda: solve_robustly(try_of, near, progress=seen.task.progress))
         if isinstance(found, RobustSolution) and _shows_all(found):
             problem, end = _named(try_of), replace(found, problem=_named(found.problem))
     start = replace(seen.start, estimate=_seen_longer(seen.start.estimate, problem.options))
@@ -342,15 +352,18 @@ def _as_long_as_asked(seen: Explained) -> Explained:
 
 
 def _named(problem: Problem) -> Problem:
-    """The same with the powers of its lens stated."""
-    return replace(problem, options=replace(problem.options, powers=problem.options.blank_lens.powers))
+    """The same with the powers of its lenses stated."""
+    each = {name: problem.options.of_camera(name) for name in problem.layout.free}
+    named = {name: replace(one, powers=one.blank_lens.powers or one.powers) for name, one in each.items()}
+    return replace(problem, options=problem.options.with_lenses(named))
 
 
 def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
-    """The estimate with the lens of the options, which holds its own."""
+    """The estimate with the lenses of the options, each of which holds its own."""
     cameras = dict(estimate.cameras)
     for name, camera in cameras.items():
-        lens = make_lens(options.lens, options.blank_lens.powers, camera.lens.coefficients, options.terms)
+        one = options.of_camera(name)
+        lens = make_lens(one.lens, one.blank_lens.powers, camera.lens.coefficients, one.terms)
         # Its own span is set, and nothing else is asked for.
         cameras[name] = replace(camera, lens=lens.spanning(0.0, camera.phi, 1.0, camera.image_size))
     return replace(estimate, cameras=cameras)

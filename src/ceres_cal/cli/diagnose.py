@@ -35,16 +35,16 @@ def _run(
         raise InputError(f"--false-alarms must lie between 0 and 1, not {false_alarms:g}")
     if held_out and new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
-    from ceres_cal.calibration.calibrating import lens_by_held_out
+    from ceres_cal.calibration.calibrating import lenses_by_held_out
 
     solved, seen = files.read_calibration(calibration), files.read_observations(observations)
     photographs = files.report_photographs(args, seen)
     diagnosis = diagnostics.diagnose(solved, seen, new_data=new_data, false_alarm_rate=false_alarms)
-    choice = lens_by_held_out(seen, solved.options) if held_out else None
-    page, unmade = files.report_page(args, solved, seen, photographs, diagnosis, choice)
+    choices = lenses_by_held_out(seen, solved.options) if held_out else None
+    page, unmade = files.report_page(args, solved, seen, photographs, diagnosis, choices)
 
     # Wrong labels that were taken out do no harm, and a noise is estimated.
     against = [finding for finding in diagnosis.findings if strict or report.is_against(finding)]
-    answer = tuple(report.diagnosis_sections(diagnosis, choice, solved.options))
+    answer = tuple(report.diagnosis_sections(diagnosis, choices, solved.options))
     sections = (*answer, unmade, files.write_results(args, diagnosis.table.save, page))
     return Document(sections, 1 if against or diagnosis.conflicts or unmade.data else 0)

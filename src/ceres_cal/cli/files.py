@@ -256,14 +256,14 @@ def report_page(
     observations: Observations,
     photographs: report.FramePhotographs | None,
     diagnosis: diagnostics.Diagnosis | None = None,
-    choice: LensChoice | None = None,
+    choices: Mapping[str, LensChoice] | None = None,
 ) -> tuple[str | None, Section]:
     """The page that --report asks for, or None; see `attempted`."""
     if args.report is None:
         return None, Section()
 
     with progress_bar(args.silent) as bar:
-        make = partial(report.make_report, calibration, observations, diagnosis, choice, photographs, bar.update)
+        make = partial(report.make_report, calibration, observations, diagnosis, choices, photographs, bar.update)
         return attempted("report", make)
 
 

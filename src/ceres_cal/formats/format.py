@@ -193,7 +193,8 @@ def calibration_of(
             told.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
     stations = {name: Station(name, camera.cam_from_world) for name, camera in ours.items()}
     bare = {name: camera.at(type(camera.cam_from_world).identity()) for name, camera in ours.items()}
-    lens = next(iter(ours.values())).lens
+    lenses = {name: camera.lens for name, camera in ours.items()}
+    each = {name: Options(lens=one.kind, powers=one.powers, terms=one.terms) for name, one in lenses.items()}
     return Calibration(
         Estimate(bare, stations, {}, EXACT),
         dict(targets or {}),
@@ -205,6 +206,6 @@ def calibration_of(
         (),
         dict.fromkeys(ours, "file"),
         tuple(told),
-        Options(lens=lens.kind, powers=lens.powers, terms=lens.terms, usual_camera=False),
+        Options(usual_camera=False).with_lenses(each),
         "",
     )

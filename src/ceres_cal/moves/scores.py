@@ -43,7 +43,8 @@ def score(
         SolutionError: another camera or target than those calibrated, or intrinsics that do not explain them at all.
     """
     observed = matched(calibration, observations)
-    given = replace(options or calibration.options, lens=calibration.options.lens, tolerances={}, dimensions=())
+    of_lens = {name: calibration.options.of_camera(name) for name in calibration.cameras}
+    given = replace(options or calibration.options, tolerances={}, dimensions=()).with_lenses(of_lens)
     sights = sights_as_built(observed, calibration)
     if hold_stations:
         require_stations(calibration, observed)

@@ -261,11 +261,22 @@ class Observations(Content):
         """One station's views with all their observations, without priors."""
         return self._of_views([view.station == name for view in self.views])
 
+    def of_camera(self, name: str) -> Observations:
+        """The views of one camera, with the priors of what they show."""
+        return self if [*self.cameras] == [name] else self._about([view.camera == name for view in self.views])
+
     def without_camera(self, name: str) -> Observations:
         """The views of the other cameras, with the priors of what they show."""
-        others = self._of_views([view.camera != name for view in self.views])
-        owners = {*others.cameras, *others.stations, *others.placements, *others.targets}
-        return replace(others, priors=tuple(prior for prior in self.priors if prior.name in owners))
+        return self._about([view.camera != name for view in self.views])
+
+    def about_shown(self, priors: Sequence[Prior]) -> tuple[Prior, ...]:
+        """Those priors that are about what the views show."""
+        owners = {*self.cameras, *self.stations, *self.placements, *self.targets}
+        return tuple(prior for prior in priors if prior.name in owners)
+
+    def _about(self, which: Sequence[bool]) -> Observations:
+        some = self._of_views(which)
+        return replace(some, priors=some.about_shown(self.priors))
 
     def _of_views(self, which: Sequence[bool]) -> Observations:
         chosen = np.array(which)

@@ -19,7 +19,7 @@ lens is. By what the free numbers take up of them they are off.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -61,6 +61,34 @@ class OtherLenses(Frozen):
     def pixels(self) -> dict[str, Array]:
         """Camera -> (N, 2) of a grid over its image, as far as it was observed."""
         return {name: _places_of(self.near.cameras[name], reach_px) for name, reach_px in self.reach_px.items()}
+
+
+def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate) -> OtherLenses:
+    """Those of several cameras, each with its own probabilities, in as many combinations as there are lenses: for each
+    camera its others and then the chosen one have their probabilities beside each other from 0 to 1, and what has one
+    place there is a combination.
+
+    Args:
+        floors: stations that see the floor. end: where the others stand, which a camera by itself does not know.
+    """
+    if len(each) == 1:
+        return each[0]
+    bounds = [np.cumsum(counted(one.weights)) for one in each]
+    cuts = np.unique(np.concatenate([np.zeros(1), *bounds]))
+
+    def combined(parts: Sequence[Estimate]) -> Estimate:
+        cameras = {name: camera for one in parts for name, camera in one.cameras.items()}
+        seen = {name: station for one in parts for name, station in one.stations.items() if name in floors}
+        return Estimate(cameras, {**end.stations, **seen}, {}, parts[0].structure)
+
+    which = np.array([np.searchsorted(own, cuts[:-1], side="right") for own in bounds])
+    return OtherLenses(
+        combined([one.near for one in each]),
+        tuple(combined([[*one.others, one.near][i] for one, i in zip(each, at, strict=True)]) for at in which.T),
+        tuple(np.diff(cuts).tolist()),
+        {name: reach_px for one in each for name, reach_px in one.reach_px.items()},
+        "; ".join(filter(None, (one.failed for one in each))),
+    )
 
 
 def _places_of(camera: Camera, reach_px: float = np.inf) -> Array:
@@ -174,7 +202,8 @@ class LeftOver(Frozen):
         every = -(-sights.equations // most_compared)
         some = sights if every <= 1 else sights[::every]
         points = there.points[some.point_rows] / (scales[0] * some.sigma_px[:, None])
-        return cls(some, points, there.curves[some.curve_rows] / (scales[1] * some.curve_sigma_px), estimate.cameras)
+        curves = there.curves[some.curve_rows] / (scales[1] * some.curve_sigma_px)
+        return cls(some, points, curves, {name: estimate.cameras[name] for name in some.cameras})
 
     @classmethod
     def of_end(cls, end: RobustSolution, sights: Sights | None = None) -> LeftOver:
@@ -258,13 +287,13 @@ def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _
 _ALONG, _OVER = 36, (7, 21)
 
 
-def shifts_by_roughness(end: RobustSolution) -> tuple[Sequence[Key], Sequence[Array]]:
+def shifts_by_roughness(end: RobustSolution, cameras: Iterable[str]) -> tuple[Sequence[Key], Sequence[Array]]:
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
-    lenses do to them.
+    lenses of some cameras do to them.
     """
     reduced = end.told
     model = _linearised(end, reduced)
-    shifts = [_shifts_of(model, name, camera) for name, camera in end.estimate.cameras.items()]
+    shifts = [_shifts_of(model, name, end.estimate.cameras[name]) for name in cameras]
     return reduced.shared.keys, [shift for own in shifts for shift in own]
 
 

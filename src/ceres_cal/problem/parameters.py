@@ -29,6 +29,16 @@ OF_PIXELS = ("phi", "aspect", "cx", "cy")
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
+class OneLens(Frozen, eq=True):
+    """The lens of one camera, see `Options`."""
+
+    lens: str
+    powers: tuple[int, ...] = ()
+    coefficients: tuple[str, ...] | None = None
+    terms: tuple[str, ...] = ()
+    free_skew: bool = False
+
+
 class Options(Frozen, eq=True):
     """What to solve for and how.
 
@@ -64,6 +74,7 @@ class Options(Frozen, eq=True):
         closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline to
             compare with, not a calibration.
         max_iterations: of each solve. threads: of the solver; 0 chooses.
+        lenses: camera -> its lens, where that is another one than `lens`, as it may be where each was chosen by itself.
     """
 
     lens: str = AUTO
@@ -86,6 +97,7 @@ class Options(Frozen, eq=True):
     closed_form_only: bool = False
     max_iterations: int = 100
     threads: int = 0
+    lenses: Mapping[str, OneLens] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out
@@ -130,10 +142,27 @@ class Options(Frozen, eq=True):
         for name in ("max_iterations", "threads"):
             if getattr(self, name) > largest:
                 raise InputError(f"{name} must be {largest} at most, not {getattr(self, name):.3g}")
+        _ = self._own  # which refuses a lens that is none
 
     @property
     def _which(self) -> str:
         return "a lens that is still to be chosen (name it)" if self.lens == AUTO else f"the {self.lens} lens"
+
+    def of_camera(self, name: str) -> Options:
+        """These options with a camera's own lens."""
+        return self._own.get(name, self)
+
+    def with_lenses(self, each: Mapping[str, Options]) -> Options:
+        """These options with the lens of each camera as others have it."""
+        parts = ("lens", "powers", "coefficients", "terms", "free_skew")
+        named = {name: OneLens(*(getattr(one, part) for part in parts)) for name, one in each.items()}
+        first = next(iter(named.values()))
+        return replace(self, **vars(first), lenses={name: one for name, one in named.items() if one != first})
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether the lens of a camera has no formula."""
+        return any(one.blank_lens.roughness for one in (self, *self._own.values()))
 
     def structure_of(self, targets: Mapping[str, Target]) -> Structure:
         """What may be built otherwise than it is drawn of the targets, all of it as drawn."""
@@ -166,6 +195,11 @@ class Options(Frozen, eq=True):
         if self.powers or views < enough_views or not self.usual_camera:
             return self
         return replace(self, free_skew="skew" not in self.fixed)
+
+    @cached_property
+    def _own(self) -> dict[str, Options]:
+        """Camera -> these options with its lens, where that is another one."""
+        return {name: replace(self, **vars(one), lenses={}) for name, one in self.lenses.items()}
 
     @property
     def _unset(self) -> Lens:
@@ -293,6 +327,16 @@ class Layout(Frozen, eq=True):
 
 def make_layout(observations: Observations, options: Options) -> Layout:
     """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
+    views = observations.shown_views
+    return Layout(
+        {name: _free_intrinsics(options.of_camera(name)) for name in observations.cameras},
+        frozenset(view.station for view in views) - anchored_stations(observations),
+        frozenset(view.placement for view in views if view.placement is not None),
+    )
+
+
+def _free_intrinsics(options: Options) -> Indices:
+    """Indices into the vector of a camera with the lens of these options."""
     names = intrinsic_names(options.blank_lens)
     held = {*options.held, *options.blank_lens.set_at_start}
     if not options.free_principal_point:
@@ -301,13 +345,7 @@ def make_layout(observations: Observations, options: Options) -> Layout:
         held |= {"aspect"}
     if not options.free_skew:
         held |= {"skew"}
-    free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
-    views = observations.shown_views
-    return Layout(
-        dict.fromkeys(observations.cameras, free),
-        frozenset(view.station for view in views) - anchored_stations(observations),
-        frozenset(view.placement for view in views if view.placement is not None),
-    )
+    return np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
 
 
 def anchored_stations(observations: Observations) -> frozenset[str]:

@@ -179,7 +179,7 @@ def gather_priors(
         observations.require_owner(prior)
         is_effect = prior.is_coma and prior in observations.priors
         if not (prior.is_open or prior.curve or is_effect):  # the first two are among the tolerances
-            stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
+            stated.append(stated_prior(prior, lenses.get(prior.name) or options.of_camera(prior.name).blank_lens))
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))
     known = {key for prior in stated for key in prior.keys}
@@ -213,7 +213,7 @@ def usual_cameras(
     image, square pixels, a lens that is little decentred, a phi of lenses that people have.
     """
     for name, size in observations.cameras.items():
-        lens = lenses.get(name, options.blank_lens)
+        lens = lenses.get(name) or options.of_camera(name).blank_lens
         keys = {key.quantity: key for key in intrinsic_keys(name, lens) if key not in stated}
         centre = 0.5 * (np.array(size, dtype=float) - 1.0)
         off_centre = USUAL_CENTRE * float(np.hypot(*size))

@@ -318,10 +318,10 @@ def require_possible_numbers(observations: Observations, options: Options) -> No
         for bounds, value, sigma in zip(_ranges(prior, observations, options), prior.value, prior.sigma, strict=False):
             bounds.require(value, here)
             bounds.require_sigma(sigma, here)
-    lens = None if options.lens == "auto" else options.blank_lens
     for name, value in options.fixed.items():
         for camera, size in observations.cameras.items():
-            _of_camera(name, size, lens).require(value, f"{name}, which is held for camera {camera!r},")
+            here = f"{name}, which is held for camera {camera!r},"
+            _of_camera(name, size, _named_lens(options, camera)).require(value, here)
     for target, tolerance in options.tolerances.items():
         if target in observations.targets:
             _require_tolerance(tolerance, target, observations)
@@ -330,8 +330,7 @@ def require_possible_numbers(observations: Observations, options: Options) -> No
 def _ranges(prior: Prior, observations: Observations, options: Options) -> Iterator[Range]:
     """The range of each of a prior's numbers."""
     if prior.owner == "camera":
-        lens = None if options.lens == "auto" else options.blank_lens
-        yield from camera_ranges(prior.quantity, observations.cameras[prior.name], lens)
+        yield from camera_ranges(prior.quantity, observations.cameras[prior.name], _named_lens(options, prior.name))
     elif prior.owner == "station":
         yield from [_of_place(prior.name, observations)] * len(prior.value)
     elif prior.dimension:
@@ -340,6 +339,11 @@ def _ranges(prior: Prior, observations: Observations, options: Options) -> Itera
             yield dimension_range(drawn_m)
     elif prior.curve:
         yield Range(0.0, 0.0, "m", _FINEST, "an offset is about 0")
+
+
+def _named_lens(options: Options, camera: str) -> Lens | None:
+    """A camera's lens; None of one that is still to be chosen."""
+    return None if options.lens == "auto" else options.of_camera(camera).blank_lens
 
 
 def camera_ranges(quantity: str, image_size: tuple[int, int], lens: Lens | None) -> Iterator[Range]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -27,7 +27,9 @@ _NEW_DATA = (
 )
 
 
-def diagnosis_sections(diagnosis: Diagnosis, choice: LensChoice | None, options: Options) -> Iterator[Section]:
+def diagnosis_sections(
+    diagnosis: Diagnosis, choices: Mapping[str, LensChoice] | None, options: Options
+) -> Iterator[Section]:
     """The verdict, the findings by size, then tables; everything but the table of single observations."""
     summaries = diagnosis.summaries
     own = ("model_error", "conflicts", "new_data", "tests", "false_alarm_rate", "findings")
@@ -37,7 +39,7 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: LensChoice | None, options:
     for number, finding in enumerate(diagnosis.findings, start=1):
         yield Section(f"finding {number}", _card(finding).lines())
     yield _noise(diagnosis.noise)
-    yield _held_out(choice, options) if choice is not None else Section(data={"held_out": None})
+    yield _held_out(choices, options) if choices is not None else Section(data={"held_out": None})
     yield _outliers(diagnosis.table)
     for title, name in (("frames", "frames"), ("features", "features"), ("radius", "radii"), ("regions", "regions")):
         one = getattr(summaries, name)
@@ -45,7 +47,7 @@ def diagnosis_sections(diagnosis: Diagnosis, choice: LensChoice | None, options:
     yield Section("leverage", _leverage(diagnosis.table), {"radius_trend": summaries.trends})
 
 
-def chapter(diagnosis: Diagnosis, choice: LensChoice | None, options: Options) -> Chapter:
+def chapter(diagnosis: Diagnosis, choices: Mapping[str, LensChoice] | None, options: Options) -> Chapter:
     """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
     alternatives = counted(diagnosis.tests, "alternative")
@@ -59,7 +61,7 @@ def chapter(diagnosis: Diagnosis, choice: LensChoice | None, options: Options) -
     else:
         pieces.append(Text(f"Nothing was found: the residuals look like noise. {tested}"))
     pieces += _noise(diagnosis.noise).pieces
-    pieces += () if choice is None else _held_out(choice, options).pieces
+    pieces += () if choices is None else _held_out(choices, options).pieces
     return Chapter("findings", "What the residuals say", tuple(pieces))
 
 
@@ -134,13 +136,16 @@ def _outliers(table: ResidualTable) -> Section:
     return Section("outliers", lines, {"rejected": rejected})
 
 
-def _held_out(choice: LensChoice, options: Options) -> Section:
-    """Which lens predicts parts that it was not fitted to best, and whether the calibration has it."""
-    current = label_of(options)
-    take = "the calibration's lens is the one to take" if choice.chosen == current else f"take {choice.chosen}"
-    (table,) = lens_choice(choice).pieces
-    data = {**vars(choice), "current": current}
-    return Section("held out", [*wrapped(choice.words), take], {"held_out": data}, (table, Text(f"{sentence(take)}.")))
+def _held_out(choices: Mapping[str, LensChoice], options: Options) -> Section:
+    """Which lens of each camera predicts parts that it was not fitted to best, and whether the calibration has it."""
+    lines, data, pieces = list[str](), {}, list[Piece]()
+    for name, choice in choices.items():
+        current, camera = label_of(options.of_camera(name)), f"camera {name!r}: " if len(choices) > 1 else ""
+        take = "the calibration's lens is the one to take" if choice.chosen == current else f"take {choice.chosen}"
+        lines += [*wrapped(camera + choice.words), take]
+        data[name] = {**vars(choice), "current": current}
+        pieces += [*lens_choice(camera, choice).pieces, Text(f"{sentence(take)}.")]
+    return Section("held out", lines, {"held_out": data}, tuple(pieces))
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------

@@ -48,8 +48,9 @@ def number_sections(quality: Quality) -> Iterator[Section]:
     """The fit, the lens, and every number of cameras, stations and targets."""
     calibration = quality.calibration
     yield _fit(calibration)
-    if calibration.lens_choice is not None:
-        yield lens_choice(calibration.lens_choice)
+    several = len(calibration.lens_choices) > 1
+    for name, choice in calibration.lens_choices.items():
+        yield lens_choice(f"camera {name!r}: " if several else "", choice)
     yield from (_camera(quality, name) for name in calibration.cameras)
     yield from (_station(quality, name) for name in calibration.stations)
     if calibration.estimate.structure.dimensions:
@@ -125,8 +126,8 @@ def warnings(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def lens_choice(choice: LensChoice) -> Section:
-    """What was chosen, over what, by how much."""
+def lens_choice(camera: str, choice: LensChoice) -> Section:
+    """What was chosen, over what, by how much; `camera`: named where there are several."""
     rows = []
     for one in choice.tried:
         cells = (DASH, DASH, DASH, one.failed)
@@ -134,8 +135,8 @@ def lens_choice(choice: LensChoice) -> Section:
             cells = (fixed(one.rms_px, 4), fixed(one.worse, 1, "+"), _percent(one.probability), "")
         rows.append((one.label, str(one.coefficients), *cells))
     head = ("lens", "coefficients", "held-out px", "worse, standard errors", "predicts best, probability", "")
-    table = Table(head, tuple(rows), f"The lens that the data ask for: {choice.chosen}", stacked=True)
-    return Section("lens", wrapped(choice.words), pieces=(table,))
+    table = Table(head, tuple(rows), sentence(f"{camera}the lens that the data ask for: {choice.chosen}"), stacked=True)
+    return Section("lens", wrapped(camera + choice.words), pieces=(table,))
 
 
 def _percent(share: float | None) -> str:

@@ -277,11 +277,11 @@ class Material(Quality):
     """A calibration, observations, what the residuals between them say, and what was asked for besides.
 
     Attributes:
-        choice: of lens, by held-out error. photographs: into which the model is drawn.
+        choices: camera -> that of its lens, by held-out error. photographs: into which the model is drawn.
     """
 
     diagnosis: Diagnosis
-    choice: LensChoice | None = None
+    choices: Mapping[str, LensChoice] | None = None
     photographs: FramePhotographs | None = None
 
     @cached_property

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ceres_cal.base import StepProgress, checked, counted, first_of, write_bytes
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.observations import Observations
+from ceres_cal.problem import Options
 from ceres_cal.report import findings
 from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Piece, Text
 from ceres_cal.report.grounds import promises
@@ -35,7 +36,7 @@ def make_report(
     calibration: Calibration,
     observations: Observations,
     diagnosis: Diagnosis | None = None,
-    choice: LensChoice | None = None,
+    choices: Mapping[str, LensChoice] | None = None,
     photographs: FramePhotographs | None = None,
     progress: StepProgress | None = None,
 ) -> str:
@@ -43,7 +44,8 @@ def make_report(
 
     Args:
         observations: those it was made from; or others, with a diagnosis of them (`new_data`).
-        diagnosis: of these observations; made here where there is none. choice: of lens, by held-out error.
+        diagnosis: of these observations; made here where there is none. choices: camera -> that of its lens,
+            by held-out error.
         photographs: of the frames, for a chapter with the model drawn into them. progress: called after each chapter.
 
     Raises:
@@ -51,7 +53,7 @@ def make_report(
             be read.
     """
     diagnosis = diagnose(calibration, observations) if diagnosis is None else diagnosis
-    material = Material(calibration, observations, diagnosis, choice=choice, photographs=photographs)
+    material = Material(calibration, observations, diagnosis, choices=choices, photographs=photographs)
     chapters = []
     for number, chapter in enumerate(_chapters(material), start=1):
         chapters.append(chapter)
@@ -66,7 +68,7 @@ def write_report(
     calibration: Calibration,
     observations: Observations,
     diagnosis: Diagnosis | None = None,
-    choice: LensChoice | None = None,
+    choices: Mapping[str, LensChoice] | None = None,
     photographs: FramePhotographs | None = None,
 ) -> None:
     """Write `make_report`'s page.
@@ -74,7 +76,7 @@ def write_report(
     Raises:
         InputError: see `make_report`; or the file cannot be written.
     """
-    write_bytes(path, make_report(calibration, observations, diagnosis, choice, photographs).encode())
+    write_bytes(path, make_report(calibration, observations, diagnosis, choices, photographs).encode())
 
 
 def _chapters(material: Material) -> Iterator[Chapter]:
@@ -85,7 +87,7 @@ def _chapters(material: Material) -> Iterator[Chapter]:
         yield in_photographs(material, material.photographs)
     supported = tuple(support(material, name) for name in list(material.observations.cameras)[:MOST_CAMERAS])
     yield Chapter("support", "What was observed", (Gallery(supported),))
-    yield findings.chapter(material.diagnosis, material.choice, material.calibration.options)
+    yield findings.chapter(material.diagnosis, material.choices, material.calibration.options)
     yield numbers_chapter(material, material.seams)
     yield from _pictures(material)
 
@@ -148,10 +150,15 @@ def _about(material: Material) -> str:
 
 def _foot(calibration: Calibration) -> str:
     options = calibration.options
-    powers = f" with powers {', '.join(map(str, options.powers))}" if options.blank_lens.powers else ""
+    lenses = dict.fromkeys(_lens_words(options.of_camera(name)) for name in calibration.cameras)
     versions = ", ".join(f"{name} {version}" for name, version in calibration.versions.items())
     return (
-        f"Solved with the {options.lens} lens{powers}, {options.loss} loss from {options.loss_scale:g} sigma, outliers "
+        f"Solved with the {' and the '.join(lenses)}, {options.loss} loss from {options.loss_scale:g} sigma, outliers "
         f"from {options.reject_sigma:g} sigma. {calibration.termination.rstrip('.')}. Observations SHA-256 "
         f"{calibration.digest[:16]}…; {versions}."
     )
+
+
+def _lens_words(options: Options) -> str:
+    powers = f" with powers {', '.join(map(str, options.powers))}" if options.blank_lens.powers else ""
+    return f"{options.lens} lens{powers}"

@@ -183,8 +183,9 @@ class _RowRounds(Rounds[RobustSolution]):
         self.no_change = AT_REST if usual is None else AT_REST_AGAIN
         # Relative change of the cost at which the first solve ends, and every further one.
         self._rough_end, self._end = 1e-3, 1e-14
-        lens = problem.options.blank_lens
-        if lens.roughness and not any(problem.knows_lens(name, lens) for name in problem.layout.free):
+        options = problem.options
+        lenses = {name: options.of_camera(name).blank_lens for name in problem.layout.free}
+        if options.is_rough and not any(problem.knows_lens(name, lens) for name, lens in lenses.items()):
             # From farther off the next solve, whose lens is as smooth as the data say, begins with steps in vain. With
             # sigmas of a tenth a hundredth of a variance may be left, and no number is off by 0.1 of its sd.
             # Measured are a hundredth of that and 0.01.
@@ -236,7 +237,7 @@ class _RowRounds(Rounds[RobustSolution]):
                 "the observations fix no pose that could show them: add points or lines of the targets"
             )
         few = problem.of_sights(_evenly(problem))
-        if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
+        if problem.options.is_rough and len(few.sights) < len(problem.sights):
             of_few = _RowRounds(few, self._usual, self._progress)
             end = of_few.to_rest(of_few.first(estimate), most_rounds=2)
             self._scales = of_few._scales  # at which they were solved, not those of the start
@@ -358,7 +359,8 @@ def _evenly(problem: Problem) -> Indices:
     chosen: list[int] = []
     for camera in problem.sights.cameras:
         boards = problem.sights.numbers(camera, placements=private).tolist()
-        enough = enough_without_formula if problem.options.blank_lens.roughness else _ENOUGH_PLACEMENTS
+        is_rough = problem.options.of_camera(camera).is_rough
+        enough = enough_without_formula if is_rough else _ENOUGH_PLACEMENTS
         chosen += boards[:: max(1, min(len(boards) // enough, share_of_placements))]
         chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
     return np.array(sorted(chosen), dtype=np.int64)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median, numerical
 from ceres_cal.base.errors import attempt
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base.frozen import Frozen, field, replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import SightKey, Sights
@@ -46,12 +46,15 @@ class Start(Frozen, eq=True):
     Attributes:
         is_near: whether it is near the minimum, but for private placements: no gross error decides from there.
         others: that show a station's view alike from elsewhere.
+        keys, poses: sights, and cam_from_frame (K, 3, 4) of each by itself, whatever other cameras say of its frame.
     """
 
     estimate: Estimate
     phi_from: Mapping[str, str]
     is_near: bool = False
     others: tuple[Estimate, ...] = ()
+    keys: tuple[SightKey, ...] = ()
+    poses: Array = field(default_factory=lambda: np.empty((0, 3, 4)))
 
 
 @numerical("the initial estimate")
@@ -110,7 +113,8 @@ def _initialised(
         )
         for key, pose, camera in posed.others
     )
-    return Start(estimate, posed.phi_from, others=others), posed.places
+    keys = tuple(sights.keys[number] for number in posed.numbers.tolist())
+    return Start(estimate, posed.phi_from, others=others, keys=keys, poses=posed.poses), posed.places
 
 
 class PosedSights(Frozen):
@@ -141,11 +145,12 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
     priors = (*sights.observations.priors, *options.priors)
     parts: list[PosedSights] = []
     for name, image_size in sights.observations.cameras.items():
-        blank = _blank_camera(name, image_size, options, priors)
+        given = options.of_camera(name)
+        blank = _blank_camera(name, image_size, given, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
         own_priors = [p for p in priors if _concerns(p, name, seen)]
-        one = _start_camera(name, blank, seen, options, own_priors, may_search=may_search)
+        one = _start_camera(name, blank, seen, given, own_priors, may_search=may_search)
         places, there = ({int(own[n]): value for n, value in part.items()} for part in (one.places, one.open))
         parts.append(replace(one, numbers=own[one.numbers], places=places, open=there))
     return PosedSights(

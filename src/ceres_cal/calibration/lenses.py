@@ -1,0 +1,155 @@
+"""The lens of each camera, chosen by its own observations: cameras of a rig may have lenses of different kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import TypeVar
+
+import numpy as np
+
+from ceres_cal.base import CalibrationError, Frozen, Mask, Poses, cached_property, replace
+from ceres_cal.calibration.lens_choice import Chosen, choose_lens
+from ceres_cal.calibration.lens_forms import papers
+from ceres_cal.observations import Sights
+from ceres_cal.posterior.other_lenses import OtherLenses, together
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.problem import Estimate, Options
+from ceres_cal.robust.as_built import AS_DRAWN, Built
+from ceres_cal.start.initialise import Start
+from ceres_cal.start.world import chained_poses
+
+_T = TypeVar("_T")
+
+
+class ChosenLenses(Frozen):
+    """What was chosen for each camera.
+
+    Attributes:
+        sights: of everything. asked: options, whose lens was open. first: a start with the paper's lens.
+        each: camera -> its lens.
+    """
+
+    sights: Sights
+    asked: Options
+    first: Start
+    each: Mapping[str, Chosen]
+
+    @cached_property
+    def options(self) -> Options:
+        """Those that were asked, with these lenses."""
+        each = self.each.items()
+        views = {name: len(self.sights.of_camera(name)) for name in self.each}
+        return self.asked.with_lenses({name: one.options.with_first_power(views[name]) for name, one in each})
+
+    @cached_property
+    def start(self) -> Start:
+        """Of everything: cameras as each was compared, and put together by what they saw in common."""
+        own = {name: one.start for name, one in self.each.items()}
+        if len(own) == 1:
+            return next(iter(own.values()))
+        cameras = {name: one.estimate.cameras[name] for name, one in own.items()}
+        numbers = [self.sights.numbers(camera=name) for name in own]
+        poses = [one.estimate.pose_stack(self.sights.of_camera(name).keys) for name, one in own.items()]
+        stations, placements = chained_poses(self.sights, np.concatenate(numbers), np.concatenate(poses))
+        estimate = Estimate(cameras, stations, placements, self.first.estimate.structure)
+        others = tuple(replace(other, cameras=cameras) for other in self.first.others)
+        return replace(self.first, estimate=estimate, others=others)
+
+    @property
+    def built(self) -> Built:
+        """How targets seemed to be built when lenses were compared."""
+        return next((one.built for one in self.each.values() if one.built.every), AS_DRAWN)
+
+    @property
+    def labels(self) -> list[str]:
+        """What the lenses are called."""
+        return [one.choice.chosen for one in self.each.values()]
+
+    @property
+    def caveats(self) -> list[str]:
+        """What speaks against the lenses that were taken."""
+        several = len(self.each) > 1
+        said = {name: one.choice.caveat for name, one in self.each.items()}
+        return [f"camera {name!r}: {words}" if several else words for name, words in said.items() if words]
+
+    def first_solved(self, solved: Callable[[ChosenLenses], _T]) -> tuple[_T, ChosenLenses]:
+        """What is solved with them, or with others in place of those with which all of the observations make no
+        calibration; and with which.
+
+        Raises:
+            CalibrationError: none make one.
+        """
+        try:
+            return solved(self), self
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
+            blamed = {error.camera or ""} & {*self.each} or self.each
+            parts = {name: start_of(self.first, self.sights, name) for name in blamed}
+            found = {n: self.each[n].otherwise(str(error), papers(self.asked), part) for n, part in parts.items()}
+            others = {name: other for name, other in found.items() if other is not None}
+            if not others:
+                raise
+        return self._with(others).first_solved(solved)
+
+    def anew(self, cameras: Collection[str], near: Estimate, built: Built, by_most: Collection[str]) -> ChosenLenses:
+        """Chosen once more for some cameras, from another estimate and over targets as they are built; of some of these
+        by most of their observations.
+        """
+        start = replace(self.first, estimate=near, keys=())
+        return self._with({
+            name: _chosen(self.sights, self.asked, start, name, built, by_most=name in by_most) for name in cameras
+        })  # fmt: skip
+
+    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float]) -> ChosenLenses | None:
+        """With other lenses where these explain what is taken out, see `Comparison.instead`; None where none does."""
+        seen, others = self.sights.observations, {}
+        for name, one in self.each.items():
+            own = np.array([view.camera == name for view in seen.views])
+            points, curves = (out[own[c.view]] for out, c in zip(taken_out, (seen.points, seen.curves), strict=True))
+            other = None
+            if one.among is not None:
+                other = one.among.instead((points, curves), scales, is_alone=len(self.each) == 1)
+            if other is not None:
+                others[name] = other
+        return self._with(others) if others else None
+
+    def others(self, posterior: Posterior, end: Estimate) -> OtherLenses:
+        """What other lenses would say of cameras whose stations stand, where they see no floor, as at the end."""
+        floors = {key.station for key in self.sights.keys if key.placement is None}
+        return together([one.others(posterior) for one in self.each.values()], floors, end)
+
+    def _with(self, others: Mapping[str, Chosen]) -> ChosenLenses:
+        return replace(self, each={**self.each, **others})
+
+
+def choose_lenses(sights: Sights, options: Options, start: Start) -> ChosenLenses:
+    """The lens that the observations of each camera ask for.
+
+    Args:
+        options: their lens is not looked at. start: of everything, with the paper's lens.
+    """
+    each = {name: _chosen(sights, options, start, name, AS_DRAWN) for name in sights.observations.cameras}
+    return ChosenLenses(sights, options, start, each)
+
+
+def _chosen(
+    sights: Sights, options: Options, start: Start, camera: str, built: Built, *, by_most: bool = False
+) -> Chosen:
+    own = sights.observations.of_camera(camera)
+    asked = replace(options, priors=own.about_shown(options.priors))
+    return choose_lens(own, asked, start_of(start, sights, camera), built, by_most=by_most)
+
+
+def start_of(start: Start, sights: Sights, camera: str) -> Start:
+    """The part of a start that is about one camera, by its own sights as far as these are posed."""
+    if len(start.estimate.cameras) == 1:
+        return start
+    posed = [i for i, key in enumerate(start.keys) if key.camera == camera and key.placement is not None]
+    there = start.estimate.with_placements([start.keys[i] for i in posed], start.poses[posed])
+    names = list(dict.fromkeys(key.placement for key in sights.of_camera(camera).keys if key.placement is not None))
+    estimate = Estimate(
+        {camera: there.cameras[camera]},
+        {name: station for name, station in there.stations.items() if station.camera == camera},
+        Poses.stacked(names, Poses.of(there.placements).of_names(names)),
+        there.structure,
+    )
+    return replace(start, estimate=estimate, phi_from={camera: start.phi_from[camera]}, others=())
