@@ -163,7 +163,7 @@ def _shown(keys: Sequence[Key], near: Estimate, pixels: Mapping[str, Array]) -> 
     for name, places in pixels.items():
         if name not in spoken_of:
             continue
-        stations = [station for station in known if near.stations[station].camera == name]
+        stations = [station for station in known if near.has_floor and near.stations[station].camera == name]
         tells_phi = any(key[:3] == ("camera", name, "phi") for key in keys)
         for station in stations:
             px_per_m = near.cameras[name].phi / max(abs(float(near.camera_at(station).position[2])), 1e-3)

@@ -257,6 +257,11 @@ class Estimate(Frozen, eq=True):
     def __post_init__(self) -> None:
         object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
 
+    @property
+    def has_floor(self) -> bool:
+        """Whether the world is a field: of boards alone a camera is the world, and in its plane z = 0 lies nothing."""
+        return not any(np.array_equal(one.cam_from_world.matrix, np.eye(3, 4)) for one in self.stations.values())
+
     def station_name(self, name: str | None) -> str:
         """The name of a station; without one, that of the only one there is.
 
