@@ -63,6 +63,17 @@ def test_lines_and_an_arc(features: tuple[str, ...]) -> None:
     assert off_in_sd(calibrate(seen(features, 3.0), KNOWN)) < 3.0  # at most 1.9
 
 
+def test_seen_alike_after_half_a_turn() -> None:
+    """The halfway line, the centre line and the circle lie on themselves then; a place that is known roughly tells."""
+    middle = seen(("HalfwayLine", "CenterLine", "CenterCircle"), 3.0)
+    calibration = calibrate(middle, KNOWN)
+    assert len(calibration.ambiguities) == 1 and "where it shows other places on the floor" in calibration.ambiguities[0]
+    assert judge_quality(quality_of(calibration, middle)).level == "no"
+    position = Prior("station", "hall", "position_m", tuple((PLACE + 0.2).tolist()), (0.3, 0.3, 0.3))
+    told = calibrate(replace(middle, priors=(position,)), KNOWN)
+    assert told.ambiguities == () and off_in_sd(told) < 3.0  # 3e-4
+
+
 def test_seen_alike_from_two_places() -> None:
     """Three points have up to four poses (Grunert): the other is named and in the deviations; the height tells."""
     three = seen(("BottomRightCorner", "CenterMark", "RightCircleCrossing"))

@@ -273,11 +273,10 @@ def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
         part, is_all = taking_part(problem, explanations), seen.task.settle is None
         beside = solve_beside_effects(problem, part, end, solves=is_all)
         problem, end = beside.problem, beside.end
-    others: tuple[Solution, ...] = ()
-    if end.problem.sights.equations == problem.sights.equations:
-        least, others = least_of_few(end.problem, end.estimate, seen.start.others)
-        if least is not end.estimate:
-            end = replace(end.moved_to(least, problem), reduced=None)
+    is_whole = end.problem.sights.equations == problem.sights.equations
+    least, others = least_of_few(end.problem, end.estimate, seen.start.others, is_whole=is_whole)
+    if least is not end.estimate:
+        end = replace(end.moved_to(least, problem), reduced=None)
     return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside, others)
 
 

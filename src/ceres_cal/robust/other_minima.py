@@ -17,13 +17,15 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, median, or_none, replace
+from ceres_cal.base import Array, Indices, Pose, median, or_none, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem import Estimate, Information, Problem, Solution, Weighting, placement_costs, solve
 from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.problem.residuals import residuals_alone
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.symmetry import is_seen_turned
+from ceres_cal.scene.targets import Target
 from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 
@@ -191,20 +193,21 @@ _APART = 0.05  # of the height: places that are no farther apart are one valley,
 
 
 def least_of_few(
-    problem: Problem, estimate: Estimate, elsewhere: Sequence[Estimate] = ()
+    problem: Problem, estimate: Estimate, elsewhere: Sequence[Estimate] = (), *, is_whole: bool = True
 ) -> tuple[Estimate, tuple[Solution, ...]]:
     """The estimate in the least minimum that is found from there, and others, with what they cost beyond it; of very
-    many observations the estimate as it is.
+    many observations the estimate as it is, but for cameras that nothing tells from turned ones.
 
     Args:
-        problem: of all the observations, none of which was taken out: that belongs to the minimum it was judged in.
-            elsewhere: starts that showed the observations alike.
+        elsewhere: starts that showed the observations alike. is_whole: whether the problem is of all the observations:
+            what was taken out belongs to the minimum it was judged in.
     """
     lower = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
-    if problem.sights.equations >= FEW:
+    is_few, turned = is_whole and problem.sights.equations < FEW, tuple(_seen_turned(problem.sights, estimate))
+    if not (is_few or turned):
         return estimate, ()
     least = solve(problem, estimate)
-    starts = (*_at_other_phi(problem, least.estimate), *elsewhere)
+    starts = (*_at_other_phi(problem, least.estimate), *elsewhere, *turned) if is_few else turned
     others = [end for start in starts if (end := solved_soon(problem, start, is_near=False)) is not None]
     lowest = min(others, key=lambda one: one.cost, default=least)
     if 2.0 * (least.cost - lowest.cost) > lower:
@@ -212,6 +215,30 @@ def least_of_few(
         least = solve(problem, lowest.estimate)
         estimate = least.estimate
     return estimate, tuple(replace(one, cost=one.cost - least.cost) for one in others)
+
+
+def _seen_turned(sights: Sights, estimate: Estimate) -> Iterator[Estimate]:
+    """The estimate with a station turned by half about the middle of the world, where all that it shows lies as well
+    then: the halfway line, the centre line and the circle.
+    """
+    half = np.diag([-1.0, -1.0, 1.0])
+    for name, station in estimate.stations.items():
+        own = [number for number, key in enumerate(sights.keys) if key.station == name]
+        of_world = own and all(sights.keys[number].placement is None for number in own)
+        if of_world and all(is_seen_turned(*shown) for shown in _shown(sights.take(np.array(own)))):
+            pose = station.cam_from_world
+            turned = replace(station, cam_from_world=Pose(pose.rotation @ half, pose.translation))
+            yield replace(estimate, stations={**estimate.stations, name: turned})
+
+
+def _shown(sights: Sights) -> Iterator[tuple[Target, set[int], set[tuple[int, int]]]]:
+    """Each target with the numbers of its points, and numbers and sides of its curves, that sights show."""
+    seen = sights.observations
+    points, curves = seen.points.take(sights.point_rows), seen.curves.take(sights.curve_rows)
+    names = np.array([view.target for view in seen.views])
+    for name, target in seen.targets.items():
+        p, c = points.take(names[points.view] == name), curves.take(names[curves.view] == name)
+        yield target, {*p.feature.tolist()}, {*zip(c.feature.tolist(), c.side.tolist(), strict=True)}
 
 
 def minima_of(
@@ -249,10 +276,10 @@ def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float
         here, camera = station.cam_from_world.position, estimate.camera_at(name)
         far = _APART * abs(here[2])
         elsewhere = [one.camera_at(name) for one in likely]
-        elsewhere = [one for one in elsewhere if np.linalg.norm(one.position - here) > far]
         apart = [one for one in elsewhere if _floors_apart_m(camera, one) > far]
+        elsewhere = [*apart, *(one for one in elsewhere if np.linalg.norm(one.position - here) > far)]
         if elsewhere:
-            there = (apart or elsewhere)[0].position
+            there = elsewhere[0].position
             first, second = (f"({', '.join(f'{value:.2f}' for value in place)}) m" for place in (here, there))
             yield (
                 (

@@ -40,6 +40,20 @@ def counterparts(target: Target, image: Array) -> tuple[Indices32, Indices32, Co
     return to_point, to_curve, flips
 
 
+def is_seen_turned(target: Target, points: Collection[int], curves: Collection[tuple[int, int]]) -> bool:
+    """Whether a half turn about the middle of the world sends all of these points, by number, and curves, by number and
+    side, onto themselves: then nothing tells a camera from one that is turned.
+    """
+    half, every = np.array([-1.0, -1.0, 1.0]), list(target.curves.values())
+    places = target.point_array[list(points)]
+    if np.any(np.abs(places * half - places) > _SAME_M):
+        return False
+    sided = any(side and not isinstance(every[number], Arc) for number, side in curves)  # whose edges change places
+    return not sided and all(
+        _is_along(curve, curve_points(curve, 0, _PIECES) * half, curve) for curve in (every[n] for n, _ in curves)
+    )
+
+
 def _is_along(curve: Curve, sent: Array, other: Curve) -> bool:
     """Whether a curve, its places sent to (N, 3), runs all along another one, either way."""
     as_long = type(curve) is type(other) and abs(curve.length_m - other.length_m) < _SAME_M
