@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, Indices, InputError, cached_property
-from ceres_cal.kernels import Optics, lens_images
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, horner, invert_increasing
 
@@ -22,9 +21,8 @@ class Radial(Lens):
 
     Section 2 of the paper, with a1 = 1: scaling a1, a2, a3 and phi together changes nothing, so phi is the focal length
     at the centre. `powers` (2, 3) is the paper's own choice, (3,) is ssl-vision's model with a3 = distortion / phi^2.
-    The coefficient of power k is named a<k> and has the unit px^(1-k). Brown's decentring p1 and p2, where they are
-    asked for, takes the measured point to the ideal one as well, as in his own paper (Decentering Distortion of Lenses,
-    1966), by the opposite amount, so that they displace what is measured as OpenCV's do; the paper has none.
+    The coefficient of power k is named a<k> and has the unit px^(1-k). Brown's decentring p1 and p2 of the ideal point
+    (x/z, y/z), where they are asked for, displaces what is measured; the paper has none.
     """
 
     powers: tuple[int, ...] = (2, 3)
@@ -100,7 +98,7 @@ class Radial(Lens):
         return across if any(across) else ()
 
     def _decentring(self, flat: Array) -> Array:
-        """By how much measured points (N, 2) are displaced, at focal length 1."""
+        """By how much ideal points (N, 2) are displaced, at focal length 1."""
         (p1, p2), (x, y) = self._across, flat.T
         both, r2 = 2.0 * x * y, x * x + y * y
         return np.column_stack([p1 * both + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + p2 * both])
@@ -132,30 +130,27 @@ class Radial(Lens):
 
     def _distort(self, rays: Array, phi: float) -> Array:
         ideal = phi * rays[:, :2] / ahead(rays)
-        if self._across:
-            return self._found(rays, ideal, phi)
         radius = np.hypot(ideal[:, 0], ideal[:, 1])
         shrink = np.where(radius > 0.0, self.measured_radius(radius) / radius, 1.0)
-        return np.asarray(ideal * shrink[:, None])
-
-    def _found(self, rays: Array, ideal: Array, phi: float) -> Array:
-        """Measured points (N, 2) of rays with these ideal points, by the compiled map; NaN for none."""
-        images, scaled = np.empty((2, 4, len(rays))), np.asarray(self.values) * self.scales(phi)
-        lens_images(Optics(self, self.kind, self.form, np.array([phi, 1.0, 0.0, 0.0, *scaled, 0.0]), phi), rays, images)
-        measured = images[:, 0].T.copy()
-        left = np.max(np.abs(self._ideal(measured, phi) - ideal), axis=1)
-        measured[~(left <= 1e-9 * phi)] = np.nan
-        return measured
+        measured = np.asarray(ideal * shrink[:, None])
+        return measured + phi * self._decentring(ideal / phi) if self._across else measured
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
-        return unit_rays(self._ideal(offsets, phi), phi)
+        steps = 30  # of a fixed point, each of which gains some two digits
+        ideal = self._ideal(offsets)
+        if self._across:
+            for _ in range(steps):
+                before, ideal = ideal, self._ideal(offsets - phi * self._decentring(ideal / phi))
+                if not np.nanmax(np.abs(ideal - before), initial=0.0) > 1e-12 * phi:
+                    break
+            ideal[np.any(np.abs(ideal - before) > 1e-9 * phi, axis=1)] = np.nan
+        return unit_rays(ideal, phi)
 
-    def _ideal(self, measured: Array, phi: float) -> Array:
-        """Ideal points (N, 2) of measured ones, px; NaN beyond the limit."""
+    def _ideal(self, measured: Array) -> Array:
+        """Ideal points (N, 2) of measured ones along the radius alone, px; NaN beyond the limit."""
         radius = np.hypot(measured[:, 0], measured[:, 1])
         stretch = np.where(radius <= self._limit, horner(self._polynomial[1:], radius), np.nan)
-        ideal = np.asarray(measured * stretch[:, None])
-        return ideal - phi * self._decentring(measured / phi) if self._across else ideal
+        return np.asarray(measured * stretch[:, None])
 
     def monotone_radius(self, phi: float) -> float:
         return self._limit
