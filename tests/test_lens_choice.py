@@ -86,7 +86,7 @@ def test_each_camera_of_a_rig_has_its_own_lens(tmp_path: Path) -> None:
         assert np.nanmax(off / known.radius_95_px.ravel()) < 1.5
     before = json.loads((tmp_path / "c.json").read_text())  # one for all cameras
     before["lens_choice"] = before.pop("lens_choices")["left"]
-    before["options"].pop("lenses")
+    before["options"].pop("lens_by_camera")
     (tmp_path / "before.json").write_text(json.dumps(before))
     assert Calibration.load(tmp_path / "before.json").lens_choices.keys() == cameras.keys()
 

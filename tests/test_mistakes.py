@@ -39,7 +39,7 @@ IN_PYTHON: list[tuple[Mistake, str]] = [
     (lambda c, o: any_cc.calibrate([o]), "observations must be an Observations, not a list"),
     (lambda c, o: any_cc.calibrate(o, {"lens": "brown"}), "options must be an Options, not a dict"),
     (lambda c, o: any_cc.calibrate(o, option=cc.Options()), "did you mean 'options'?"),
-    (lambda c, o: any_cc.Options(lense="radial"), "Options has no field 'lense': did you mean 'lenses'?"),
+    (lambda c, o: any_cc.Options(lense="radial"), "Options has no field 'lense': did you mean 'lens'?"),
     (lambda c, o: cc.Options(lens="radail"), "there is no lens 'radail': did you mean 'radial'?"),
     (lambda c, o: cc.Options(loss="hubre"), "there is no loss 'hubre': did you mean 'huber'?"),
     (lambda c, o: any_cc.Options(lens="radial", powers=2), "Options(powers=...): Expected a list, got a whole number"),

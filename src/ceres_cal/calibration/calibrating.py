@@ -16,7 +16,7 @@ from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import of_closed_form
 from ceres_cal.calibration.solving import Explained, Task, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
-from ceres_cal.observations.validation import unfilled
+from ceres_cal.observations.validation import require_filled, unfilled
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.problem import EXACT, SolveProgress, gather_priors, make_structure, problem_of, require_possible_numbers
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
@@ -59,10 +59,12 @@ def calibrate(
     Raises:
         DegenerateError: the observations cannot determine the unknowns; the message names the frame or the numbers.
         SolutionError: no usable camera came out.
-        InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
+        InputError: a prior or a fixed number that the camera does not have; pixels outside their image, or in a corner
+            of one that is far larger.
     """
     options = options or Options()
     require_possible_numbers(observations, options)
+    require_filled(observations)
     observations, options = free_dimensions(observations, options)
     with for_small_matrices(), at_most(options.threads):
         try:

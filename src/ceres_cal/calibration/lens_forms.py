@@ -22,13 +22,13 @@ PAPER = "radial 2,3"
 
 def papers(options: Options) -> Options:
     """The options with the paper's lens."""
-    return replace(options, lens="radial", powers=PAPERS_POWERS, coefficients=None, terms=(), lenses={})
+    return replace(options, lens="radial", powers=PAPERS_POWERS, coefficients=None, terms=(), lens_by_camera={})
 
 
 def any_lens(options: Options) -> Options:
     """The options with the lens that the data ask for; coefficients that they hold belong to a lens of its own."""
     fixed = {name: value for name, value in options.fixed.items() if name in (*OF_PIXELS, "skew")}
-    return replace(options, lens=AUTO, powers=(), coefficients=None, terms=(), fixed=fixed, lenses={})
+    return replace(options, lens=AUTO, powers=(), coefficients=None, terms=(), fixed=fixed, lens_by_camera={})
 
 
 def candidates(options: Options) -> list[Options]:

@@ -14,13 +14,13 @@ of whole pixels may well give it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, median
-from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, view_label
+from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, in_blocks, view_label
 from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
@@ -138,19 +138,38 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
     return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({at})"
 
 
-def unfilled(content: Content) -> Iterator[str]:
-    """A line for each camera whose observations all lie in a small corner of its image."""
-    corner = 0.25  # of either side: a board that is always held so far from the middle of the image is rare
+def require_filled(content: Content) -> None:
+    """Raise InputError where the observations of a camera all lie in a tenth of its image's sides: as many images away
+    as a pixel may lie outside of one. What comes of such a picture hangs on the rounding of numbers.
+    """
+    for odd in unfilled(content, 1.0 / _FAR):
+        raise InputError(odd)
+
+
+def unfilled(content: Content, corner: float = 0.25) -> Iterator[str]:
+    """A line for each camera whose observations all lie in a small corner of its image.
+
+    Args:
+        corner: of either side: a board that is always held so far from the middle of the image is rare.
+    """
+    reach = dict.fromkeys(content.cameras, np.zeros(2))
     owners = np.array([view.camera for view in content.views])
-    for camera, size in content.cameras.items():
-        own = owners == camera
-        pixels = np.concatenate([column.pixels[own[column.view]] for column in (content.points, content.curves)])
-        if len(pixels) and np.all(pixels.max(axis=0) < corner * np.array(size)):
-            reach = "{:.0f} x {:.0f}".format(*pixels.max(axis=0))
-            yield (
-                f"camera {camera!r}: observations reach {reach} px of an image of {size[0]} x {size[1]}: is image_size "
-                "that of the pictures?"
-            )
+    for column in (content.points, content.curves):
+        for _, block in in_blocks(column):
+            for camera in _within(content, reach, corner):  # of most all is said by the first block
+                seen = block.pixels[(owners == camera)[block.view]]
+                reach[camera] = np.maximum(reach[camera], np.max(seen, axis=0, initial=0.0))
+    for camera in _within(content, reach, corner):
+        (width, height), size = reach[camera], content.cameras[camera]
+        yield (
+            f"camera {camera!r}: observations reach {width:.0f} x {height:.0f} px of an image of {size[0]} x "
+            f"{size[1]}: is image_size that of the pictures?"
+        )
+
+
+def _within(content: Content, reach: Mapping[str, Array], corner: float) -> list[str]:
+    """Cameras whose observations reach less far than a corner of their images."""
+    return [name for name, size in content.cameras.items() if np.all(reach[name] < corner * np.array(size))]
 
 
 def odd_sizes(content: Content) -> Iterator[str]:

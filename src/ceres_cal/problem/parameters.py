@@ -74,7 +74,8 @@ class Options(Frozen, eq=True):
         closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline to
             compare with, not a calibration.
         max_iterations: of each solve. threads: of the solver; 0 chooses.
-        lenses: camera -> its lens, where that is another one than `lens`, as it may be where each was chosen by itself.
+        lens_by_camera: camera -> its lens, where that is another one than `lens`, as it may be where each was chosen by
+            itself.
     """
 
     lens: str = AUTO
@@ -97,7 +98,7 @@ class Options(Frozen, eq=True):
     closed_form_only: bool = False
     max_iterations: int = 100
     threads: int = 0
-    lenses: Mapping[str, OneLens] = field(default_factory=dict)
+    lens_by_camera: Mapping[str, OneLens] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out
@@ -157,7 +158,7 @@ class Options(Frozen, eq=True):
         parts = ("lens", "powers", "coefficients", "terms", "free_skew")
         named = {name: OneLens(*(getattr(one, part) for part in parts)) for name, one in each.items()}
         first = next(iter(named.values()))
-        return replace(self, **vars(first), lenses={name: one for name, one in named.items() if one != first})
+        return replace(self, **vars(first), lens_by_camera={name: one for name, one in named.items() if one != first})
 
     @property
     def is_rough(self) -> bool:
@@ -199,7 +200,7 @@ class Options(Frozen, eq=True):
     @cached_property
     def _own(self) -> dict[str, Options]:
         """Camera -> these options with its lens, where that is another one."""
-        return {name: replace(self, **vars(one), lenses={}) for name, one in self.lenses.items()}
+        return {name: replace(self, **vars(one), lens_by_camera={}) for name, one in self.lens_by_camera.items()}
 
     @property
     def _unset(self) -> Lens:
