@@ -17,13 +17,14 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.moves import _checked_station
 from ceres_cal.moves.checks import check
-from ceres_cal.moves.refit_plan import MIRRORED, relabelled
+from ceres_cal.moves.refit_plan import relabelled
 from ceres_cal.moves.refits import movements, refit
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import MIRRORED
 from ceres_cal.simulate import Disturbance, simulate
 
 

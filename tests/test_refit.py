@@ -36,7 +36,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.file import PriorFile
 from ceres_cal.moves.poses import movement
-from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitOptions, carried_prior, make_plan, relabelled
+from ceres_cal.moves.refit_plan import RefitOptions, carried_prior, make_plan, relabelled
 from ceres_cal.moves.refits import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.problem.bundle import packed
@@ -47,6 +47,7 @@ from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import CameraFile, PoseFile
 from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import MIRRORED, TURNED
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import simulate
 

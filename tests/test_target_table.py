@@ -15,11 +15,11 @@ from ceres_cal.base.files import convert
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.diagnostics.advice import advise
-from ceres_cal.moves.refit_plan import TURNED, mistaken_targets, relabelled
+from ceres_cal.moves.refit_plan import mistaken_targets, relabelled
 from ceres_cal.problem.structure import Tolerance
 from ceres_cal.report.pictures.frames import frame_by_name
 from ceres_cal.scene.curves import Arc, Curve, Segment
-from ceres_cal.scene.symmetry import turns_of
+from ceres_cal.scene.symmetry import TURNED, turns_of
 from ceres_cal.scene.targets import TARGET_KINDS, Grid, Target, TargetKind, target_from_spec, targets_by_name
 from ceres_cal.simulate import Disturbance, Simulation, Station, scene_from_json, scene_to_json, simulate
 

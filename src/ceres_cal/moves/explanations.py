@@ -15,10 +15,11 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.agreement import NOISIER, price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
-from ceres_cal.moves.refit_plan import MIRRORED, TURNED, RefitPlan, mistaken_targets, relabelled
+from ceres_cal.moves.refit_plan import RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem import Estimate, make_structure
 from ceres_cal.problem.residuals import residuals
+from ceres_cal.scene.symmetry import MIRRORED, TURNED
 
 # Share of the observations that another zoom must explain to be looked at. Nothing changes from 0.33 to 0.67.
 _HALF = 0.5

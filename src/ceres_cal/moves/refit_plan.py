@@ -24,10 +24,8 @@ from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import intrinsic_keys, require_possible_numbers
 from ceres_cal.scene.lens import Lens
-from ceres_cal.scene.symmetry import counterparts
+from ceres_cal.scene.symmetry import TURNED, counterparts
 from ceres_cal.scene.targets import target_from_spec
-
-TURNED, MIRRORED = np.array([-1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 
 
 def relabelled(observations: Observations, image: Array) -> Observations | None:

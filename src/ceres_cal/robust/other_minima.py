@@ -24,7 +24,7 @@ from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.problem.residuals import residuals_alone
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.symmetry import is_seen_turned
+from ceres_cal.scene.symmetry import TURNED, is_seen_turned
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
@@ -221,13 +221,12 @@ def _seen_turned(sights: Sights, estimate: Estimate) -> Iterator[Estimate]:
     """The estimate with a station turned by half about the middle of the world, where all that it shows lies as well
     then: the halfway line, the centre line and the circle.
     """
-    half = np.diag([-1.0, -1.0, 1.0])
     for name, station in estimate.stations.items():
         own = [number for number, key in enumerate(sights.keys) if key.station == name]
         of_world = own and all(sights.keys[number].placement is None for number in own)
         if of_world and all(is_seen_turned(*shown) for shown in _shown(sights.take(np.array(own)))):
             pose = station.cam_from_world
-            turned = replace(station, cam_from_world=Pose(pose.rotation @ half, pose.translation))
+            turned = replace(station, cam_from_world=Pose(pose.rotation * TURNED, pose.translation))
             yield replace(estimate, stations={**estimate.stations, name: turned})
 
 

@@ -12,6 +12,8 @@ from ceres_cal.scene.targets import Target
 
 _SAME_M = 1e-6
 _PIECES = 32  # of a curve, whose ends have to lie on another one
+TURNED, MIRRORED = np.array([-1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
+"""What x, y, z are multiplied by in half a turn about the middle of the world, and in its mirrored picture."""
 
 
 # ---- feature by feature ---------------------------------------------------------------------------------------------
@@ -44,13 +46,12 @@ def is_seen_turned(target: Target, points: Collection[int], curves: Collection[t
     """Whether a half turn about the middle of the world sends all of these points, by number, and curves, by number and
     side, onto themselves: then nothing tells a camera from one that is turned.
     """
-    half, every = np.array([-1.0, -1.0, 1.0]), list(target.curves.values())
-    places = target.point_array[list(points)]
-    if np.any(np.abs(places * half - places) > _SAME_M):
+    every, places = list(target.curves.values()), target.point_array[list(points)]
+    if np.any(np.abs(places * TURNED - places) > _SAME_M):
         return False
     sided = any(side and not isinstance(every[number], Arc) for number, side in curves)  # whose edges change places
     return not sided and all(
-        _is_along(curve, curve_points(curve, 0, _PIECES) * half, curve) for curve in (every[n] for n, _ in curves)
+        _is_along(curve, curve_points(curve, 0, _PIECES) * TURNED, curve) for curve in (every[n] for n, _ in curves)
     )
 
 
