@@ -267,7 +267,7 @@ def around(camera: Camera, radius_px: float) -> Array:
     return np.asarray(pixels[np.all((pixels > 0.0) & (pixels < (1279.0, 959.0)), axis=1)])
 
 
-@pytest.mark.parametrize("seed", [3, 5, 11])
+@pytest.mark.parametrize("seed", [3, 5, 20])
 def test_beyond_the_observations_other_lenses_are_what_they_show(seed: int) -> None:
     """85 px beyond the outermost observation of a lens that is chosen by the data."""
     calibration, truth = seen_in_a_circle(seed)
@@ -275,7 +275,7 @@ def test_beyond_the_observations_other_lenses_are_what_they_show(seed: int) -> N
     shown = np.isfinite(truth.locate(pixels)[:, 0])
     points = calibration.uncertainty.located(pixels[shown])
     off = np.linalg.norm(points.located - truth.locate(pixels[shown]), axis=1)
-    assert np.all(off < 4.0 * points.sd_m)  # .6, 1.8, 2.1 measured; 1.9, 7.4 and 9.6 with the chosen lens alone
+    assert np.all(off < 4.0 * points.sd_m)  # .4, 1.3, 2.9 measured; 1.9 and 7.4 of 3 and 5 with the chosen lens alone
 
 
 @pytest.mark.parametrize("seed", [2, 7])

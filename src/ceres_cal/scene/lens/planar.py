@@ -7,7 +7,7 @@ Maps along a radius with value 0 and slope 1 at 0, polynomials and their ratios:
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import ClassVar, Protocol
 
@@ -140,6 +140,41 @@ def invert_increasing(profile: Profile, target: Array) -> Array:
     return answer
 
 
+def inverted(profile: Profile, target: Array, mapped: Callable[[Array], Array] | None = None) -> Array:
+    """Points (N, 2) whose image is `target`, NaN where none is found.
+
+    Args:
+        mapped: the map of points (N, 2) and its derivatives by their x and y, (2, 3, N); without it the map is along
+            the radius alone. profile: its map along the radius, in the direction in which that ends first.
+    """
+    radius, end = np.hypot(target[:, 0], target[:, 1]), profile.limit
+    # Other directions may reach farther than that of the profile: from beyond its rim, start just inside.
+    rim = float(profile.value(np.array(end))) if np.isfinite(end) else end
+    start = invert_increasing(profile, radius if mapped is None else np.minimum(radius, rim * (1.0 - 1e-6)))
+    flat = target * np.where(radius > 0.0, start / radius, 1.0)[:, None]
+    return flat if mapped is None else _newton(mapped, flat, target, end)
+
+
+def _newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit: float) -> Array:
+    """Points (N, 2) whose image is `target`, from `flat`; NaN where Newton's method does not get there."""
+    longest = 0.1  # step of Newton's method, of the limit
+    rows = np.arange(len(flat))
+    for _ in range(STEPS):
+        (x, xx, xy), (y, yx, yy) = mapped(flat[rows])
+        x, y = x - target[rows, 0], y - target[rows, 1]
+        step = np.column_stack([yy * x - xy * y, xx * y - yx * x]) / (xx * yy - xy * yx)[:, None]
+        # At the limit the map hardly grows, and a whole step would end behind others that lead past it.
+        length = np.linalg.norm(step, axis=1)
+        step *= np.minimum(1.0, longest * limit / np.maximum(length, 1e-300))[:, None]
+        flat[rows] -= step
+        rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
+        if not len(rows):
+            break
+    error = np.max(np.abs(mapped(flat)[:, 0].T - target), axis=1)
+    solved = error <= 1e-12 * (1.0 + np.max(np.abs(target), axis=1))
+    return np.where(solved[:, None], flat, np.nan)
+
+
 def dense_polynomial(values: Sequence[float], powers: Sequence[int]) -> Array:
     """x + sum values_k x^powers_k as a polynomial, lowest power first."""
     polynomial = np.zeros(max(powers) + 1)
@@ -216,15 +251,8 @@ class Planar(Lens):
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
         unit = self._unit(phi)
-        measured = offsets / unit
-        radius = np.hypot(measured[:, 0], measured[:, 1])
-        # Other directions may reach farther than that of the profile: from beyond its rim, start just inside.
-        end = self._profile.limit
-        rim = float(self._profile.value(np.array(end))) if np.isfinite(end) else end
-        start = invert_increasing(self._profile, radius if self._is_round else np.minimum(radius, rim * (1.0 - 1e-6)))
-        flat = measured * np.where(radius > 0.0, start / radius, 1.0)[:, None]
-        if not self._is_round:
-            flat = self._within(self._newton(flat, measured))
+        mapped = None if self._is_round else self.mapped
+        flat = self._within(inverted(self._profile, offsets / unit, mapped))
         rays = self._lifted(flat * (unit / phi))
         return unit_rays(rays[:, :2], rays[:, 2])
 
@@ -237,25 +265,6 @@ class Planar(Lens):
         unit = self._unit(1.0)
         images = self._images(self._lifted(flat), unit) / unit
         return np.concatenate([images[:, :1], np.sum(images[:, 1:, None] * self._slopes(flat), axis=1)], axis=1)
-
-    def _newton(self, start: Array, measured: Array) -> Array:
-        """Points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
-        longest = 0.1  # step of Newton's method, of the limit
-        flat, rows = start.copy(), np.arange(len(start))
-        for _ in range(STEPS):
-            (x, xx, xy), (y, yx, yy) = self.mapped(flat[rows])
-            x, y = x - measured[rows, 0], y - measured[rows, 1]
-            step = np.column_stack([yy * x - xy * y, xx * y - yx * x]) / (xx * yy - xy * yx)[:, None]
-            # At the limit the map hardly grows, and a whole step would end behind others that lead past it.
-            length = np.linalg.norm(step, axis=1)
-            step *= np.minimum(1.0, longest * self._limit / np.maximum(length, 1e-300))[:, None]
-            flat[rows] -= step
-            rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
-            if not len(rows):
-                break
-        error = np.max(np.abs(self.mapped(flat)[:, 0].T - measured), axis=1)
-        solved = error <= 1e-12 * (1.0 + np.max(np.abs(measured), axis=1))
-        return np.where(solved[:, None], flat, np.nan)
 
     def monotone_radius(self, phi: float) -> float:
         return self._unit(phi) * self._rim

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base import Array, Indices, InputError, cached_property
+from ceres_cal.base import Array, Indices, InputError
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
-from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, horner, invert_increasing
+from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, derivative, horner, invert_increasing, inverted, less
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,9 @@ class Radial(Lens):
 
     Section 2 of the paper, with a1 = 1: scaling a1, a2, a3 and phi together changes nothing, so phi is the focal length
     at the centre. `powers` (2, 3) is the paper's own choice, (3,) is ssl-vision's model with a3 = distortion / phi^2.
-    The coefficient of power k is named a<k> and has the unit px^(1-k). Brown's decentring p1 and p2 of the ideal point
-    (x/z, y/z), where they are asked for, displaces what is measured; the paper has none.
+    The coefficient of power k is named a<k> and has the unit px^(1-k). Brown's decentring p1 and p2, where they are
+    asked for, takes the measured point to the ideal one as well, as in his own paper (Decentering Distortion of Lenses,
+    1966), by the opposite amount, so that they displace what is measured as OpenCV's do; the paper has none.
     """
 
     powers: tuple[int, ...] = (2, 3)
@@ -92,31 +94,20 @@ class Radial(Lens):
         return self.values[: len(self.powers)]
 
     @property
-    def _across(self) -> tuple[float, ...]:
-        """p1 and p2; nothing where they are 0."""
-        across = self.values[len(self.powers) :]
-        return across if any(across) else ()
-
-    def _decentring(self, flat: Array) -> Array:
-        """By how much ideal points (N, 2) are displaced, at focal length 1."""
-        (p1, p2), (x, y) = self._across, flat.T
-        both, r2 = 2.0 * x * y, x * x + y * y
-        return np.column_stack([p1 * both + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + p2 * both])
+    def _across(self) -> tuple[float, float]:
+        """p1 and p2; 0 where it has none."""
+        p1, p2 = self.values[len(self.powers) :] or (0.0, 0.0)
+        return p1, p2
 
     @property
     def _polynomial(self) -> Array:
         """The map along a radius, lowest power first: r + sum a_k r^k."""
         return dense_polynomial(self._along, self.powers)
 
-    @cached_property
-    def _profile(self) -> Ratio:
-        """That map, as it is inverted."""
-        return Ratio(self._polynomial)
-
-    @property
-    def _limit(self) -> float:
-        """Where it stops growing; infinity where it never does."""
-        return self._profile.limit
+    def _profile(self, phi: float) -> Ratio:
+        """That map in units of phi, in the direction in which a decentring takes most off it, 3 |p| r^2."""
+        along = dense_polynomial(self._along * phi ** np.subtract(self.powers, 1.0), self.powers)
+        return Ratio(less(along, np.array([0.0, 0.0, 3.0 * np.hypot(*self._across)])))
 
     def ideal_radius(self, measured_radius: ArrayLike) -> Array:
         """r' of r, both in px (paper, section 2); no check of the monotone radius."""
@@ -126,34 +117,32 @@ class Radial(Lens):
         """r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
         ideal = np.asarray(ideal_radius, dtype=float)
         with np.errstate(all="ignore"):
-            return invert_increasing(self._profile, ideal.ravel()).reshape(ideal.shape)
+            return invert_increasing(Ratio(self._polynomial), ideal.ravel()).reshape(ideal.shape)
 
     def _distort(self, rays: Array, phi: float) -> Array:
-        ideal = phi * rays[:, :2] / ahead(rays)
-        radius = np.hypot(ideal[:, 0], ideal[:, 1])
-        shrink = np.where(radius > 0.0, self.measured_radius(radius) / radius, 1.0)
-        measured = np.asarray(ideal * shrink[:, None])
-        return measured + phi * self._decentring(ideal / phi) if self._across else measured
+        profile, ideal = self._profile(phi), rays[:, :2] / ahead(rays)
+        measured = inverted(profile, ideal, partial(self._mapped, phi=phi) if any(self._across) else None)
+        return np.where(np.hypot(measured[:, :1], measured[:, 1:]) <= profile.limit, phi * measured, np.nan)
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
-        steps = 30  # of a fixed point, each of which gains some two digits
-        ideal = self._ideal(offsets)
-        if self._across:
-            for _ in range(steps):
-                before, ideal = ideal, self._ideal(offsets - phi * self._decentring(ideal / phi))
-                if not np.nanmax(np.abs(ideal - before), initial=0.0) > 1e-12 * phi:
-                    break
-            ideal[np.any(np.abs(ideal - before) > 1e-9 * phi, axis=1)] = np.nan
-        return unit_rays(ideal, phi)
+        ideal = self._mapped(offsets / phi, phi)[:, 0].T
+        return unit_rays(np.where(self.shows(offsets, phi)[:, None], ideal, np.nan), 1.0)
 
-    def _ideal(self, measured: Array) -> Array:
-        """Ideal points (N, 2) of measured ones along the radius alone, px; NaN beyond the limit."""
-        radius = np.hypot(measured[:, 0], measured[:, 1])
-        stretch = np.where(radius <= self._limit, horner(self._polynomial[1:], radius), np.nan)
-        return np.asarray(measured * stretch[:, None])
+    def _mapped(self, flat: Array, phi: float) -> Array:
+        """(2, 3, N) ideal points of measured ones (N, 2) in units of phi, and the derivatives of that by their x, y."""
+        (p1, p2), (x, y), radius = self._across, flat.T, phi * np.hypot(flat[:, 0], flat[:, 1])
+        stretch, slope = horner(self._polynomial[1:], radius), horner(derivative(self._polynomial), radius)
+        bend = np.where(radius > 0.0, (slope - stretch) / (radius / phi) ** 2, 0.0)
+        across, down = p1 * x + p2 * y, p1 * y + p2 * x  # Brown's decentring, and the halves of its derivatives
+        ideal_x = x * stretch - (2.0 * p1 * x * y + p2 * (3.0 * x * x + y * y))
+        ideal_y = y * stretch - (p1 * (x * x + 3.0 * y * y) + 2.0 * p2 * x * y)
+        xy = bend * x * y - 2.0 * across
+        xx = stretch + bend * x * x - 2.0 * (down + 2.0 * p2 * x)
+        yy = stretch + bend * y * y - 2.0 * (down + 2.0 * p1 * y)
+        return np.array([[ideal_x, xx, xy], [ideal_y, xy, yy]])
 
     def monotone_radius(self, phi: float) -> float:
-        return self._limit
+        return phi * self._profile(phi).limit
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         return {name: measured**power for name, power in zip(self.names, self.powers, strict=False)}, ideal - measured
