@@ -82,8 +82,8 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
     assert conflict.sigmas == pytest.approx((conflict.seen - 3.0) / np.hypot(0.005, conflict.seen_sd), rel=0.15)
     assert conflict.words in wrong().warnings
     assert conflict.words == (
-        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.969 ± 0.056 m, "
-        "15 sigmas apart: correct or remove it"
+        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.969 ± 0.053 m, "
+        "16 sigmas apart: correct or remove it"
     )
 
 
@@ -151,6 +151,17 @@ def test_two_heights_contradict_each_other(tilt_deg: float) -> None:
     assert known.value == pytest.approx(HEIGHT_M if tilt_deg else 3.51, abs=0.1)
     judged = verdict(calibration, seen(tilt_deg))
     assert judged.level == "no" and not any("model is wrong" in line for _, line in judged.reasons)
+
+
+@pytest.mark.parametrize("stated", [Prior("camera", "overhead", "phi", (1500.0,), (2.0,)), height(2.0, 0.005)])
+def test_nothing_takes_up_a_grossly_wrong_statement(stated: Prior) -> None:
+    """A phi of 1500 px was confirmed by a spline, without a word; a height of 2 m by a board and views that moved."""
+    sample = Observations.load(Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json")
+    calibration = calibrate(sample, Options(priors=(stated,)))
+    (conflict,) = calibration.conflicts
+    assert "the observations alone say" in conflict.words and calibration.warnings == (conflict.words,)
+    assert calibration.station().phi == pytest.approx(868.6, abs=1.0) and calibration.options.priors == (stated,)
+    assert calibration.digest == sample.digest
 
 
 def test_the_wrong_one_of_two_that_fight_is_named() -> None:

@@ -20,6 +20,7 @@ from ceres_cal.calibration.outcome import (
 from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
+from ceres_cal.observations.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.assess import assess, with_doubts
 from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements, shifts_by_roughness
@@ -27,7 +28,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution, SolveProgress
 from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, Layout, Options
-from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.priors import GaussianPrior, stated_of_cameras
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
@@ -70,6 +71,7 @@ class Task(Frozen):
     chosen: bool = False
     before: Layout | None = None
     scales: tuple[float, float] | None = None
+    stated: tuple[Observations, Options] | None = None
 
 
 class Explained(Frozen):
@@ -142,6 +144,22 @@ class Explained(Frozen):
 
         return shifts_at
 
+    @property
+    def as_stated(self) -> Explained:
+        """The answer with what was set aside at the start, solved for from where everything else was explained."""
+        if self.task.stated is None:
+            return self
+        observations, options = self.task.stated
+        lenses = {name: camera.lens for name, camera in self.end.estimate.cameras.items()}
+        options = replace(self.problem.options, priors=options.priors)
+        every = stated_of_cameras(observations, options, lenses).values()
+        known = {key for prior in every for key in prior.keys}
+        others = [prior for prior in (one.without(known) for one in self.problem.priors) if prior.keys]
+        sights = replace(self.problem.sights, observations=observations)
+        problem = replace(self.problem, sights=sights, options=options, priors=(*every, *others))
+        end = solve_robustly(problem, self.end.estimate, self.task.scales, self.task.progress)
+        return replace(self, problem=problem, end=end)
+
     def without(self, conflicts: Conflicts) -> Explained:
         """The answer without what was stated and everything else contradicts."""
         if conflicts.answer is None:
@@ -176,7 +194,7 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
 
 def known_of(seen: Explained) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
-    task, conflicts = seen.task, Conflicts()
+    task, seen, conflicts = seen.task, seen.as_stated, Conflicts()
     if task.tested:
         part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
         conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at)

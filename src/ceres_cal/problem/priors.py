@@ -8,6 +8,7 @@ of a prior is root (x - mean) with root^T root = information.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from types import MappingProxyType
 
 import numpy as np
 
@@ -174,17 +175,25 @@ def gather_priors(
         InputError: a prior names a camera, a station or a quantity that is not there.
     """
     lenses = {name: camera.lens for name, camera in (cameras or {}).items()}
-    stated = []
-    for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
-        observations.require_owner(prior)
-        is_effect = prior.is_coma and prior in observations.priors
-        if not (prior.is_open or prior.curve or is_effect):  # the first two are among the tolerances
-            stated.append(stated_prior(prior, lenses.get(prior.name) or options.of_camera(prior.name).blank_lens))
+    stated = [*stated_of_cameras(observations, options, lenses).values()]
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))
     known = {key for prior in stated for key in prior.keys}
     usual = usual_cameras(observations, options, known, lenses) if options.usual_camera else ()
     return (*stated, *usual, *tolerances(structure))
+
+
+def stated_of_cameras(
+    observations: Observations, options: Options, lenses: Mapping[str, Lens] = MappingProxyType({})
+) -> dict[Prior, GaussianPrior]:
+    """What observations and options state of numbers, once each; see `gather_priors`."""
+    stated = {}
+    for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
+        observations.require_owner(prior)
+        is_effect = prior.is_coma and prior in observations.priors
+        if not (prior.is_open or prior.curve or is_effect):  # the first two are among the tolerances
+            stated[prior] = stated_prior(prior, lenses.get(prior.name) or options.of_camera(prior.name).blank_lens)
+    return stated
 
 
 def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
