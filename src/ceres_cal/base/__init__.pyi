@@ -11,3 +11,5 @@ from ceres_cal.base.threads import *
 from ceres_cal.base.transforms import *
 from ceres_cal.base.typed import *
 from ceres_cal.base.words import *
+
+__version__: str

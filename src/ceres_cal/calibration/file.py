@@ -10,9 +10,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base import Frozen, InputError, PixelOrigin, Units, convert, field, naming, replace
+from ceres_cal.base import Frozen, InputError, PixelOrigin, Units, __version__, convert, field, naming, replace
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
-from ceres_cal.base.version import __version__
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.posterior.files import PosteriorFile, information_from, lower_triangle, require_keys

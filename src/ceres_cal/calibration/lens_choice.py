@@ -136,16 +136,18 @@ class Comparison(Frozen):
         near = attempt(partial(solved, self.chosen))  # reads: "other lenses could not be compared, ..."
         if isinstance(near, CalibrationError):
             return replace(found, failed=str(near))
-        found = replace(found, near=near)
+        found, left = replace(found, near=near), 1.0
         for one, weight, steps in each:
-            # quiet: what cannot be solved for, or ends in another minimum, says nothing
+            # quiet: what cannot be solved for, or ends in another minimum, says nothing, and the rest share its weight
             near = attempt(partial(solved, one, as_promised=True))
-            if not isinstance(near, CalibrationError):
-                ends = self._ends(one, near, steps)
-                weights = (weight / len(ends),) * len(ends)
-                found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
+            if isinstance(near, CalibrationError):
+                left -= weight
+                continue
+            ends = self._ends(one, near, steps)
+            weights = (weight / len(ends),) * len(ends)
+            found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
         # What they say by chance is less by as much as there are more observations than took part.
-        share = max(self.share, least_share)
+        share = max(self.share, least_share) / max(left, least_probability)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
     def _open_phi(self, one: Candidate, posterior: Posterior) -> dict[Key, float]:

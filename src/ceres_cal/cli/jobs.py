@@ -22,9 +22,18 @@ from typing import Any
 import msgspec
 
 from ceres_cal import observations
-from ceres_cal.base import CalibrationError, Frozen, InputError, answer_or_reason, attempt, note, printable, replace
+from ceres_cal.base import (
+    CalibrationError,
+    Frozen,
+    InputError,
+    __version__,
+    answer_or_reason,
+    attempt,
+    note,
+    printable,
+    replace,
+)
 from ceres_cal.base.files import convert, parse_json, read_bytes
-from ceres_cal.base.version import __version__
 
 RESULTS = "results.jsonl"
 LEVELS = ("failed", "no", "care", "good")
