@@ -8,7 +8,7 @@ lens predict the others no better: a criterion that counts observations would ta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -82,6 +82,9 @@ class Chosen(Frozen):
         return OtherLenses(self.start.estimate, (), (), {}) if self.among is None else self.among.others(posterior)
 
 
+_Steps = Mapping[Key, Mapping[Key, float]]
+
+
 class Comparison(Frozen):
     """The lenses that were compared, and the one that was chosen.
 
@@ -120,14 +123,20 @@ class Comparison(Frozen):
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         told = [one for one in self.tried if not one.form.blank.roughness]
         likely = dict(zip(told, _probabilities(told), strict=True))
+        longer = [one for one in told if one.extends(self.chosen, self.as_good)]
+        asked = [one for one in told if one is not self.chosen and (one in longer or likely[one] >= least_probability)]
         each = list[tuple[Candidate, float, dict[Key, float]]]()
-        for one in told:
-            steps = self._open_phi(one, posterior)
-            if steps and one.extends(self.chosen, self.as_good):
+        if self.chosen.form.blank.roughness or not asked:
+            return found
+        here, own = posterior.mixture(), self.chosen.along_phi(posterior.stated)
+        known = dict(zip(here.keys, np.sqrt(here.variances[0]).tolist(), strict=True))
+        for one in asked:
+            steps = self._open_phi(one.along_phi(posterior.stated), own, known, one.of.estimate)
+            if steps and one in longer:
                 likely[one] = max(likely[one], likely[self.chosen])
-            if one is not self.chosen and likely[one] >= least_probability and not one.fault:
+            if likely[one] >= least_probability and not one.fault:
                 each.append((one, likely[one], steps))
-        if self.chosen.form.blank.roughness or not each:
+        if not each:
             return found
 
         def solved(one: Candidate, *, as_promised: bool = False) -> Estimate:
@@ -150,20 +159,23 @@ class Comparison(Frozen):
         share = max(self.share, least_share) / max(left, least_probability)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
-    def _open_phi(self, one: Candidate, posterior: Posterior) -> dict[Key, float]:
+    @staticmethod
+    def _open_phi(along: _Steps, own: _Steps, known: Mapping[Key, float], there: Estimate) -> dict[Key, float]:
         """How numbers vary, by a standard deviation, along what another lens leaves open of phi and the chosen one does
         not.
 
         Straight from above the form of a lens alone tells phi. Of a floor one coefficient knew it to 0.4 %, 16 standard
         deviations off at robot height; three, which predicted as well, knew it to 10 %.
+
+        Args:
+            along, own: of the other lens and the chosen one, see `Candidate.along_phi`. known: standard deviations by
+                the chosen one. there: cameras of the other's kind.
         """
-        much, most = 1.0, 0.5  # excess of variance over that by the chosen lens; of phi
-        here, own, steps = posterior.mixture(), self.chosen.along_phi(posterior.stated), dict[Key, float]()
-        known = dict(zip(here.keys, np.sqrt(here.variances[0]).tolist(), strict=True))
-        for phi, step in one.along_phi(posterior.stated).items():
+        much, most, steps = 1.0, 0.5, dict[Key, float]()  # excess of variance over that by the chosen lens; of phi
+        for phi, step in along.items():
             excess = (step[phi] / own[phi][phi]) ** 2 - 1.0 if known.get(phi, 0.0) and phi in own else 0.0
             if excess > much:
-                far = min(known[phi] * excess**0.5, most * one.of.estimate.cameras[phi.owner].phi)
+                far = min(known[phi] * excess**0.5, most * there.cameras[phi.owner].phi)
                 steps |= {key: steps.get(key, 0.0) + far * value / step[phi] for key, value in step.items()}
         return steps
 
