@@ -82,7 +82,7 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
     assert conflict.sigmas == pytest.approx((conflict.seen - 3.0) / np.hypot(0.005, conflict.seen_sd), rel=0.15)
     assert conflict.words in wrong().warnings
     assert conflict.words == (
-        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.969 ± 0.053 m, "
+        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.970 ± 0.053 m, "
         "16 sigmas apart: correct or remove it"
     )
 
@@ -162,6 +162,25 @@ def test_nothing_takes_up_a_grossly_wrong_statement(stated: Prior) -> None:
     assert "the observations alone say" in conflict.words and calibration.warnings == (conflict.words,)
     assert calibration.station().phi == pytest.approx(868.6, abs=1.0) and calibration.options.priors == (stated,)
     assert calibration.digest == sample.digest
+
+
+def test_a_fisheye_without_a_wrong_height_is_found_where_it_was_before() -> None:
+    """From where a height of 2.4 m had led, the observations alone said 2.16 m: phi 367 px, places 80 mm off."""
+    pose = overhead_pose(0.1, -0.2, 3.2, tilt_x_deg=9.0, tilt_y_deg=-4.3, yaw_deg=3.0)
+    cameras, stations = {"overhead": camera("kannala-brandt")}, {"overhead": Station("overhead", pose)}
+    scene = field_scene(ssl_field("B"), cameras, stations, spacing_m=0.2)
+    calibration = calibrate(simulate(scene, NOISE, seed=9).observations, Options(priors=(height(2.4, 0.005),)))
+    (conflict,) = calibration.conflicts
+    assert abs(conflict.seen - 3.2) < 3.0 * conflict.seen_sd < 0.1 and calibration.station().phi > 540.0
+
+
+def test_no_lens_takes_up_a_phi_that_is_held_wrong() -> None:
+    """Under a phi of 1096 px a spline was taken, and the observations alone said 1854 +- 17 px of 548 px."""
+    seen_alone = simulate(SCENES["kannala-brandt/boards"](), NOISE, seed=7).observations
+    calibration = calibrate(seen_alone, Options(fixed={"phi": 1096.0}))
+    (conflict,) = calibration.conflicts
+    assert abs(conflict.seen - 548.0) < 3.0 * conflict.seen_sd < 6.0
+    assert calibration.options.fixed == {"phi": 1096.0} and calibration.station().phi == 1096.0
 
 
 def test_the_wrong_one_of_two_that_fight_is_named() -> None:

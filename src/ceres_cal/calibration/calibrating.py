@@ -18,7 +18,15 @@ from ceres_cal.calibration.solving import Explained, Task, explained, known_of, 
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import require_filled, unfilled
 from ceres_cal.posterior.assess import with_other_lenses
-from ceres_cal.problem import EXACT, SolveProgress, gather_priors, make_structure, problem_of, require_possible_numbers
+from ceres_cal.problem import (
+    EXACT,
+    SolveProgress,
+    free_keys,
+    gather_priors,
+    make_structure,
+    problem_of,
+    require_possible_numbers,
+)
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import stated_of_cameras
 from ceres_cal.robust.as_built import Built, free_dimensions
@@ -197,22 +205,26 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
 
 
 def _without_disputed(sights: Sights, options: Options) -> tuple[Sights, Options] | None:
-    """Without what is stated and a first solution contradicts; None where it contradicts nothing."""
+    """Without what is stated or held and a first solution contradicts; None where it contradicts nothing."""
     observations = sights.observations
     each = (observations.priors, options.priors)
-    if not any(each) or options.closed_form_only:
+    holds = options.fixed or not options.free_principal_point
+    if not (any(each) or holds) or options.closed_form_only:
         return None
     end = attempt(partial(_first_solved, sights, options))  # quiet: whoever solves for all meets it again
     if isinstance(end, CalibrationError):
         return None
-    kept = {key for prior in without_suspicious(end.problem, end).priors for key in prior.keys}
+    agreed = without_suspicious(end.problem, end)
+    kept = {key for prior in agreed.priors for key in prior.keys}
     stated = stated_of_cameras(observations, end.problem.options)
     disputed = [one for one, prior in stated.items() if kept.isdisjoint(prior.keys)]
-    if not disputed:
+    now, before = (set(free_keys(end.estimate, one.layout)) for one in (agreed, end.problem))
+    freed = {key.quantity for key in now - before}
+    if not (disputed or freed):
         return None
     of_views, of_options = (tuple(prior for prior in priors if prior not in disputed) for priors in each)
     sights = replace(sights, observations=replace(observations, priors=of_views))
-    return sights, replace(options, priors=of_options)
+    return sights, replace(options.freeing(freed), priors=of_options)
 
 
 def _first_solved(sights: Sights, options: Options) -> RobustSolution:

@@ -27,7 +27,7 @@ from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements, sh
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution, SolveProgress
 from ceres_cal.problem.information import Key, over
-from ceres_cal.problem.parameters import Estimate, Layout, Options
+from ceres_cal.problem.parameters import Estimate, Layout, Options, as_held, make_layout
 from ceres_cal.problem.priors import GaussianPrior, stated_of_cameras
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
@@ -151,13 +151,16 @@ class Explained(Frozen):
             return self
         observations, options = self.task.stated
         lenses = {name: camera.lens for name, camera in self.end.estimate.cameras.items()}
-        options = replace(self.problem.options, priors=options.priors)
+        stated = {name: getattr(options, name) for name in ("priors", "fixed", "free_principal_point")}
+        options = replace(self.problem.options, **stated)
         every = stated_of_cameras(observations, options, lenses).values()
         known = {key for prior in every for key in prior.keys}
         others = [prior for prior in (one.without(known) for one in self.problem.priors) if prior.keys]
         sights = replace(self.problem.sights, observations=observations)
-        problem = replace(self.problem, sights=sights, options=options, priors=(*every, *others))
-        end = solve_robustly(problem, self.end.estimate, self.task.scales, self.task.progress)
+        layout = make_layout(observations, options)
+        problem = replace(self.problem, sights=sights, layout=layout, options=options, priors=(*every, *others))
+        cameras = {name: as_held(camera, options) for name, camera in self.end.estimate.cameras.items()}
+        end = solve_robustly(problem, replace(self.end.estimate, cameras=cameras), self.task.scales, self.task.progress)
         return replace(self, problem=problem, end=end)
 
     def without(self, conflicts: Conflicts) -> Explained:
@@ -194,10 +197,11 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
 
 def known_of(seen: Explained) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
-    task, seen, conflicts = seen.task, seen.as_stated, Conflicts()
+    task, conflicts = seen.task, Conflicts()
+    near, seen = seen.end if task.stated else None, seen.as_stated
     if task.tested:
         part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
-        conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at)
+        conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at, near)
         seen = seen.without(conflicts)
     settled = None
     if task.settle is not None:

@@ -207,6 +207,7 @@ def find_conflicts(
     usual: tuple[float, float] | None = None,
     part: Problem | None = None,
     shifts_at: ShiftsAt | None = None,
+    near: RobustSolution | None = None,
 ) -> Conflicts:
     """Everything stated that the rest contradicts, the worst first, each with those before it left out.
 
@@ -214,13 +215,14 @@ def find_conflicts(
         problem: of all the observations. end: its solution. usual: noise scales that were seen before.
         part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
             without an outlier; None where the answer stays. shifts_at: by which numbers scatter besides.
+        near: where it was solved without what looks wrong, if it was: a wrong statement may lead to another minimum.
     """
     most = 4  # solves
     every = tuple(statements(problem, end.estimate))
     if not every:
         return Conflicts()
     reduced = end.told
-    search = _ForwardSelection(problem, end, usual, every, shifts_at)
+    search = _ForwardSelection(problem, end, usual, every, shifts_at, near)
     while search.solves < most and search.leave_out_the_worst():
         pass
     pairs = list(contradicting(every))
@@ -303,6 +305,7 @@ class _ForwardSelection:
     usual: tuple[float, float] | None
     every: tuple[Statement, ...]
     shifts_at: ShiftsAt | None
+    near: RobustSolution | None = None
 
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
@@ -328,7 +331,7 @@ class _ForwardSelection:
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.estimate)
-        after = None if suspect.kind == "earlier" else _solved(freed, self.end, self.usual)
+        after = None if suspect.kind == "earlier" else _solved(freed, self.near or self.end, self.usual)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
