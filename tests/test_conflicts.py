@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenery import field_scene, overhead_pose
+from scenery import board_scene, field_scene, join, overhead_pose
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal.base.errors import InputError, SolutionError
@@ -181,6 +181,20 @@ def test_no_lens_takes_up_a_phi_that_is_held_wrong() -> None:
     (conflict,) = calibration.conflicts
     assert abs(conflict.seen - 548.0) < 3.0 * conflict.seen_sd < 6.0
     assert calibration.options.fixed == {"phi": 1096.0} and calibration.station().phi == 1096.0
+
+
+def test_statements_that_are_wrong_together_are_all_named() -> None:
+    """A phi and a height a fifth too large confirm one another: phi came out as 1037 px, and neither was named."""
+    pose = overhead_pose(0.1, -0.2, HEIGHT_M, tilt_x_deg=7.2, tilt_y_deg=-3.4, yaw_deg=3.0)
+    before = {"overhead": camera("radial-2-3")}, {"overhead": Station("overhead", pose)}
+    scene = join(
+        field_scene(ssl_field("B"), *before, spacing_m=0.2), board_scene(checkerboard(9, 6, 0.1), *before, 5, seed=3)
+    )
+    phi = Prior("camera", "overhead", "phi", (1.2 * 868.0,), (2.0,))
+    calibration = calibrate(simulate(scene, NOISE, seed=5).observations, under(phi, height(1.2 * HEIGHT_M, 0.005)))
+    assert {one.quantity for one in calibration.conflicts} == {"phi", "height"}
+    assert calibration.station().phi == pytest.approx(868.0, abs=5.0)
+    assert calibration.station().position[2] == pytest.approx(HEIGHT_M, abs=0.03)
 
 
 def test_the_wrong_one_of_two_that_fight_is_named() -> None:

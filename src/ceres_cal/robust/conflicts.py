@@ -13,8 +13,9 @@ slope of the cost along it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -225,6 +226,7 @@ def find_conflicts(
     search = _ForwardSelection(problem, end, usual, every, shifts_at, near)
     while search.solves < most and search.leave_out_the_worst():
         pass
+    search.leave_out_together()
     pairs = list(contradicting(every))
     named = (*(one for _, one in pairs), *search.conflicts())
     priors, answer = agreed(problem.priors, named), None
@@ -242,13 +244,24 @@ def without_suspicious(problem: Problem, end: RobustSolution) -> Problem:
     """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
     others. Tolerances stay: a line that its own one does not hold is a line aside.
     """
-    estimate = end.estimate
-    for one in statements(problem, estimate):
-        if one.kind in ("earlier", "tolerance"):
-            continue
-        if worst_test(one, linear_rest(one, end)).log_p < np.log(_SUSPICIOUS):
+    estimate, suspicious = end.estimate, np.log(_SUSPICIOUS)
+    every = [one for one in statements(problem, estimate) if one.kind not in ("earlier", "tolerance")]
+    for one in every:
+        if worst_test(one, linear_rest(one, end)).log_p < suspicious:
             problem = one.left_out(problem, estimate)
+    told, left = _together(every), _together(statements(problem, estimate))
+    if told and left and worst_test(left, linear_rest(told, end)).log_p < suspicious:
+        problem = left.left_out(problem, estimate)
     return problem
+
+
+def _together(every: Iterable[Statement]) -> Statement | None:
+    """Priors of different numbers as one statement, for wrong ones may confirm one another: a phi and a height that are
+    both a fifth too large, heights that are all in feet. None where there are no two.
+    """
+    parts = [one for one in every if one.kind == "prior"]
+    keys, priors = (tuple(chain.from_iterable(getattr(one, of) for one in parts)) for of in ("keys", "priors"))
+    return Statement("prior", keys, priors, np.empty(0)) if len(parts) > 1 else None
 
 
 def contradicted_by(
@@ -349,6 +362,39 @@ class _ForwardSelection:
             self.problem, self.end = freed, after
         return True
 
+    def leave_out_together(self) -> None:
+        """Judge all that is left of what was stated by what is solved for without any of it."""
+        out = [one for one, *_ in self.out]
+        parts = [one for one in self.every if one.kind == "prior" and one not in out]
+        together = _together(parts)
+        if together is None or worst_test(together, linear_rest(together, self.end)).log_p > np.log(_SUSPICIOUS):
+            return
+        freed = together.left_out(self.problem, self.end.estimate)
+        after = _solved(freed, self.near or self.end, self.usual)
+        if after is None:
+            return
+        rise = self._rise(after)
+        if rise is None or log_probability(rise, rest_at(together, after)) > self._level:
+            return
+        rest = rest_at(together, after, self._known(after))
+        tests = [(one, worst_test(one, rest)) for one in parts]
+        wrong = [(one, test, ()) for one, test in tests if test.log_p <= self._level]
+        if wrong:
+            named = {one.keys for one, *_ in wrong}
+            self.doubts = [one for one in self.doubts if one.keys not in named]
+            self.out += wrong
+            self.places.append(difference(after.estimate, self._start, self._first.shared.keys))
+            self.problem, self.end = freed, after
+
+    def _rise(self, after: RobustSolution) -> float | None:
+        """By how much the least squares rise, over the same observations, when what was left out there is added."""
+        without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
+        bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
+        starts = (without, after.estimate), (bound, self.end.estimate)
+        ends = attempt(lambda: [solve(*start).cost for start in starts])  # quiet: the linear test decides
+        # Of exact observations it is rounding.
+        return None if isinstance(ends, CalibrationError) else max(2.0 * (ends[1] - ends[0]), 0.0)
+
     def conflicts(self) -> list[Conflict]:
         """What is in conflict still when all of it is left out: a wrong height may have made others look wrong."""
         alone = all(prior.is_usual for prior in self.problem.priors) and len(self.out) == len(self.every)
@@ -377,14 +423,8 @@ class _ForwardSelection:
         rest = rest_at(statement, after)
         alone = worst_test(statement, rest)
         test = worst_test(statement, rest_at(statement, after, self._known(after)))
-        without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
-        bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
-        starts = (without, rest.estimate), (bound, self.end.estimate)
-        ends = attempt(lambda: [solve(*start).cost for start in starts])  # quiet: the linear test decides
-        if isinstance(ends, CalibrationError):
-            return test
-        rise = max(2.0 * (ends[1] - ends[0]), 0.0)  # of exact observations it is rounding
-        if rise >= alone.squared or len(statement.priors) > 1:
+        rise = self._rise(after)
+        if rise is None or rise >= alone.squared or len(statement.priors) > 1:
             return test
         share = rise / alone.squared
         squared, sigmas = share * test.squared, test.sigmas * share**0.5
