@@ -195,26 +195,37 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
     A height 25 % wrong was taken up by a principal point that moves from view to view and by a board that is bent.
     """
     sights = gather_sights(observations)
-    agreed = _without_disputed(sights, options)
+    start = initialise(sights, _named(options))
+    agreed = _without_disputed(sights, options, start)
     if agreed is not None:
+        (rest, fewer), asked = agreed, replace(task, stated=(observations, options))
         # quiet: nothing of what was stated is set aside
-        found = attempt(partial(_of_lenses, replace(task, stated=(observations, options)), *agreed))
+        found = attempt(lambda: _of_lens_asked(asked, initialise(rest, _named(fewer)), rest, fewer))
         if isinstance(found, Calibration) and found.conflicts:
             return found
-    return _of_lenses(task, sights, options)
+    return _of_lens_asked(task, start, sights, options)
 
 
-def _without_disputed(sights: Sights, options: Options) -> tuple[Sights, Options] | None:
+def _named(options: Options) -> Options:
+    """With the paper's lens where none is named."""
+    from ceres_cal.calibration.lens_forms import papers
+
+    return options if options.lens != AUTO else papers(options)
+
+
+def _without_disputed(sights: Sights, options: Options, start: Start) -> tuple[Sights, Options] | None:
     """Without what is stated or held and a first solution contradicts; None where it contradicts nothing."""
+    # Ten standard deviations: with the paper's lens for another one right heights of a rig are up to 6.5 off.
+    grossly = 1e-22
     observations = sights.observations
     each = (observations.priors, options.priors)
     holds = options.fixed or not options.free_principal_point
     if not (any(each) or holds) or options.closed_form_only:
         return None
-    end = attempt(partial(_first_solved, sights, options))  # quiet: whoever solves for all meets it again
+    end = attempt(partial(_first_solved, sights, options, start))  # quiet: whoever solves for all meets it again
     if isinstance(end, CalibrationError):
         return None
-    agreed = without_suspicious(end.problem, end)
+    agreed = without_suspicious(end.problem, end, grossly)
     kept = {key for prior in agreed.priors for key in prior.keys}
     stated = stated_of_cameras(observations, end.problem.options)
     disputed = [one for one, prior in stated.items() if kept.isdisjoint(prior.keys)]
@@ -227,31 +238,23 @@ def _without_disputed(sights: Sights, options: Options) -> tuple[Sights, Options
     return sights, replace(options.freeing(freed), priors=of_options)
 
 
-def _first_solved(sights: Sights, options: Options) -> RobustSolution:
-    """With the paper's lens where none is named."""
-    from ceres_cal.calibration.lens_forms import papers
-
-    given = options if options.lens != AUTO else papers(options)
-    start = initialise(sights, given)
-    problem = problem_of(sights, given, start.estimate)
+def _first_solved(sights: Sights, options: Options, start: Start) -> RobustSolution:
+    problem = problem_of(sights, _named(options), start.estimate)
     return solve_robustly(problem, start.estimate, is_near=start.is_near)
 
 
-def _of_lenses(task: Task, sights: Sights, options: Options) -> Calibration:
+def _of_lens_asked(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
     if options.lens == AUTO:
-        return _of_any_lens(replace(task, chosen=True), sights, options)
-    return _of_lens(task, initialise(sights, options), sights, options)
+        return _of_any_lens(replace(task, chosen=True), start, sights, options)
+    return _of_lens(task, start, sights, options)
 
 
-def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
+def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
     """With the lenses that the data ask for."""
-    from ceres_cal.calibration.lens_forms import papers
     from ceres_cal.calibration.lenses import choose_lenses
 
-    simple = papers(options)
-    start = initialise(sights, simple)
     if options.closed_form_only:
-        return _of_lens(task, start, sights, simple)
+        return _of_lens(task, start, sights, _named(options))
 
     def seen_with(lenses: ChosenLenses) -> Explained:
         problem = problem_of(sights, lenses.options, lenses.start.estimate)
@@ -297,8 +300,8 @@ def _of_any_lens(task: Task, sights: Sights, options: Options) -> Calibration:
 
 def _part(bulk: Bulk, options: Options) -> Subset:
     """The part that decides: of the world some views, with those that stand out at a first solution of others."""
-    part = bulk.part()
-    return bulk.part(bulk.standing_out(_first_solved(gather_sights(part.observations), options)))
+    sights = gather_sights(bulk.part().observations)
+    return bulk.part(bulk.standing_out(_first_solved(sights, options, initialise(sights, _named(options)))))
 
 
 def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:

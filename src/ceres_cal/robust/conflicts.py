@@ -240,11 +240,11 @@ def find_conflicts(
     return Conflicts(named, reduced.shared.keys, tuple(shifts), answer, tuple(search.doubts))
 
 
-def without_suspicious(problem: Problem, end: RobustSolution) -> Problem:
-    """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
-    others. Tolerances stay: a line that its own one does not hold is a line aside.
+def without_suspicious(problem: Problem, end: RobustSolution, probability: float = _SUSPICIOUS) -> Problem:
+    """The problem without what is stated of cameras and looks wrong where it was solved, by chance at most so often: it
+    may bend what is said of others. Tolerances stay: a line that its own one does not hold is a line aside.
     """
-    estimate, suspicious = end.estimate, np.log(_SUSPICIOUS)
+    estimate, suspicious = end.estimate, np.log(probability)
     every = [one for one in statements(problem, estimate) if one.kind not in ("earlier", "tolerance")]
     for one in every:
         if worst_test(one, linear_rest(one, end)).log_p < suspicious:
