@@ -28,7 +28,7 @@ from ceres_cal.problem import (
     require_possible_numbers,
 )
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
-from ceres_cal.problem.priors import stated_of_cameras
+from ceres_cal.problem.priors import stated_priors
 from ceres_cal.robust.as_built import Built, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by, without_suspicious
 from ceres_cal.robust.noise import noise_of_cameras
@@ -227,7 +227,7 @@ def _without_disputed(sights: Sights, options: Options, start: Start) -> tuple[S
         return None
     agreed = without_suspicious(end.problem, end, grossly)
     kept = {key for prior in agreed.priors for key in prior.keys}
-    stated = stated_of_cameras(observations, end.problem.options)
+    stated = stated_priors(observations, end.problem.options)
     disputed = [one for one, prior in stated.items() if kept.isdisjoint(prior.keys)]
     now, before = (set(free_keys(end.estimate, one.layout)) for one in (agreed, end.problem))
     freed = {key.quantity for key in now - before}

@@ -28,7 +28,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution, SolveProgress
 from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, Layout, Options, as_held, make_layout
-from ceres_cal.problem.priors import GaussianPrior, stated_of_cameras
+from ceres_cal.problem.priors import GaussianPrior, stated_priors
 from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
@@ -153,7 +153,7 @@ class Explained(Frozen):
         lenses = {name: camera.lens for name, camera in self.end.estimate.cameras.items()}
         stated = {name: getattr(options, name) for name in ("priors", "fixed", "free_principal_point")}
         options = replace(self.problem.options, **stated)
-        every = stated_of_cameras(observations, options, lenses).values()
+        every = stated_priors(observations, options, lenses).values()
         known = {key for prior in every for key in prior.keys}
         others = [prior for prior in (one.without(known) for one in self.problem.priors) if prior.keys]
         sights = replace(self.problem.sights, observations=observations)

@@ -175,7 +175,7 @@ def gather_priors(
         InputError: a prior names a camera, a station or a quantity that is not there.
     """
     lenses = {name: camera.lens for name, camera in (cameras or {}).items()}
-    stated = [*stated_of_cameras(observations, options, lenses).values()]
+    stated = [*stated_priors(observations, options, lenses).values()]
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))
     known = {key for prior in stated for key in prior.keys}
@@ -183,7 +183,7 @@ def gather_priors(
     return (*stated, *usual, *tolerances(structure))
 
 
-def stated_of_cameras(
+def stated_priors(
     observations: Observations, options: Options, lenses: Mapping[str, Lens] = MappingProxyType({})
 ) -> dict[Prior, GaussianPrior]:
     """What observations and options state of numbers, once each; see `gather_priors`."""
