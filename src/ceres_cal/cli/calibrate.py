@@ -194,8 +194,7 @@ def _powers(args: CalibrateArguments) -> tuple[int, ...]:
 
 def _options(args: CalibrateArguments, observations: Observations, **parsed: Any) -> Options:
     """The options; `parsed`: powers and what is fixed."""
-    from ceres_cal.problem.parameters import Options
-    from ceres_cal.problem.structure import dimensions_of
+    from ceres_cal.problem import Options, dimensions_of
 
     terms = tuple(arguments.parse_names(args.terms))
     parsed |= {"lens": args.lens or _AUTO, "terms": terms}  # powers alone make radial

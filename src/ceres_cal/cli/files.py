@@ -60,8 +60,7 @@ def require_shown(
     """The field that photographs are to show; InputError, before any is searched, where what is said of it, of the
     board or of the camera cannot be.
     """
-    from ceres_cal.problem.parameters import Options
-    from ceres_cal.problem.quantities import camera_ranges, place_range
+    from ceres_cal.problem import Options, camera_ranges, place_range
 
     least = 0.1  # of the picture's diagonal, that a field is large which can be found
     if board is not None:

@@ -20,8 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Mask
-from ceres_cal.base.frozen import Frozen, Rows
+from ceres_cal.base import Array, Array32, Frozen, Mask, Rows
 from ceres_cal.kernels import profile_equations
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0

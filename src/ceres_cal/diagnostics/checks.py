@@ -14,9 +14,7 @@ from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, log_chi2_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.columns import Selection
-from ceres_cal.effects.effect import Amount, AsBuilt, Case, EffectEstimate, Finding, Words
-from ceres_cal.effects.linearised import Linearised
+from ceres_cal.effects import Amount, AsBuilt, Case, EffectEstimate, Finding, Linearised, Selection, Words
 from ceres_cal.effects.table.targets import feature_of
 from ceres_cal.problem.structure import numbers_by_kind
 from ceres_cal.robust.noise import LARGER, Inliers

@@ -14,17 +14,13 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.checks import CHECKS, DiagnosisCase, Noise, TestResults, measure_noise, solved_for
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.effects.columns import EffectSums, least_absolute, select
-from ceres_cal.effects.effect import Finding
-from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
+from ceres_cal.effects import EffectSums, Finding, Weights, equation_weights, least_absolute, make_linear_model, select
 from ceres_cal.effects.table import EFFECTS, JointStep, columns_of_all, joint_step
 from ceres_cal.effects.table.targets import CURVE_ASIDE, POINT_ASIDE
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Layout, Problem, Weighting
 from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals, write_equations
-from ceres_cal.robust.noise import USUAL_EQUATIONS, Inliers, judge
-from ceres_cal.robust.other_minima import with_lost_boards_posed
-from ceres_cal.robust.stated import Conflict
+from ceres_cal.robust import USUAL_EQUATIONS, Conflict, Inliers, judge, with_lost_boards_posed
 
 if TYPE_CHECKING:
     from ceres_cal.diagnostics.summaries import Summaries

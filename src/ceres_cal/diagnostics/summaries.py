@@ -8,8 +8,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, numbers_of
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.effects.effect import Case
-from ceres_cal.effects.linearised import Linearised
+from ceres_cal.effects import Case, Linearised
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)

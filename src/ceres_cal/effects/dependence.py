@@ -22,10 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.tails import student_95
-from ceres_cal.base.words import two_digits
+from ceres_cal.base import Array, Frozen, Indices, Mask, replace, student_95, two_digits
 from ceres_cal.effects.evidence import DEPENDENCE
 from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
 from ceres_cal.effects.linearised import Linearised
@@ -40,11 +37,7 @@ from ceres_cal.effects.strands import (
     sampled,
     views_or_placements,
 )
-from ceres_cal.problem.information import Information
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.reduced import ReducedInformation
-from ceres_cal.problem.residuals import Residuals
+from ceres_cal.problem import Estimate, Information, Problem, ReducedInformation, Residuals
 
 if TYPE_CHECKING:
     from ceres_cal.effects.likelihood import Likelihoods

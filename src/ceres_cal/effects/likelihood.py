@@ -12,9 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.base import Array, Frozen, Indices, Mask, parts_of, run_parts
 from ceres_cal.effects.strands import ASIDE, StrandFamily, decay
 from ceres_cal.kernels import strands_left
 from ceres_cal.observations import joined

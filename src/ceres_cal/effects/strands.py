@@ -11,14 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, evenly, median
-from ceres_cal.base.frozen import Frozen, cached_property
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, cached_property, distinct, evenly, median
 from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
 from ceres_cal.observations.sights import Sights, bounds_of
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.reduced import ReducedInformation
-from ceres_cal.problem.residuals import Equations, Residuals, equations_of
+from ceres_cal.problem import Equations, Estimate, Problem, ReducedInformation, Residuals, equations_of
 
 _MOST_ROWS = 1_500  # of a kind in a view
 

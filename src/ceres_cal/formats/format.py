@@ -177,8 +177,7 @@ def calibration_of(
             know of it, a line each.
     """
     from ceres_cal.calibration import Calibration, Fit
-    from ceres_cal.problem.parameters import Estimate, Options, Station
-    from ceres_cal.problem.structure import EXACT
+    from ceres_cal.problem import EXACT, Estimate, Options, Station
 
     ours, told = dict[str, scene.Camera](), [*warnings]
     for name, given in cameras.items():

@@ -17,8 +17,7 @@ from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations
-from ceres_cal.posterior.maps import ErrorMap, FieldGrid, visible_pixels
-from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.posterior import ErrorMap, FieldGrid, field_grid, visible_pixels
 from ceres_cal.problem import Estimate, Information, Key
 from ceres_cal.scene import Camera, Target
 

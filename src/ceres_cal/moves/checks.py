@@ -13,8 +13,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, numerical, or_none, replace
-from ceres_cal.base.typed import checked
+from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, checked, numerical, or_none, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.agreement import (
@@ -38,9 +37,8 @@ from ceres_cal.moves.explanations import WORDS
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_from, moved_words, pose_candidates
 from ceres_cal.moves.refit_plan import loosened
 from ceres_cal.observations import Observations, Sights, gather_sights
-from ceres_cal.problem import Estimate, Information, Key, layout_of, solve
+from ceres_cal.problem import Estimate, Information, Key, Problem, Weighting, layout_of, solve
 from ceres_cal.problem.priors import GaussianPrior, tolerances
-from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import residuals
 

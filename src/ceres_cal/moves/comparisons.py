@@ -21,8 +21,7 @@ from ceres_cal.moves.agreement import (
     change_of,
     contrast,
 )
-from ceres_cal.posterior.maps import FieldGrid, field_map
-from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.posterior import FieldGrid, field_grid, field_map
 from ceres_cal.problem import EXACT, Estimate, Key, difference
 
 

@@ -17,8 +17,7 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, GaussianPrior, Weighting, over, placement_costs, pose_keys
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.scene.camera import Camera
-from ceres_cal.start.closed_forms import fit_lines, pose_from_homography
-from ceres_cal.start.planes import plane_sight
+from ceres_cal.start import fit_lines, plane_sight, pose_from_homography
 
 # Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise. Nothing
 # changes from half to double.

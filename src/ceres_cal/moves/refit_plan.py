@@ -9,23 +9,14 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import Pose
-from ceres_cal.base.words import no_such
+from ceres_cal.base import Array, Frozen, InputError, Pose, no_such, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves.agreement import matched, require_posterior
-from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations import Observations, Prior, Sights, gather_sights
+from ceres_cal.problem import GaussianPrior, Problem, gather_priors, intrinsic_keys, require_possible_numbers
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.problem.priors import GaussianPrior, gather_priors
-from ceres_cal.problem.problem import Problem
-from ceres_cal.problem.quantities import intrinsic_keys, require_possible_numbers
-from ceres_cal.scene.lens import Lens
-from ceres_cal.scene.symmetry import TURNED, counterparts
-from ceres_cal.scene.targets import target_from_spec
+from ceres_cal.scene import TURNED, Lens, counterparts, target_from_spec
 
 
 def relabelled(observations: Observations, image: Array) -> Observations | None:

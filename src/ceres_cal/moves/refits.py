@@ -10,11 +10,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base.arrays import numerical
-from ceres_cal.base.errors import DegenerateError, SolutionError
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.transforms import Pose
-from ceres_cal.base.typed import checked
+from ceres_cal.base import DegenerateError, Pose, SolutionError, checked, numerical, replace
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
@@ -29,16 +25,11 @@ from ceres_cal.moves.explanations import (
 )
 from ceres_cal.moves.poses import PoseSearch, equations, moved_from, moved_words, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, loosened, make_plan, refit_problem
-from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, gather_sights
-from ceres_cal.posterior.assess import with_other_lenses
-from ceres_cal.posterior.other_lenses import OtherLenses
-from ceres_cal.problem.bundle import SolveProgress
-from ceres_cal.problem.parameters import Estimate, Station
-from ceres_cal.problem.problem import Weighting
+from ceres_cal.observations import Observations, Sights, gather_sights
+from ceres_cal.posterior import OtherLenses, with_other_lenses
+from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting
 from ceres_cal.robust.other_minima import solved_soon
-from ceres_cal.start.initialise import Start
-from ceres_cal.start.world import what_poses
+from ceres_cal.start import Start, what_poses
 
 # Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
 _NATS_ALIKE = 10.0

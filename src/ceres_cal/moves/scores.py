@@ -12,13 +12,10 @@ from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.agreement import NOISIER, Agreement, Agreements, Misfit, matched, require_stations
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations, Sights, gather_sights
-from ceres_cal.problem import EXACT, Estimate, Options, Station, make_layout
-from ceres_cal.problem.priors import gather_priors
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem import EXACT, Estimate, Options, Problem, Station, gather_priors, make_layout
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.noise import LARGER
-from ceres_cal.start.initialise import Start
-from ceres_cal.start.world import chained_poses
+from ceres_cal.start import Start, chained_poses
 
 
 @checked

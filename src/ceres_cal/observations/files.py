@@ -13,16 +13,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base import AnyArray, Codes, Column, Frozen, InputError, field, read_npz, replace, require_columns
-from ceres_cal.base.files import (
-    PIXEL_ORIGIN,
-    UNITS,
-    PixelOrigin,
-    Units,
-    decode_json,
-    opened,
-    read_bytes,
-    write_bytes,
-)
+from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, PixelOrigin, Units, decode_json, opened, read_bytes, write_bytes
 from ceres_cal.base.words import did_you_mean, no_such
 from ceres_cal.observations.columns import (
     NO_CURVES,

@@ -12,17 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base import Array, numerical, replace
-from ceres_cal.effects.aside import Explanation
-from ceres_cal.effects.dependence import Scatter
-from ceres_cal.effects.effect import ShiftsAt
+from ceres_cal.effects import Explanation, Scatter, ShiftsAt
 from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
 from ceres_cal.problem import PHI_RANGE, Estimate, Information, Problem, Solution, difference, moved, over, unit_px
 from ceres_cal.problem.reduced import ReducedInformation, information
-from ceres_cal.robust.conflicts import Conflicts
-from ceres_cal.robust.other_minima import minima_of
-from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.robust import Conflicts, RobustSolution, minima_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 

@@ -24,9 +24,8 @@ from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.bent import weak_axes
 from ceres_cal.posterior.mixture import FARTHER, Mixture, quantiles, radii
 from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.problem import Estimate, PixelSlopes, intrinsic_names, moved, pixel_slopes
 from ceres_cal.problem.information import STATION_QUANTITIES, Information, Key, over
-from ceres_cal.problem.parameters import Estimate, intrinsic_names
-from ceres_cal.problem.quantities import PixelSlopes, moved, pixel_slopes
 from ceres_cal.scene.camera import Camera, in_image
 
 

@@ -24,10 +24,8 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from ceres_cal.base import HEIGHTS_M, Array, Frozen, Indices, Mask, Pose, cached_property, grid_places
+from ceres_cal.effects import Linearised, equation_weights, likeliest_sizes, linearise_within, shifts_by
 from ceres_cal.effects.evidence import agreement as agreement_of
-from ceres_cal.effects.evidence import shifts_by
-from ceres_cal.effects.linearised import Linearised, equation_weights, linearise_within
-from ceres_cal.effects.smoothness import likeliest_sizes
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.maps import Functional, Picture, located_by, shown_by
 from ceres_cal.problem import Estimate, Information, Key, ReducedInformation, natural_sizes

@@ -10,13 +10,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base.arrays import median
-from ceres_cal.base.words import HEIGHTS_M, counted, ended, first_of, mm, sentence, short
+from ceres_cal.base import HEIGHTS_M, counted, ended, first_of, median, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Finding
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.posterior.maps import FieldMap
-from ceres_cal.posterior.uncertainty import Verdict
+from ceres_cal.posterior import FieldMap, Verdict
 from ceres_cal.report.quality import FaultyMap, Quality
 from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.targets.target import PAINT_WANDERS

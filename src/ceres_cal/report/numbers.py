@@ -8,18 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, euler_from_rotation, replace, rotation_exp
-from ceres_cal.base.words import (
-    DASH,
-    at_precision,
-    bounds_text,
-    fixed,
-    grouped,
-    mm,
-    plural,
-    powered,
-    sentence,
-    short,
-)
+from ceres_cal.base.words import DASH, at_precision, bounds_text, fixed, grouped, mm, plural, powered, sentence, short
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.uncertainty import Verdict

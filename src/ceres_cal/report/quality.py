@@ -22,8 +22,7 @@ from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.effects.effect import Finding
 from ceres_cal.effects.table import EFFECTS, JointStep
 from ceres_cal.observations import Observations, gather_sights, thinned
-from ceres_cal.posterior.maps import FieldMap, ImageMap, locate_slopes, visible_pixels
-from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
+from ceres_cal.posterior import FieldMap, ImageMap, Uncertainty, Verdict, locate_slopes, visible_pixels
 from ceres_cal.problem import OF_PIXELS, Key
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene import Camera, Target, curve_points

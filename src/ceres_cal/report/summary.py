@@ -27,8 +27,7 @@ from ceres_cal.base.words import (
 )
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import ResidualTable
-from ceres_cal.posterior.maps import FieldMap
-from ceres_cal.posterior.uncertainty import Uncertainty, Verdict
+from ceres_cal.posterior import FieldMap, Uncertainty, Verdict
 from ceres_cal.report import grounds
 from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
 from ceres_cal.report.numbers import bounds, number_row, number_sections, observed, outliers, stopped, warnings

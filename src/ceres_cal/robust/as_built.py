@@ -20,11 +20,8 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base import Array, DegenerateError, Frozen, Indices, field, replace, rms
-from ceres_cal.effects.aside import Explanation
-from ceres_cal.effects.columns import SparseColumns
-from ceres_cal.effects.effect import AsBuilt
+from ceres_cal.effects import AsBuilt, Explanation, Linearised, SparseColumns, Weights, make_linear_model
 from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, STRETCHED, RepeatedAmounts, agreement
-from ceres_cal.effects.linearised import Linearised, Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior, Sights
 from ceres_cal.problem import Estimate, Options, Problem, gather_priors, unit_px
 from ceres_cal.problem.reduced import information

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, median, medians_known, or_none, replace
+from ceres_cal.effects import least_absolute, make_linear_model
 from ceres_cal.effects.aside import (
     DOUBTFUL,
     Explanation,
@@ -27,8 +28,6 @@ from ceres_cal.effects.aside import (
     groups_of,
     measure_offsets,
 )
-from ceres_cal.effects.columns import least_absolute
-from ceres_cal.effects.linearised import make_linear_model
 from ceres_cal.observations.sights import column_of, shown_rows, some_views, thinned_by_key
 from ceres_cal.problem import Problem, with_placements_at_best
 from ceres_cal.problem.residuals import residuals, write_equations

@@ -14,11 +14,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, cached_property, replace
+from ceres_cal.effects import FLOOR_OFF, LIKELY, RepeatedAmounts, make_linear_model, shifts_by, strand_names
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
-from ceres_cal.effects.evidence import FLOOR_OFF, LIKELY, RepeatedAmounts, shifts_by
-from ceres_cal.effects.linearised import make_linear_model
-from ceres_cal.effects.strands import strand_names
 from ceres_cal.effects.table import estimated
 from ceres_cal.problem import Estimate, GaussianPrior, Key, Problem, free_keys, write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly

@@ -15,14 +15,7 @@ from ceres_cal.base import Array, Frozen, Indices, Mask, replace
 from ceres_cal.effects.linearised import equation_weights, shared_columns, studentised
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Options, Problem, ReducedInformation, Weighting, from_placement
-from ceres_cal.problem.residuals import (
-    Equations,
-    Residuals,
-    equations_of,
-    pairs_of,
-    relative_lengths,
-    residuals,
-)
+from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pairs_of, relative_lengths, residuals
 
 if TYPE_CHECKING:
     from ceres_cal.problem.shares import Histogram

@@ -23,11 +23,8 @@ from ceres_cal.problem import Estimate, Information, Problem, Solution, Weightin
 from ceres_cal.problem.quantities import difference, natural_sizes
 from ceres_cal.problem.residuals import residuals_alone
 from ceres_cal.robust.noise import Inliers
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.symmetry import TURNED, is_seen_turned
-from ceres_cal.scene.targets import Target
-from ceres_cal.start.closed_forms import pose_from_homography
-from ceres_cal.start.planes import consensus_homography
+from ceres_cal.scene import TURNED, Camera, Target, is_seen_turned
+from ceres_cal.start import consensus_homography, pose_from_homography
 
 # Perspective that bends a view by so many standard deviations leaves no doubt. Of 200 small boards none stays
 # mirrored from 12 to 200, four do at 0; of 20 000, six did at 50.

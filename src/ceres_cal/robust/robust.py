@@ -10,14 +10,10 @@ from typing import Generic, Self, TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Indices, numerical
-from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import Frozen, replace
+from ceres_cal.base import DegenerateError, Frozen, Indices, numerical, replace
 from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.bundle import Solution, SolveProgress, solve, with_placements_at_best
-from ceres_cal.problem.parameters import Estimate
-from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem import Estimate, Problem, Solution, SolveProgress, Weighting, solve, with_placements_at_best
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, residuals_alone
 from ceres_cal.robust.noise import (

@@ -22,11 +22,9 @@ from itertools import pairwise
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Mask, first_of, replace, two_digits
-from ceres_cal.effects.columns import SparseColumns
+from ceres_cal.effects import Linearised, SparseColumns, Weights, equation_weights, make_linear_model, posed
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
 from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RepeatedAmounts, shifts_by
-from ceres_cal.effects.groups import posed
-from ceres_cal.effects.linearised import Linearised, Weights, equation_weights, make_linear_model
 from ceres_cal.effects.table.lens import lens_changes
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Key, Problem, free_keys

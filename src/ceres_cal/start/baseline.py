@@ -11,14 +11,10 @@ from itertools import combinations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import replace
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base import Array, DegenerateError, Pose, replace
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.parameters import Estimate, Station
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Radial
+from ceres_cal.scene import Camera, Radial
 from ceres_cal.start.closed_forms import fit_rings, homography_from_points, pose_from_homography
 from ceres_cal.start.planes import ring_radii
 

@@ -16,13 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices, median
-from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Pose
-from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Lens
+from ceres_cal.base import Array, DegenerateError, Frozen, Indices, Pose, median, parts_of, run_parts
+from ceres_cal.scene import Camera, Lens
 
 # Medians of the errors: no clean residual is that long, nine standard deviations. Nothing changes at half of it.
 _WRONG = 8.0

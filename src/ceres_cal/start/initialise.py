@@ -12,15 +12,9 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, median, numerical
-from ceres_cal.base.errors import attempt
-from ceres_cal.base.frozen import Frozen, field, replace
-from ceres_cal.base.transforms import Pose
-from ceres_cal.observations import Prior
-from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.problem.parameters import Estimate, Options, Station, unit_px
-from ceres_cal.problem.priors import ANY_PHI
-from ceres_cal.problem.quantities import PHI_RANGE
+from ceres_cal.base import Array, Frozen, Indices, Pose, attempt, field, median, numerical, replace
+from ceres_cal.observations import Prior, SightKey, Sights
+from ceres_cal.problem import ANY_PHI, PHI_RANGE, Estimate, Options, Station, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     RADII,

@@ -10,12 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct, evenly, median, rms
-from ceres_cal.base.errors import or_none
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.threads import kept_signals
-from ceres_cal.observations import joined
-from ceres_cal.observations.sights import Sights, bounds_of, ranges
+from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, evenly, kept_signals, median, or_none, rms
+from ceres_cal.observations import Sights, bounds_of, joined, ranges
 from ceres_cal.start.closed_forms import (
     PlaneData,
     RadialProfile,

@@ -12,11 +12,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import median
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.observations import Observations, View
-from ceres_cal.observations.sights import SightKey, gather_sights
+from ceres_cal.base import Frozen, Pose, median, replace, rotation_exp
+from ceres_cal.observations import Observations, SightKey, View, gather_sights
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import posed_sights

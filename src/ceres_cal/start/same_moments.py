@@ -12,8 +12,7 @@ import numpy as np
 
 from ceres_cal.base import Array, CalibrationError, Pose, SolutionError, attempt, counted, median
 from ceres_cal.effects.evidence import LEAST_PX
-from ceres_cal.observations import Observations, gather_sights
-from ceres_cal.observations.sights import SightKey
+from ceres_cal.observations import Observations, SightKey, gather_sights
 from ceres_cal.problem import Estimate, Options, Problem
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.start.initialise import posed_sights

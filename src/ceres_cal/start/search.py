@@ -16,9 +16,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.frozen import Frozen
-from ceres_cal.base.transforms import rotation_exp, skews
+from ceres_cal.base import Array, Frozen, Indices, Mask, rotation_exp, skews
 from ceres_cal.observations import joined
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
 from ceres_cal.start.sightlines import LEAST_PX, Beforehand, Candidates, Sightlines

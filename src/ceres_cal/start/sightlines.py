@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask, distinct, medians
-from ceres_cal.base.frozen import Frozen, Rows, cached_property
-from ceres_cal.base.transforms import skews
+from ceres_cal.base import Array, Frozen, Indices, Mask, Rows, cached_property, distinct, medians, skews
 
 LEAST_PX = 1e-3  # of a scale: below it all data are exact
 _LEAST = 1e-12  # of a length, which is divided by

@@ -9,12 +9,9 @@ from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 
+from ceres_cal.base import DegenerateError, Frozen, Pose, Poses, SolutionError, chained, inverted, replace
 from ceres_cal.base.arrays import Array, Indices, distinct, evenly
-from ceres_cal.base.errors import DegenerateError, SolutionError
-from ceres_cal.base.frozen import Frozen, replace
-from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.observations import Prior
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations import Prior, Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import BestCameras, apart, best_of, information, searched

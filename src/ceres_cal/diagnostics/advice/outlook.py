@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, evenly, thin_root
-from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
-from ceres_cal.posterior.mixture import Mixture
-from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior import FieldMap, Mixture, Posterior, locate_slopes, station_keys, visible_pixels
 from ceres_cal.problem import Estimate, Information, Key, moved
 
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`posterior.assess` leaves it there)
