@@ -18,7 +18,6 @@ from ceres_cal.report.document import (
     Table,
     Text,
     Tile,
-    Tiles,
     wrapped,
 )
 from ceres_cal.report.page import html
@@ -87,7 +86,7 @@ def test_every_piece_of_a_page_is_escaped() -> None:
         Text(evil),
         BulletList((("good", evil),)),
         Table((evil, evil), ((evil, evil),), evil),
-        Tiles((Tile(evil, evil, evil, evil),)),
+        (Tile(evil, evil, evil, evil),),
         Card("no", evil, evil, (evil,), "a b.html"),
         Folded(evil, (Text(evil),)),
     )

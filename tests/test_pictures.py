@@ -36,7 +36,7 @@ from ceres_cal.report.pictures.frames import (
     model_of,
     photographs_of,
 )
-from ceres_cal.report.pictures.overlay import Layer, Marks, draw_overlay, model_seen
+from ceres_cal.report.pictures.overlay import Layer, Model, draw_overlay, model_seen
 from ceres_cal.report.pictures.straight import Straight, straighten
 from ceres_cal.report.pictures.warp import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
@@ -274,12 +274,13 @@ def test_the_model_of_a_field_is_where_the_camera_sees_it(shot: script.Shot, tmp
         lifted.points, calibration.station().project(places + np.array([0.0, 0.0, 0.15])), equal_nan=True
     )
     assert model.apart_px(model) == (0.0, 0.0) and lifted.apart_px(model)[0] > 5.0
-    middle = model.lines[list(shot.target.curves).index("CenterCircle")].middle
+    middle = model.lines[list(shot.target.curves).index("CenterCircle")][0]
     circle = calibration.station().locate(middle[np.isfinite(middle[:, 0])])
     assert np.hypot(*circle.T) == pytest.approx(0.5, abs=1e-9)
-    marks = marks_of(calibration, observations, frame)
-    assert sum(len(one.pixels) for one in marks) == len(observations.points) + len(observations.curves)
-    assert sum(len(one.pixels) for one in marks if one.crosses) == len(calibration.rejected)
+    marks = [(one.shown, one.crosses) for one in marks_of(calibration, observations, frame)]
+    counts = {crosses: len(pixels) for pixels, crosses in marks if not isinstance(pixels, Model)}
+    assert sum(counts.values()) == len(observations.points) + len(observations.curves)
+    assert counts.get(True, 0) == len(calibration.rejected)
     with pytest.raises(InputError, match="has no station 'elsewhere'"):
         model_of(calibration, replace(frame, station="elsewhere"))
     with pytest.raises(InputError, match="has no placement 'x'"):
@@ -295,12 +296,11 @@ def test_the_real_field_s_overlay_lies_on_the_paint(tigers_field: tuple[Path, Fi
     grey = read_grey(path).astype(float)
     names = list(script.real_target().curves)
     for name in ("BottomTouchLine", "RightGoalLine", "RightPenaltyStretch", "RightFieldRightPenaltyStretch"):
-        line = model.lines[names.index(name)]
-        left, right = line.edges
-        inside = np.all((line.middle > 20.0) & (line.middle < np.array(model.image_size) - 20.0), axis=1)
+        middle, left, right = model.lines[names.index(name)]
+        inside = np.all((middle > 20.0) & (middle < np.array(model.image_size) - 20.0), axis=1)
         inside &= np.linspace(0.0, 1.0, len(inside)) > 0.25  # writing lies over the others
-        beside = 2.0 * left - line.middle, 2.0 * right - line.middle
-        paint, *carpet = (_levels(grey, pixels[inside]) for pixels in (line.middle, *beside))
+        beside = 2.0 * left - middle, 2.0 * right - middle
+        paint, *carpet = (_levels(grey, pixels[inside]) for pixels in (middle, *beside))
         assert np.mean(paint > np.maximum(*carpet) + 20.0) > 0.75, name  # 0.9: seams, and crossing lines
 
 
@@ -316,20 +316,20 @@ def test_drawing_touches_what_it_should(shot: script.Shot) -> None:
     drawn = draw_overlay(photograph, [Layer(model, "mod\u00e8le", "after")])
     assert np.all(photograph == 90)  # not into the original
     changed = np.argwhere(np.any(drawn[:800] != 90, axis=2))[:, ::-1]  # the legend is below
-    lines = np.concatenate([p for line in model.lines for p in (line.edges or (line.middle,))])
+    lines = np.concatenate([p for line in model.lines for p in (line[1:] or line)])
     lines = lines[np.isfinite(lines[:, 0])]
     away = [np.min(np.hypot(*(lines - pixel).T)) for pixel in changed[:: max(1, len(changed) // 300)]]
     assert len(changed) > 2000 and max(away) < 8.0  # half a step along a line, or a cross's arm
     place = np.array([[640.0, 300.0]])
     for crosses in (False, True):
-        marked = draw_overlay(photograph[..., 0], [], [Marks(place, "observed", "before", crosses)])
+        marked = draw_overlay(photograph[..., 0], [Layer(place, "observed", "before", crosses)])
         assert marked.shape == (960, 1280, 3)
         found = np.argwhere(np.any(marked[:800] != 90, axis=2))[:, ::-1]
         assert len(found) >= 4 and np.mean(found, axis=0) == pytest.approx(place[0], abs=0.1)
     deep = draw_overlay((photograph.astype(np.uint16) * 256), [])
     assert deep.dtype == np.uint8
     far = np.array([[1e12, 0.0], [np.nan, np.nan], [np.inf, 3.0]])
-    assert np.all(draw_overlay(photograph, [], [Marks(far, "", "before"), Marks(far, "", "before", True)])[:800] == 90)
+    assert np.all(draw_overlay(photograph, [Layer(far, "", "before"), Layer(far, "", "before", True)])[:800] == 90)
 
 
 def true_estimate(shot: script.Shot) -> Estimate:

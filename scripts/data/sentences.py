@@ -17,7 +17,7 @@ MOST_WORDS = 35
 _FEWEST_WORDS = 3
 _HELP = {"option", "switch", "argument", "command", "output_option", "calibration_argument", "height_option"}
 _HELP |= {"station_option", "jobs_option", "not_painted_option", "prior_option"}
-_PIECES = {"Section", "Text", "Figure", "PhotoFigure", "Tile", "Card", "Chapter", "Table", "Folded", "BulletList"}
+_PIECES = {"Section", "Text", "Figure", "Tile", "Card", "Chapter", "Table", "Folded", "BulletList"}
 _BANNED = (
     *("go together", "goes with", "go with", "came to rest", "come to rest", "comes to rest", "stands off", "in doubt"),
     *(

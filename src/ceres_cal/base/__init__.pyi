@@ -1,3 +1,4 @@
+from ceres_cal.base import words as words
 from ceres_cal.base.archives import *
 from ceres_cal.base.arrays import *
 from ceres_cal.base.errors import *

@@ -14,7 +14,7 @@ from ceres_cal import base, cli, report
 from ceres_cal.base import DASH, InputError, counted, mm, plural, printable
 from ceres_cal.cli.arguments import jobs_option, output_option
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
-from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile, Tiles
+from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile
 
 _COMMANDS = ("calibrate", "check", "refit")
 _READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
@@ -186,7 +186,7 @@ def summary_page(title: str, outcomes: Sequence[cli.Outcome], links: dict[str, s
     count = Counter(one.level for one in outcomes)
     level = _LEVELS.get(ranked[0].level, ranked[0].level)
     how = f"{counted(len(attention), 'job')} of {len(ranked)} to look at" if attention else "Nothing to look at"
-    tiles = Tiles(tuple(Tile(_WORDS[name], str(count[name]), "", "", _LEVELS.get(name, name)) for name in cli.LEVELS))
+    tiles = tuple(Tile(_WORDS[name], str(count[name]), "", "", _LEVELS.get(name, name)) for name in cli.LEVELS)
     chapters = [Chapter("verdict", f"{how}.", (tiles,), level)]
     if attention:
         cards: list[Piece] = [_card(one, links.get(one.job, "")) for one in attention[:most_cards]]

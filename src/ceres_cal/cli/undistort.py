@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -266,26 +266,24 @@ def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMake
     observations = None if args.observations is None else read_observations([args.observations])
     known = {} if observations is None else {f.name: f for f in report.frames_of(observations) if f.station == station}
 
-    def layers(frame: report.Frame) -> Iterator[report.Layer]:
-        if before is not None:
-            yield report.Layer(report.model_of(before, frame), f"before: {Path(args.before or '').name}", "before")
-        if height:
-            yield report.Layer(report.model_of(calibration, frame, height), f"{1e3 * height:g} mm above", "lifted")
-        yield report.Layer(report.model_of(calibration, frame), args.calibration.name, "after")
-
     def picture(path: Path) -> tuple[Image, dict[str, Any], str]:
         image, called = _read(path, camera, name), frame_of(path)
         if observations is not None and called not in known:
             raise InputError(f"{path}: {args.observations} has no frame {called!r} of station {station!r}")
         frame = known.get(called) or report.frame_by_name(calibration, station, called)
-        drawn = list(layers(frame))
-        marks = () if observations is None else report.marks_of(calibration, observations, frame)
-        model = drawn[-1].model
+        layers, model = list[report.Layer](), report.model_of(calibration, frame)
         facts: dict[str, Any] = {"shown": [list(one) for one in frame.shown], "in_view": model.in_view}
         line = f"{', '.join(target for target, _ in frame.shown)}: {model.in_view} lines and points in view"
         if before is not None:
-            facts["moved_px"] = moved = model.apart_px(drawn[0].model)
+            earlier = report.model_of(before, frame)
+            layers.append(report.Layer(earlier, f"before: {Path(args.before or '').name}", "before"))
+            facts["moved_px"] = moved = model.apart_px(earlier)
             line += f"; {moved[0]:.2f} px from before in the median, {moved[1]:.2f} px at most"
-        return report.draw_overlay(image, drawn, marks), facts, line
+        if height:
+            lifted = report.model_of(calibration, frame, height)
+            layers.append(report.Layer(lifted, f"{1e3 * height:g} mm above", "lifted"))
+        layers.append(report.Layer(model, args.calibration.name, "after"))
+        layers += () if observations is None else report.marks_of(calibration, observations, frame)
+        return report.draw_overlay(image, layers), facts, line
 
     return picture, {"camera": name, "station": station}, "what was drawn"

@@ -1,3 +1,4 @@
+from ceres_cal.effects import aside as aside
 from ceres_cal.effects.aside import *
 from ceres_cal.effects.columns import *
 from ceres_cal.effects.dependence import *

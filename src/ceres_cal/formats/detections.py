@@ -246,19 +246,14 @@ def _read_colmap(request: ImportRequest) -> Observations:
     return Observations({"target": target}, cameras, tuple(views), Points(*_split(rows, 4)), NO_CURVES)
 
 
-def _never(_: bytes) -> bool:
-    return False  # by its name alone: the same file is read as cameras by default
-
-
-def _any(_: bytes) -> bool:
-    return True
-
-
 _NAMED = f"columns {', '.join((*_COLUMNS, *_PLACE))}"
 FORMATS = (
-    ImportFormat("corners-vnl", "mrcal's corners.vnl", (".vnl",), _any, _read_corners),
-    ImportFormat("csv", f"observations as CSV, {_NAMED}", (".csv",), _any, _read_table),
-    ImportFormat("npz-columns", "the same as an array for each column", (".npz",), _any, _read_table),
-    ImportFormat("mrcal-observations", "what a .cameramodel was made from", (".cameramodel",), _never, _read_mrcal),
-    ImportFormat("colmap-observations", "the keypoints of a COLMAP model", (), _never, _read_colmap),
+    ImportFormat("corners-vnl", "mrcal's corners.vnl", (".vnl",), lambda _: True, _read_corners),
+    ImportFormat("csv", f"observations as CSV, {_NAMED}", (".csv",), lambda _: True, _read_table),
+    ImportFormat("npz-columns", "the same as an array for each column", (".npz",), lambda _: True, _read_table),
+    # By their names alone: the same files are read as cameras by default.
+    ImportFormat(
+        "mrcal-observations", "what a .cameramodel was made from", (".cameramodel",), lambda _: False, _read_mrcal
+    ),
+    ImportFormat("colmap-observations", "the keypoints of a COLMAP model", (), lambda _: False, _read_colmap),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from msgspec import Struct
 
@@ -117,9 +117,6 @@ def _options(work: Callable[..., Any]) -> dict[str, tuple[Any, str]]:
     hints = get_type_hints(work, include_extras=True) if names else {}
     return {name: get_args(hints[name]) for name in names or ()}
 
-
-ImageSize = Annotated[str, "WIDTHxHEIGHT px, where the file does not say it"]
-"""An option of several formats."""
 
 # ---- reading --------------------------------------------------------------------------------------------------------
 

@@ -12,22 +12,15 @@ from typing import Annotated, Any
 import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, replace, two_digits
-from ceres_cal.formats.format import (
-    Exported,
-    ExportFormat,
-    ExportLoss,
-    ExportRequest,
-    ImageSize,
-    ImportFormat,
-    ImportRequest,
-    calibration_of,
-)
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.scene import FISHEYE, LARGEST, ForeignCamera, image_grid, opencv_models
 
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D1", "D")
+ImageSize = Annotated[str, "WIDTHxHEIGHT px, where the file does not say it"]
+"""An option of several formats."""
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
@@ -38,7 +31,7 @@ def _export(request: ExportRequest) -> Exported:
     import cv2
 
     cameras, losses = as_foreign(request, opencv_models)
-    entries = _mono(cameras[0], losses[0]) if len(cameras) == 1 else _stereo(cameras)
+    entries = _mono(cameras[0], loss_words(losses[0])) if len(cameras) == 1 else _stereo(cameras)
     storage = cv2.FileStorage(request.ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for key, value in {"stations": " ".join(request.stations), **entries}.items():
         storage.write(key, value)
@@ -78,10 +71,10 @@ def _common(camera: ForeignCamera) -> dict[str, Any]:
     return {"image_width": width, "image_height": height, "distortion_model": camera.model}
 
 
-def _mono(camera: ForeignCamera, loss: ExportLoss) -> dict[str, Any]:
+def _mono(camera: ForeignCamera, lost: list[str]) -> dict[str, Any]:
     matrix, coefficients, pose = _numbers(camera)
     named = {"camera_matrix": matrix, "distortion_coefficients": coefficients, "extrinsic_parameters": pose}
-    return _common(camera) | named | {"loss": "; ".join(loss_words(loss))}
+    return _common(camera) | named | {"loss": "; ".join(lost)}
 
 
 def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:

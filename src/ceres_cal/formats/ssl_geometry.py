@@ -10,16 +10,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base import InputError, attempt, replace
-from ceres_cal.formats.format import (
-    Exported,
-    ExportFormat,
-    ExportRequest,
-    ImageSize,
-    ImportFormat,
-    ImportRequest,
-    calibration_of,
-)
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import field_box
+from ceres_cal.formats.opencv import ImageSize
 from ceres_cal.formats.ssl_cameras import CameraIds, as_before, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import geometry_from_bytes, to_bytes

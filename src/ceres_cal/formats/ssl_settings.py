@@ -14,16 +14,9 @@ from xml.sax.saxutils import escape
 from msgspec import Struct
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.formats.format import (
-    Exported,
-    ExportFormat,
-    ExportRequest,
-    ImageSize,
-    ImportFormat,
-    ImportRequest,
-    calibration_of,
-)
+from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import field_box
+from ceres_cal.formats.opencv import ImageSize
 from ceres_cal.formats.ssl_cameras import NAMES, CameraIds, to_cameras, to_entries
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.scene import LARGEST, Target

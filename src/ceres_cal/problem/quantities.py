@@ -15,18 +15,9 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.base import Array, Frozen, InputError, Pose, replace, rotation_exp, rotation_log, skew, two_digits
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem import parameters
 from ceres_cal.problem.information import POSE_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
-from ceres_cal.problem.parameters import (
-    Estimate,
-    Layout,
-    Options,
-    Station,
-    intrinsic_names,
-    intrinsics_scales,
-    intrinsics_vector,
-    unit_px,
-    with_intrinsics,
-)
+from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import Tolerance, dimensions_of
 from ceres_cal.scene import Camera, Lens
@@ -79,7 +70,8 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
         if kind == "camera":
             camera = estimate.cameras[owner]
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0, "skew": 1.0}
-            known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
+            natural = camera.lens.natural_sizes(camera.phi, parameters.unit_px(camera))
+            known |= zip(camera.lens.names, natural, strict=True)
             sizes[columns] = [known[keys[column].quantity] for column in columns]
         elif kind == "structure":
             sizes[columns] = estimate.structure.sizes_m[estimate.structure.places(keys[column] for column in columns)]
@@ -191,10 +183,10 @@ def camera_moved(camera: Camera, quantities: Sequence[str], step: Array) -> Came
     Raises:
         InputError: phi or aspect is no longer above 0.
     """
-    vector, known = intrinsics_vector(camera), intrinsic_names(camera.lens)
+    vector, known = parameters.intrinsics_vector(camera), intrinsic_names(camera.lens)
     at = [known.index(name) for name in quantities]
     vector[at] += step * intrinsics_scales(camera)[at]
-    return with_intrinsics(camera, vector)
+    return parameters.with_intrinsics(camera, vector)
 
 
 def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:

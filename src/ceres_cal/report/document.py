@@ -69,7 +69,8 @@ class Table(Frozen, eq=True):
 
 
 class Figure(Frozen, eq=True):
-    """A picture with a title, a sentence that says how to read it, and the table behind it.
+    """A picture with a title, a sentence that says how to read it, and the table behind it; or an image (JPEG), across
+    both columns.
 
     One that has a `wide_height` is drawn twice, for a wide and for a narrow window; heights are over the width. `hover`
     is what is said beside the pointer; whoever has none finds it in the table.
@@ -78,26 +79,17 @@ class Figure(Frozen, eq=True):
     name: str
     title: str
     reading: str
-    draw: Draw
-    table: Table
+    draw: Draw | bytes
+    table: Table | None = None
     height: float = 0.66
     wide_height: float | None = None
     hover: Hover | None = None
 
 
-class PhotoFigure(Frozen, eq=True):
-    """A picture that is an image (JPEG), across both columns, and a sentence on what it shows."""
-
-    name: str
-    title: str
-    reading: str
-    jpeg: bytes
-
-
 class Gallery(Frozen, eq=True):
     """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
 
-    pictures: tuple[Figure | PhotoFigure, ...]
+    pictures: tuple[Figure, ...]
 
 
 class Folded(Frozen, eq=True):
@@ -117,12 +109,6 @@ class Tile(Frozen, eq=True):
     level: str = ""
 
 
-class Tiles(Frozen, eq=True):
-    """Tiles in a row."""
-
-    tiles: tuple[Tile, ...]
-
-
 class Card(Frozen, eq=True):
     """One finding: a sentence, what to do where that is known, small facts, and a file beside the page to look at."""
 
@@ -137,7 +123,7 @@ class Card(Frozen, eq=True):
         return wrapped(self.sentence, *([f"-> {self.advice}"] if self.advice else []), f"   {'; '.join(self.facts)}")
 
 
-Piece = Text | BulletList | Table | Gallery | Folded | Tiles | Card
+Piece = Text | BulletList | Table | Gallery | Folded | tuple[Tile, ...] | Card
 
 
 class Chapter(Frozen, eq=True):

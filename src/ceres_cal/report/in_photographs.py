@@ -8,10 +8,10 @@ import numpy as np
 
 from ceres_cal.base import counted, first_of, fixed, rms
 from ceres_cal.calibration import Calibration
-from ceres_cal.report.document import Chapter, Folded, Gallery, PhotoFigure, Text
+from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Text
 from ceres_cal.report.pictures.frames import Frame, frames_of, jpeg_of_at_most, marks_of, model_of, read_photograph
-from ceres_cal.report.pictures.overlay import Layer, draw_overlay
-from ceres_cal.report.quality import ClosedForm, FramePhotographs, Material
+from ceres_cal.report.pictures.overlay import Layer, Model, draw_overlay
+from ceres_cal.report.quality import FramePhotographs, Material
 
 MOST_PHOTOGRAPHS = 4
 _READING = (
@@ -63,7 +63,7 @@ def _rms_px(material: Material, frame: Frame) -> float:
     return rms(distances, 0.0)
 
 
-def _picture(material: Material, photographs: FramePhotographs, frame: Frame, number: int) -> PhotoFigure:
+def _picture(material: Material, photographs: FramePhotographs, frame: Frame, number: int) -> Figure:
     widest_px, most_bytes = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page
     calibration, path = material.calibration, photographs.paths[frame.name, frame.station]
     model = model_of(calibration, frame)
@@ -71,13 +71,16 @@ def _picture(material: Material, photographs: FramePhotographs, frame: Frame, nu
     photograph = read_photograph(path, model.image_size, owner)
     layers, notes = [Layer(model, "this calibration", "after")], []
     for before, name in _before(material, photographs, frame):
-        layers.insert(0, Layer(model_of(before, frame), name, "before"))
-        median, worst = model.apart_px(layers[0].model)
+        earlier = model_of(before, frame)
+        layers.insert(0, Layer(earlier, name, "before"))
+        median, worst = model.apart_px(earlier)
         notes.append(f"Cyan: {name}, median distance {fixed(median, 2)} px, at most {fixed(worst, 2)} px.")
-    marks = [one for one in marks_of(calibration, material.observations, frame) if one.crosses]  # dots would hide paint
-    notes += [f"Crosses: {counted(len(one.pixels), 'observation')} taken out." for one in marks]
-    drawn = draw_overlay(photograph, layers, marks)
-    return PhotoFigure(
+    for one in marks_of(calibration, material.observations, frame):
+        if one.crosses and not isinstance(one.shown, Model):  # dots would hide paint
+            layers.append(one)
+            notes.append(f"Crosses: {counted(len(one.shown), 'observation')} taken out.")
+    drawn = draw_overlay(photograph, layers)
+    return Figure(
         f"photograph-{number}",
         f"Frame {frame.name}, {frame.station}",
         f"{' '.join(notes)} Residuals {fixed(_rms_px(material, frame), 2)} px rms.",
@@ -88,8 +91,8 @@ def _picture(material: Material, photographs: FramePhotographs, frame: Frame, nu
 def _before(material: Material, photographs: FramePhotographs, frame: Frame) -> Iterator[tuple[Calibration, str]]:
     """What to compare with, as far as it knows the frame."""
     before, name = photographs.before, "the calibration before"
-    if before is None and isinstance(material.closed_form, ClosedForm):
-        before, name = material.closed_form.calibration, "the paper's closed form"
+    if before is None and not isinstance(material.closed_form, str):
+        before, name = material.closed_form[0], "the paper's closed form"
     if before is None or frame.station not in before.stations:
         return
     if all(placement is None or placement in before.placements for _, placement in frame.shown):

@@ -57,36 +57,34 @@ def _(piece: document.Table) -> str:
 
 @html.register
 def _(piece: document.Figure) -> str:
+    is_wide = piece.wide_height or isinstance(piece.draw, bytes)
+    behind = f"<details><summary>The numbers behind it</summary>{html(piece.table)}</details>" if piece.table else ""
+    reading = f"<figcaption>{escape(piece.reading)}</figcaption>{behind}"
+    below = f'<div class="reading">{reading}</div>' if behind else reading
+    title = f"<h3>{escape(piece.title)}</h3>"
+    return (
+        f'<figure id="{escape(piece.name)}"{_class("wide" if is_wide else "")}>{title}{_drawn(piece)}{below}</figure>'
+    )
+
+
+def _drawn(piece: document.Figure) -> str:
+    if isinstance(piece.draw, bytes):
+        content = b64encode(piece.draw).decode("ascii")
+        return f'<img alt="{escape(piece.title)}" src="data:image/jpeg;base64,{content}">'
     label = f'role="img" aria-label="{escape(piece.title)}"'
     if piece.hover is not None:
         label += f' data-hover="{escape(json.dumps(vars(piece.hover), separators=(",", ":"), ensure_ascii=False))}"'
     narrow = to_svg(piece.draw, piece.height, NARROW_IN, f"{piece.name}-narrow")
     if piece.wide_height is not None:
         wide = to_svg(piece.draw, piece.wide_height, WIDE_IN, f"{piece.name}-wide")
-        drawn = f'<div class="on-wide" {label}>{wide}</div><div class="on-narrow" {label}>{narrow}</div>'
-    else:
-        drawn = f"<div {label}>{narrow}</div>"
-    return (
-        f'<figure id="{escape(piece.name)}"{_class("wide" if piece.wide_height else "")}><h3>{escape(piece.title)}</h3>'
-        f'{drawn}<div class="reading"><figcaption>{escape(piece.reading)}</figcaption>'
-        f"<details><summary>The numbers behind it</summary>{html(piece.table)}</details></div></figure>"
-    )
-
-
-@html.register
-def _(piece: document.PhotoFigure) -> str:
-    content = b64encode(piece.jpeg).decode("ascii")
-    return (
-        f'<figure id="{escape(piece.name)}" class="wide"><h3>{escape(piece.title)}</h3>'
-        f'<img alt="{escape(piece.title)}" src="data:image/jpeg;base64,{content}">'
-        f"<figcaption>{escape(piece.reading)}</figcaption></figure>"
-    )
+        return f'<div class="on-wide" {label}>{wide}</div><div class="on-narrow" {label}>{narrow}</div>'
+    return f"<div {label}>{narrow}</div>"
 
 
 @html.register
 def _(piece: document.Gallery) -> str:
     elements = [html(picture) for picture in piece.pictures]
-    in_a_column = [isinstance(one, document.Figure) and one.wide_height is None for one in piece.pictures]
+    in_a_column = [one.wide_height is None and not isinstance(one.draw, bytes) for one in piece.pictures]
     if sum(in_a_column) % 2 and in_a_column[-1]:
         elements[-1] = elements[-1].replace("<figure ", '<figure class="lone" ', 1)
     return f'<div class="gallery">{"".join(elements)}</div>'
@@ -99,8 +97,8 @@ def _(piece: document.Folded) -> str:
 
 
 @html.register
-def _(piece: document.Tiles) -> str:
-    return f'<div class="tiles">{"".join(map(html, piece.tiles))}</div>'
+def _(tiles: tuple) -> str:  # type: ignore[type-arg]
+    return f'<div class="tiles">{"".join(map(html, tiles))}</div>'
 
 
 @html.register

@@ -99,12 +99,8 @@ def _steps(step: JointStep | None, keys: Sequence[Key]) -> Array:
     return np.array([moves.get(key, 0.0) for key in keys])
 
 
-class Seam(Struct, frozen=True, eq=False):
-    """What two stations disagree about: predicted at HEIGHTS_M, and measured in what both observed."""
-
-    stations: tuple[str, str]
-    predicted: tuple[FieldMap, ...]
-    measured: Disagreement
+Seam = tuple[tuple[str, str], tuple[FieldMap, ...], "Disagreement"]
+"""What two stations disagree about: who they are, predicted at HEIGHTS_M, and measured in what both observed."""
 
 
 def quality_of(calibration: Calibration, observations: Observations) -> Quality:
@@ -230,7 +226,7 @@ class Quality(Frozen):
                 continue
             maps = tuple(self.uncertainty.seam_sd_mm(*pair, height_m) for height_m in HEIGHTS_M)
             if not np.all(np.isnan(maps[0].sd_mm)):
-                yield Seam(pair, maps, self.calibration.disagreement(self.observations, *pair))
+                yield pair, maps, self.calibration.disagreement(self.observations, *pair)
 
 
 def _of_observed(known: ImageMap, observations: Observations) -> float:
@@ -246,18 +242,6 @@ def _of_observed(known: ImageMap, observations: Observations) -> float:
 
 
 # ---- what a report is made of ---------------------------------------------------------------------------------------
-
-
-class ClosedForm(Struct, frozen=True, eq=False):
-    """The paper's own method on the same observations.
-
-    Attributes:
-        calibration: its answer. lengths: (N,) px, of the residuals of every observation, points first; NaN where it
-            cannot show one.
-    """
-
-    calibration: Calibration
-    lengths: Array
 
 
 class FramePhotographs(Struct, frozen=True, eq=False):
@@ -309,8 +293,10 @@ class Material(Quality):
         return () if self.diagnosis.new_data else tuple(islice(self.each_seam(), most_seams))
 
     @cached_property
-    def closed_form(self) -> ClosedForm | str:
-        """The paper's method, or why there is none."""
+    def closed_form(self) -> tuple[Calibration, Array] | str:
+        """The answer of the paper's own method to the same observations, and the lengths (N,) px of the residuals that
+        it leaves of each, points first, NaN where it cannot show one; or why there is none.
+        """
         if self.diagnosis.new_data:
             return "these observations are others than those the calibration was made from"
         if not self.calibration.rounds:
@@ -323,7 +309,7 @@ class Material(Quality):
             return str(calibration)
         remaining = residuals(gather_sights(self.observations), calibration.estimate)
         lengths = np.concatenate([np.linalg.norm(remaining.points, axis=1), np.abs(remaining.curves)])
-        return ClosedForm(calibration, lengths)
+        return calibration, lengths
 
     def of_camera(self, camera: str) -> Mask:
         """(N,) bool: rows of the residual table that a camera observed."""

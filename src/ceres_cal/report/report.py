@@ -15,7 +15,7 @@ from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Piece, T
 from ceres_cal.report.grounds import promises
 from ceres_cal.report.maps import image_figure, lens_image_figure, map_figure
 from ceres_cal.report.page import page
-from ceres_cal.report.quality import ClosedForm, FramePhotographs, Material
+from ceres_cal.report.quality import FramePhotographs, Material
 from ceres_cal.report.residual_pictures import against_radius, by_frame, outliers, support, vectors
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation, distortion
 from ceres_cal.report.summary import numbers_chapter, verdict_chapter
@@ -134,9 +134,9 @@ def _left_out(names: list[str]) -> tuple[Text, ...]:
 def _solve(material: Material) -> Chapter:
     closed = material.closed_form
     figures: list[Figure | None] = [convergence(material), correlation(material)]
-    if isinstance(closed, ClosedForm):
-        figures.insert(1, against_closed_form(material, closed))
-    texts = () if isinstance(closed, ClosedForm) else (Text(f"No closed form to compare with: {closed}.", "note"),)
+    if not isinstance(closed, str):
+        figures.insert(1, against_closed_form(material, *closed))
+    texts = (Text(f"No closed form to compare with: {closed}.", "note"),) if isinstance(closed, str) else ()
     gallery = Gallery(tuple(figure for figure in figures if figure is not None))
     folded = Folded("Convergence, closed form, and correlations", (gallery, *texts))
     return Chapter("solve", "The solve", (folded,))

@@ -13,7 +13,7 @@ from ceres_cal.problem.information import Key
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Hover
 from ceres_cal.report.document import Figure, Table
-from ceres_cal.report.quality import ClosedForm, Material
+from ceres_cal.report.quality import Material
 from ceres_cal.report.residual_pictures import number_of, owner_suffix
 from ceres_cal.scene.camera import Camera
 
@@ -136,11 +136,11 @@ def convergence(material: Material) -> Figure | None:
 # ---- closed form against bundle -------------------------------------------------------------------------------------
 
 
-def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
+def against_closed_form(material: Material, closed: Calibration, left_px: Array) -> Figure:
     """How many residuals are below a length, by the paper's closed form and by the bundle."""
     table = material.diagnosis.table
     inlier = table.inlier
-    lengths = {"closed form": closed.lengths[inlier], "bundle": np.abs(table.distance_px[inlier])}
+    lengths = {"closed form": left_px[inlier], "bundle": np.abs(table.distance_px[inlier])}
     lengths = {name: np.where(np.isfinite(values), values, np.inf) for name, values in lengths.items()}
     shares = np.linspace(0.01, 0.99, 99)
     curves = {name: np.quantile(values, shares, method="nearest") for name, values in lengths.items()}
@@ -160,7 +160,7 @@ def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
         f"Farther left is better. The median residual is {short(medians['bundle'])} px after the bundle adjustment and "
         f"{short(medians['closed form'])} px after the closed form of the paper.",
         draw,
-        _comparison(material.calibration, closed.calibration, curves, shares),
+        _comparison(material.calibration, closed, curves, shares),
     )
 
 

@@ -10,26 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base import answer_or_reason, replace, rms
-from ceres_cal.base.words import (
-    DASH,
-    HEIGHTS_M,
-    at_height,
-    at_precision,
-    counted,
-    fixed,
-    metres,
-    mm,
-    plural,
-    sentence,
-    short,
-    two_digits,
-)
+from ceres_cal.base import answer_or_reason, replace, rms, words
+from ceres_cal.base.words import DASH, HEIGHTS_M, at_height, at_precision, counted, mm, plural, short, two_digits
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import ResidualTable
 from ceres_cal.posterior import FieldMap, Uncertainty, Verdict
 from ceres_cal.report import grounds
-from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
+from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, wrapped
 from ceres_cal.report.numbers import bounds, number_row, number_sections, observed, outliers, stopped, warnings
 from ceres_cal.report.quality import Material, Quality, Seam, paint_of
 
@@ -62,16 +49,20 @@ def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Se
 
 def _verdict(quality: Quality) -> Section:
     """The headline of the report, and what stands behind it and was not said yet."""
-    judged, findings = grounds.judge_quality(quality), quality.findings
+    data, findings = _judged(quality), quality.findings
     cause = grounds.disputed(quality)
     named = [one for one in findings if grounds.is_against(one) and not cause][:_MOST_FINDINGS]
-    lines = [judged.headline, *(f"{one.kind}: {one.sentence}" for one in named)]
+    lines = [data["headline"], *(f"{one.kind}: {one.sentence}" for one in named)]
     if findings:
         whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
         lines.append(f"{plural(len(findings), 'finding')}{whence}")
+    return Section("verdict", lines, {"verdict": {**data, "findings": findings}})
+
+
+def _judged(quality: Quality) -> dict[str, Any]:
+    judged = grounds.judge_quality(quality)
     reasons = [{"level": level, "text": text} for level, text in judged.reasons]
-    data = {"level": judged.level, "headline": judged.headline, "reasons": reasons, "findings": findings}
-    return Section("verdict", lines, {"verdict": data})
+    return {"level": judged.level, "headline": judged.headline, "reasons": reasons}
 
 
 # ---- how well places are known --------------------------------------------------------------------------------------
@@ -130,14 +121,13 @@ def _map_data(m: FieldMap) -> dict[str, Any]:
 def _seams(seams: Sequence[Seam]) -> Section:
     """By how much two cameras disagree about what both see."""
     data, rows = [], []
-    for seam in seams:
-        rms, expected, count = seam.measured.rms_mm, seam.measured.expected_rms_mm, len(seam.measured.what)
-        measured = {"found_mm": rms, "expected_mm": expected, "compared": count}
-        predicted = [_map_data(one) for one in seam.predicted]
-        data.append({"stations": seam.stations, "predicted": predicted, **measured})
-        means = (f"± {mm(one.mean_mm)}" for one in seam.predicted)
+    for stations, maps, measured in seams:
+        rms, expected, count = measured.rms_mm, measured.expected_rms_mm, len(measured.what)
+        found = {"found_mm": rms, "expected_mm": expected, "compared": count}
+        data.append({"stations": stations, "predicted": [_map_data(one) for one in maps], **found})
+        means = (f"± {mm(one.mean_mm)}" for one in maps)
         over = f" rms of {count}" if count else ""
-        rows.append((f" {DASH} ".join(seam.stations), *means, f"{mm(rms)}{over}", mm(expected)))
+        rows.append((f" {DASH} ".join(stations), *means, f"{mm(rms)}{over}", mm(expected)))
     head = ("stations", *map(at_height, HEIGHTS_M), "found", "expected")
     table = Table(head, tuple(rows), "Where two cameras overlap: by how much they disagree", stacked=True)
     shown = (table,) if rows else ()
@@ -175,7 +165,7 @@ def verdict_chapter(material: Material) -> Chapter:
         tiles = tuple(
             replace(tile, level=grounds.worst(judged.level, tile.level)) if tile.level else tile for tile in tiles
         )
-    pieces: list[Piece] = [Tiles(tiles), BulletList(judged.reasons)]
+    pieces: list[Piece] = [tiles, BulletList(judged.reasons)]
     if material.maps:
         pieces.append(Text(_MEANING, "note"))
     return Chapter("verdict", judged.headline, tuple(pieces), judged.level)
@@ -188,7 +178,7 @@ def _tiles(material: Material) -> Iterator[Tile]:
     several = len(material.maps) > 1
     for station, maps in material.maps.items():
         for one in maps:
-            label = sentence(at_height(one.height_m)) + (f", {station}" if several else "")
+            label = words.sentence(at_height(one.height_m)) + (f", {station}" if several else "")
             yield _map_tile(label, one, grounds.reach(one.height_m, [one], grounds.paint_over_usual(material)))
     if not material.maps:
         for verdict in grounds.focal(material):
@@ -213,14 +203,14 @@ def _map_tile(label: str, one: FieldMap, known: grounds.Reach) -> Tile:
         return Tile(
             label, "unknown", "", "not determined by the observations: add tilted boards or measure the height", level
         )
-    note = f"mean of located points; at worst {mm(one.worst_mm)}, at {metres(one.worst_place_m)}"
+    note = f"mean of located points; at worst {mm(one.worst_mm)}, at {words.metres(one.worst_place_m)}"
     return Tile(label, f"± {short(one.mean_mm)}", "mm", note, level)
 
 
 def _focal_tile(verdict: Verdict) -> Tile:
     known = np.isfinite(verdict.relative)
     value = f"± {short(100.0 * verdict.relative)}" if known else "unknown"
-    note = f"{fixed(verdict.value, 1)} px, 95 %: {bounds(verdict)}"
+    note = f"{words.fixed(verdict.value, 1)} px, 95 %: {bounds(verdict)}"
     return Tile(f"phi of {verdict.key.owner}", value, "%" if known else "", note, grounds.level_of_verdict(verdict))
 
 
@@ -239,12 +229,9 @@ def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
 
 def known_of(quality: Quality) -> dict[str, Any]:
     """Verdict, numbers, maps, and residuals by frame."""
-    judged = grounds.judge_quality(quality)
     maps = next(iter(quality.maps.values()), ())
     return {
-        "level": judged.level,
-        "headline": judged.headline,
-        "reasons": [{"level": level, "text": text} for level, text in judged.reasons],
+        **_judged(quality),
         "numbers": list(_numbers(quality)),
         "maps": [_map(one) for one in maps],
         "paint": [np.round(line[:, :2], 3).tolist() for line in paint_of(quality.fields)],

@@ -17,17 +17,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, median, medians_known, or_none, replace
-from ceres_cal.effects import least_absolute, make_linear_model
-from ceres_cal.effects.aside import (
-    DOUBTFUL,
-    Explanation,
-    FeatureGroups,
-    ObservationGroups,
-    Offsets,
-    ViewGroups,
-    groups_of,
-    measure_offsets,
-)
+from ceres_cal.effects import aside, least_absolute, make_linear_model
+from ceres_cal.effects.aside import DOUBTFUL, Explanation, FeatureGroups, ObservationGroups, Offsets, ViewGroups
 from ceres_cal.observations.sights import column_of, shown_rows, some_views, thinned_by_key
 from ceres_cal.problem import Problem, with_placements_at_best
 from ceres_cal.problem.residuals import residuals, write_equations
@@ -81,7 +72,7 @@ def compete(problem: Problem, end: RobustSolution, solver: Solver) -> tuple[Robu
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    every = Subproblem(problem, end, list(groups_of(problem.sights)))
+    every = Subproblem(problem, end, list(aside.groups_of(problem.sights)))
     if not every.kinds:
         return end, ()
     part = compared_part(every)
@@ -296,7 +287,7 @@ class _Competition:
         weights = replace(weights, used=used, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(self._some.problem, end.estimate, equations, weights)
         prior = groups.prior  # that it is one of those that are compared
-        return chosen, measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
+        return chosen, aside.measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
 
 
 # ---- what is asked, and what is compared ----------------------------------------------------------------------------

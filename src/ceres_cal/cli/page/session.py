@@ -327,7 +327,7 @@ class Found(Struct, frozen=True, eq=False):
 
 def _lines(model: report.Model) -> list[Any]:
     """(S, 2) px each."""
-    return [np.round(line.middle[::4], 1).tolist() for line in model.lines]
+    return [np.round(line[0][::4], 1).tolist() for line in model.lines]
 
 
 def _shown(state: State, target: scene.Target) -> detect.PointHints:

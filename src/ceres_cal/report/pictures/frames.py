@@ -5,7 +5,7 @@ Photographs out of image files, and pictures as bytes of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,7 @@ from ceres_cal.base import Frozen, Image, InputError, Mask, frame_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.images import encoded, read_colour
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.report.pictures.overlay import Marks, Model, in_8_bit_colour, model_seen
+from ceres_cal.report.pictures.overlay import Layer, Model, in_8_bit_colour, model_seen
 
 Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""
@@ -106,7 +106,7 @@ def model_of(calibration: Calibration, frame: Frame, height_m: float = 0.0) -> M
     return model_seen(calibration.estimate, calibration.targets, frame.station, frame.shown, height_m)
 
 
-def marks_of(calibration: Calibration, observations: Observations, frame: Frame) -> tuple[Marks, ...]:
+def marks_of(calibration: Calibration, observations: Observations, frame: Frame) -> Iterator[Layer]:
     """What was observed in a frame: what took part and, where the calibration was made from these observations, what
     was taken out.
     """
@@ -117,8 +117,10 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     here = [np.isin(columns.view, frame.views) for columns in both]
     pixels = np.concatenate([columns.pixels[rows] for columns, rows in zip(both, here, strict=True)])
     used = np.concatenate([mask[rows] for mask, rows in zip(inliers, here, strict=True)])
-    marks = (Marks(pixels[used], "observed", "used"), Marks(pixels[~used], "taken out", "taken out", crosses=True))
-    return tuple(one for one in marks if len(one.pixels))
+    if np.any(used):
+        yield Layer(pixels[used], "observed", "used")
+    if not np.all(used):
+        yield Layer(pixels[~used], "taken out", "taken out", crosses=True)
 
 
 def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Image:

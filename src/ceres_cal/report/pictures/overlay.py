@@ -46,24 +46,19 @@ _SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
 
 
 class Layer(Struct, frozen=True, eq=False):
-    """A model in one of COLOURS; its label stands in the legend."""
+    """A model, or observed pixels (N, 2), in one of COLOURS; its label stands in the legend.
 
-    model: Model
+    Pixels are dots, or crosses for what was taken out.
+    """
+
+    shown: Model | Array
     label: str
-    colour: str
-
-
-class Marks(Struct, frozen=True, eq=False):
-    """Observed pixels (N, 2) in one of COLOURS, with what they are; dots, or crosses for what was taken out."""
-
-    pixels: Array
-    what: str
     colour: str
     crosses: bool = False
 
 
-def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Marks] = ()) -> Image8:
-    """A photograph with models and marks drawn into it, the last on top: (height, width, 3) blue, green, red, 8 bit.
+def draw_overlay(photograph: Image, layers: Sequence[Layer]) -> Image8:
+    """A photograph with models and pixels drawn into it, the last on top: (height, width, 3) blue, green, red, 8 bit.
 
     Lines run where the model says, to 1/16 px; the eye compares them with the paint. How well that is known they do
     not tell.
@@ -73,20 +68,16 @@ def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Mar
     size = _STYLE["point_px"] * thick
     for layer in layers:
         colour = COLOURS[layer.colour]
-        for line in layer.model.lines:
-            _draw_line(canvas, line, colour, round(thick))
-        _draw_crosses(canvas, layer.model.points, size, colour, round(thick), upright=True)
-    for mark in marks:
-        colour = COLOURS[mark.colour]
-        if mark.crosses:
-            _draw_crosses(canvas, mark.pixels, size, colour, round(thick), upright=False)
+        if isinstance(layer.shown, Model):
+            for middle, *edges in layer.shown.lines:
+                for line in edges or (middle,):
+                    _draw_line(canvas, line, colour, round(thick))
+            _draw_crosses(canvas, layer.shown.points, size, colour, round(thick), upright=True)
+        elif layer.crosses:
+            _draw_crosses(canvas, layer.shown, size, colour, round(thick), upright=False)
         else:
-            _draw_dots(canvas, mark.pixels, _STYLE["dot_px"] * thick, colour)
-    return _with_legend(
-        canvas,
-        [(one.label, COLOURS[one.colour]) for one in layers] + [(one.what, COLOURS[one.colour]) for one in marks],
-        thick,
-    )
+            _draw_dots(canvas, layer.shown, _STYLE["dot_px"] * thick, colour)
+    return _with_legend(canvas, [(one.label, COLOURS[one.colour]) for one in layers], thick)
 
 
 def in_8_bit_colour(image: Image) -> Image8:
@@ -99,11 +90,10 @@ def in_8_bit_colour(image: Image) -> Image8:
     return np.asarray(cv2.cvtColor(plain, cv2.COLOR_GRAY2BGR) if plain.ndim == 2 else plain, dtype=np.uint8)
 
 
-def _draw_line(canvas: Image8, line: CurveOutline, colour: Colour, thickness: int) -> None:
-    for pixels in line.edges or (line.middle,):
-        pairs = np.stack([pixels[:-1], pixels[1:]], axis=1)
-        pairs = pairs[_drawable(pairs.reshape(-1, 2), canvas).reshape(-1, 2).all(axis=1)]
-        cv2.polylines(canvas, list(_fixed(pairs)), False, colour, thickness, cv2.LINE_AA, _SHIFT)
+def _draw_line(canvas: Image8, pixels: Array, colour: Colour, thickness: int) -> None:
+    pairs = np.stack([pixels[:-1], pixels[1:]], axis=1)
+    pairs = pairs[_drawable(pairs.reshape(-1, 2), canvas).reshape(-1, 2).all(axis=1)]
+    cv2.polylines(canvas, list(_fixed(pairs)), False, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def _draw_crosses(canvas: Image8, pixels: Array, size: float, colour: Colour, thickness: int, *, upright: bool) -> None:
@@ -153,21 +143,17 @@ _NAMES = 4  # of missing lines in the legend
 def draw_seen(photograph: Image, seen: Followed | None, target: Target) -> Image8:
     """A photograph with the lines found in it, and, of the best candidate, where paint was found and where not."""
     grey = in_8_bit_colour(photograph).mean(axis=2).astype(np.float32)
-    marks = [Marks(find_strokes(grey).ends.reshape(-1, 2), "lines seen", "before")]
+    layers = [Layer(find_strokes(grey).ends.reshape(-1, 2), "lines seen", "before")]
     if seen is not None:
         lines = seen.lines
         missing = [target.curve_names[number] for number in seen.absent]
         names = ", ".join(missing[:_NAMES]) + (f" and {len(missing) - _NAMES} more" if len(missing) > _NAMES else "")
-        marks += [
-            Marks(lines.pixels[lines.found], "best candidate: paint", "after"),
-            Marks(
-                lines.course.pixels[~lines.found],
-                f"best candidate: no paint{f', all along {names}' if names else ''}",
-                "taken out",
-                crosses=True,
-            ),
+        absent = f"best candidate: no paint{f', all along {names}' if names else ''}"
+        layers += [
+            Layer(lines.pixels[lines.found], "best candidate: paint", "after"),
+            Layer(lines.course.pixels[~lines.found], absent, "taken out", crosses=True),
         ]
-    return draw_overlay(photograph, (), marks)
+    return draw_overlay(photograph, layers)
 
 
 def places_in_picture(
@@ -196,24 +182,19 @@ def places_in_picture(
 # ---- the model ------------------------------------------------------------------------------------------------------
 
 
-class CurveOutline(Struct, frozen=True, eq=False):
-    """One curve: its middle (S, 2) px, NaN where the camera does not show it, and both edges of wide paint."""
-
-    middle: Array
-    edges: tuple[Array, ...] = ()
-
-
 class Model(Struct, frozen=True, eq=False):
-    """What is drawn into a photograph of `image_size`: lines, and points (N, 2) px."""
+    """What is drawn into a photograph of `image_size`: lines, and points (N, 2) px. Of each line there is its middle
+    (S, 2) px, NaN where the camera does not show it, and behind it both edges of wide paint.
+    """
 
     image_size: tuple[int, int]
-    lines: tuple[CurveOutline, ...]
+    lines: tuple[tuple[Array, ...], ...]
     points: Array
 
     @property
     def in_view(self) -> int:
         """How many of its lines and points the photograph shows, lines in part at least."""
-        lines = sum(bool(np.any(self._inside(line.middle))) for line in self.lines)
+        lines = sum(bool(np.any(self._inside(middle))) for middle, *_ in self.lines)
         return lines + int(np.count_nonzero(self._inside(self.points)))
 
     def apart_px(self, other: Model) -> tuple[float, float]:
@@ -221,7 +202,7 @@ class Model(Struct, frozen=True, eq=False):
 
         NaN where the photograph shows no place of both.
         """
-        pairs = [(a.middle, b.middle) for a, b in zip(self.lines, other.lines, strict=True)]
+        pairs = [(a[0], b[0]) for a, b in zip(self.lines, other.lines, strict=True)]
         pairs.append((self.points, other.points))
         apart = np.concatenate([np.linalg.norm(a - b, axis=1)[self._inside(a)] for a, b in pairs])
         apart = apart[np.isfinite(apart)]
@@ -247,7 +228,7 @@ def model_seen(
     """
     built = estimate.structure.built(targets)
     lift = Pose(np.eye(3), np.array([0.0, 0.0, height_m]))
-    lines: list[CurveOutline] = []
+    lines: list[tuple[Array, ...]] = []
     points = [np.empty((0, 2))]
     for name, placement in shown:
         camera = estimate.camera_at(station, placement)
@@ -257,7 +238,7 @@ def model_seen(
     return Model(estimate.camera_at(station).image_size, tuple(lines), np.concatenate(points))
 
 
-def _lines(built: BuiltTarget, camera: Camera) -> Iterator[CurveOutline]:
+def _lines(built: BuiltTarget, camera: Camera) -> Iterator[tuple[Array, ...]]:
     wide_px = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
     steps = 240  # along a curve
     target = built.target
@@ -268,10 +249,10 @@ def _lines(built: BuiltTarget, camera: Camera) -> Iterator[CurveOutline]:
         )
         width = np.linalg.norm(left - right, axis=1)[in_image(middle, camera.image_size)]
         wide = len(width) > 0 and float(np.median(width)) >= wide_px
-        yield CurveOutline(middle, (left, right) if wide else ())
+        yield (middle, left, right) if wide else (middle,)
     if target.grid is not None:
         grid = built.points.reshape(target.grid.rows, -1, 3)
-        yield from (CurveOutline(camera.project(_between(row))) for row in (*grid, *grid.swapaxes(0, 1)))
+        yield from ((camera.project(_between(row)),) for row in (*grid, *grid.swapaxes(0, 1)))
 
 
 def _between(corners: Array) -> Array:
