@@ -17,7 +17,6 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.report.target_pictures import sheet_pdf
 from ceres_cal.scene.targets import Target, checkerboard, circle_grid, rings, ssl_field, target_from_spec
-from ceres_cal.scene.targets.target import Disc
 
 __all__ = ["say"]
 PLAIN = circle_grid(7, 5, 0.03, 0.02)
@@ -111,10 +110,10 @@ def test_what_is_printed_is_what_a_camera_sees(board: Target) -> None:
     steps = [np.tile(1e-9 * direction, (len(plane), 1)) for direction in np.eye(2)]
     printed = np.zeros(len(plane))
     for shape in paper.shapes():
-        if isinstance(shape, Disc):
-            inside = np.linalg.norm(plane - shape.centre_m, axis=1) < shape.radius_m
+        if shape.is_round:
+            inside = np.linalg.norm(plane - shape.place_m, axis=1) < shape.size_m
         else:
-            inside = np.all((plane > shape.corner_m) & (plane < np.add(shape.corner_m, shape.side_m)), axis=1)
+            inside = np.all((plane > shape.place_m) & (plane < np.add(shape.place_m, shape.size_m)), axis=1)
         printed[inside] = shape.is_dark
     np.testing.assert_array_equal(printed, np.round(dark_share(board, Footprints(plane, *steps))))
 

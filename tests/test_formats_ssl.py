@@ -25,7 +25,7 @@ from ssl_settings_file import settings
 from ceres_cal import Calibration, InputError
 from ceres_cal.base.arrays import Array
 from ceres_cal.cli import main
-from ceres_cal.formats import Group, Heard, export, import_calibration, publish, received_geometry, ssl_packet
+from ceres_cal.formats import Group, export, import_calibration, publish, received_geometry, ssl_packet
 from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.camera import in_image
@@ -307,9 +307,9 @@ def test_published_and_heard_over_the_loopback(
 ) -> None:
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
     sender = in_background(packet, loopback)
-    heard = received_geometry(loopback, 10.0)
-    assert [calib["camera_id"] for calib in heard.geometry["calib"]] == [0, 1]
-    assert len(heard.field.curves) == 13
+    geometry, field, _ = received_geometry(loopback, 10.0)
+    assert [calib["camera_id"] for calib in geometry["calib"]] == [0, 1]
+    assert len(field.curves) == 13
     group = ["--address", loopback.address, "--port", str(loopback.port), "--interface", loopback.interface]
     assert main(["listen", "-o", str(tmp_path / "field.json"), *group]) == 0
     sender.join()
@@ -321,7 +321,7 @@ def test_published_and_heard_over_the_loopback(
     assert "no geometry of a field within 0.2 s, but nothing at all" in capsys.readouterr().err
 
 
-def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float, group: Group) -> Heard:
+def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float, group: Group) -> Any:
     """What is received while each packet is sent to an address again and again."""
     ends = threading.Event()
 
@@ -351,10 +351,10 @@ def no_field() -> bytes:
 
 def test_a_packet_that_makes_no_field_does_not_end_listening(loopback: Group) -> None:
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
-    heard = sent_while_it_listens(
+    _, field, sender = sent_while_it_listens(
         {b"junk": loopback.address, no_field(): loopback.address, packet: loopback.address}, 5, loopback
     )
-    assert len(heard.field.curves) == 13 and heard.sender.startswith("127.0.0.1:")
+    assert len(field.curves) == 13 and sender.startswith("127.0.0.1:")
     with pytest.raises(InputError, match=r"within 0.2 s, but from 127\.0\.0\.1:\d+ .*field_length"):
         sent_while_it_listens({no_field(): loopback.address}, 0.2, loopback)
 

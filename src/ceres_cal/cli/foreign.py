@@ -205,13 +205,13 @@ def _listen(
     seconds: float = option("how long to wait", "S", 10.0),
 ) -> Document:
     require_output(output, [], "a field is", ".json", ".pb", ".yml", ".yaml")
-    heard = formats.received_geometry(_group(args), seconds)
+    geometry, field, sender = formats.received_geometry(_group(args), seconds)
     if output.suffix == ".json":
-        return _write_target(heard.field, output, heard.sender)
-    save(output, formats.geometry_content(heard.geometry, output.suffix))
-    ids = [entry["camera_id"] for entry in heard.geometry.get("calib", [])]
-    words = f"a field and cameras {ids} from {heard.sender}, written to {output}"
-    data = {"output": str(output), "camera_ids": ids, "sender": heard.sender}
+        return _write_target(field, output, sender)
+    save(output, formats.geometry_content(geometry, output.suffix))
+    ids = [entry["camera_id"] for entry in geometry.get("calib", [])]
+    words = f"a field and cameras {ids} from {sender}, written to {output}"
+    data = {"output": str(output), "camera_ids": ids, "sender": sender}
     return Document((Section("heard", [words], data),))
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base import Array, Array32, Frozen, Indices32, InputError, Mask, Rows, frame_of, naming
+from ceres_cal.base import Array, Array32, Frozen, Indices32, InputError, Mask, frame_of, naming
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
-from ceres_cal.observations import NO_POINTS, Curves, Observations, View
-from ceres_cal.scene.targets import Target, rings
+from ceres_cal.observations import NO_POINTS, Curves, Observations, View, taken
+from ceres_cal.scene.targets import rings
 
 TARGET_NAME = "rings"
 RAYS = 360
@@ -84,7 +84,9 @@ def detect_rings(
         edges, blur = _measured(grey, centre, tracks)
         _require_all_seen(grey, centre, tracks, len(radii_m))
         polynomial, rms = _polynomial(edges, centre, np.array(sheet.spec["radii_m"]))
-    observations = _observations(edges, sheet, grey, frame_of(image), camera, station or camera)
+    frame, size = frame_of(image), (int(grey.shape[1]), int(grey.shape[0]))
+    views = (View(frame, camera, station or camera, TARGET_NAME, frame),)
+    observations = Observations({TARGET_NAME: sheet}, {camera: size}, views, NO_POINTS, edges)
     # The first ring's own middle: farther out, tilt makes the gradients miss the centre.
     own = tracks[0].series[[1, 1 + _HARMONICS]]
     return RingsDetection(observations, centre + own, len(tracks), polynomial, rms, blur)
@@ -206,16 +208,8 @@ def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], ex
 # ---- measuring ------------------------------------------------------------------------------------------------------
 
 
-class _Edges(Rows):
-    """Measured edges: number of the ring (from 0), pixels (N, 2), sigma_px (N,), radius from the centre (N,) px."""
-
-    ring: Indices32
-    pixels: Array
-    sigma_px: Array
-    radius: Array
-
-
-def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[_Edges, float]:
+def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[Curves, float]:
+    """The edges as observations of the rings by number, and the usual blur."""
     radii = np.array([track.radius(_ANGLES) for track in tracks])
     # A window ends before the next edge begins, and neighbouring windows of a ring do not overlap.
     gap = np.min(np.diff(np.vstack([np.zeros(RAYS), radii, 2.0 * radii[-1] - radii[-2]]), axis=0), axis=1)
@@ -227,9 +221,10 @@ def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[_
         blurs.append(measured[2])
         parts.append((np.full(len(_ANGLES[::every]), number, np.int32), *measured[:2]))
     ring, pixels, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
-    radius = np.linalg.norm(pixels - centre, axis=1)
-    kept, factor = _usual(ring, radius, sigma, np.arctan2(*(pixels - centre).T[::-1]))
-    return _Edges(ring, pixels, factor * sigma, radius).take(kept), float(np.median(blurs))
+    away = pixels - centre
+    kept, factor = _usual(ring, np.linalg.norm(away, axis=1), sigma, np.arctan2(*away.T[::-1]))
+    edges = Curves(np.zeros(len(ring), np.int32), ring, pixels, factor * sigma, np.zeros(len(ring), np.int8))
+    return taken(edges, kept), float(np.median(blurs))
 
 
 def _measured_ring(
@@ -281,44 +276,33 @@ def _usual(ring: Indices32, radius: Array, sigma: Array, angle: Array) -> tuple[
 # ---- the paper's polynomial, and observations -----------------------------------------------------------------------
 
 
-def _polynomial(edges: _Edges, centre: Array, radii_m: Array) -> tuple[Array, float]:
+def _polynomial(edges: Curves, centre: Array, radii_m: Array) -> tuple[Array, float]:
     """The paper's fit (section 2) to all edges, and its rms in measured pixels.
 
     Tilt, and a centre beside the lens's axis, add what goes round once or twice: it is fitted along with the
     polynomial, or rings of which the image shows only a part would pull it aside.
     """
-    inner = edges.ring == edges.ring.min()
-    unit = float(np.max(edges.radius))
-    ring = radii_m[edges.ring] * float(np.mean(edges.radius[inner])) / radii_m[edges.ring.min()]
-    angle, share = np.arctan2(*(edges.pixels - centre).T[::-1]), edges.radius / unit
+    number, away = edges.feature, edges.pixels - centre
+    angle, radius = np.arctan2(*away.T[::-1]), np.linalg.norm(away, axis=1)
+    unit = float(np.max(radius))
+    ring = radii_m[number] * float(np.mean(radius[number == number.min()])) / radii_m[number.min()]
+    share = radius / unit
     once = np.power.outer(share, np.arange(6))
     twice = np.power.outer(share, np.arange(1, 5))
     turning = [wave(n * angle)[:, None] * powers for n, powers in ((1, once), (2, twice)) for wave in (np.cos, np.sin)]
     basis = np.column_stack([np.power.outer(share, [1, 2, 3]), *turning])
     solution = np.linalg.lstsq(basis, ring, rcond=None)[0]
     polynomial = solution[:3] / unit ** np.array([1.0, 2.0, 3.0])
-    slope = np.power.outer(edges.radius, [0, 1, 2]) @ (polynomial * (1.0, 2.0, 3.0))
+    slope = np.power.outer(radius, [0, 1, 2]) @ (polynomial * (1.0, 2.0, 3.0))
     misfit = (basis @ solution - ring) / slope
-    worst = max(abs(float(np.median(misfit[edges.ring == number]))) for number in np.unique(edges.ring))
+    worst = max(abs(float(np.median(misfit[number == one]))) for one in np.unique(number))
     if worst > _MOST_MISFIT * unit:
         raise InputError(
-            f"the {len(np.unique(edges.ring))} rings found do not have these radii (no smooth lens fits: one is "
+            f"the {len(np.unique(number))} rings found do not have these radii (no smooth lens fits: one is "
             f"{worst:.1f} px off): give the radius of every edge between dark and bright, from the inside out"
         )
     rms = float(np.sqrt(np.mean(misfit**2)))
     return polynomial, rms
-
-
-def _observations(edges: _Edges, sheet: Target, grey: Array32, frame: str, camera: str, station: str) -> Observations:
-    count = len(edges.ring)
-    size = (int(grey.shape[1]), int(grey.shape[0]))
-    return Observations(
-        {TARGET_NAME: sheet},
-        {camera: size},
-        (View(frame, camera, station, TARGET_NAME, frame),),
-        NO_POINTS,
-        Curves(np.zeros(count, np.int32), edges.ring, edges.pixels, edges.sigma_px, np.zeros(count, np.int8)),
-    )
 
 
 # ---- their centre ---------------------------------------------------------------------------------------------------

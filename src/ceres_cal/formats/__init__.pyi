@@ -15,7 +15,6 @@ from ceres_cal.formats.registry import import_observations as import_observation
 from ceres_cal.formats.registry import prepare_export as prepare_export
 from ceres_cal.formats.registry import read_foreign as read_foreign
 from ceres_cal.formats.ssl_multicast import Group as Group
-from ceres_cal.formats.ssl_multicast import Heard as Heard
 from ceres_cal.formats.ssl_multicast import geometry_content as geometry_content
 from ceres_cal.formats.ssl_multicast import publish as publish
 from ceres_cal.formats.ssl_multicast import read_ssl_target as read_ssl_target

@@ -84,20 +84,9 @@ def publish(packet: bytes, group: Group, times: int | None = None, period_s: flo
     return sent
 
 
-class Heard(Struct, frozen=True):
-    """A geometry that came over the network.
-
-    Attributes:
-        geometry: as plain data. field: what it describes. sender: address and port that it came from.
-    """
-
-    geometry: dict[str, Any]
-    field: Target
-    sender: str
-
-
-def received_geometry(group: Group, seconds: float) -> Heard:
-    """The first geometry of a field that can be that comes within a time; other packets are passed over.
+def received_geometry(group: Group, seconds: float) -> tuple[dict[str, Any], Target, str]:
+    """The first geometry of a field that can be that comes within a time, as plain data, the field, and the address and
+    port that it came from; other packets are passed over.
 
     Raises:
         InputError: none comes (it says from whom others came, and what is wrong with the last), the address is no
@@ -109,7 +98,7 @@ def received_geometry(group: Group, seconds: float) -> Heard:
             packet = from_bytes("SSL_WrapperPacket", content)
             if "geometry" not in packet:
                 raise InputError("a packet without geometry")
-            return Heard(dict(packet["geometry"]), target_of(packet["geometry"]["field"]), sender)
+            return dict(packet["geometry"]), target_of(packet["geometry"]["field"]), sender
         except InputError as error:  # reads: "no geometry of a field within 10 s, but from 10.0.0.7:10006 ..."
             refused[sender] = str(error)
     heard = first_of([f"from {sender} {why}" for sender, why in refused.items()])

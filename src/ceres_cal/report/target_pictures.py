@@ -15,7 +15,7 @@ from ceres_cal.base import Array, InputError
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, PAINT, POINT, WIDE_IN
 from ceres_cal.scene import Arc, Curve, Target, crossings, curve_points
-from ceres_cal.scene.targets.target import Disc, Paper
+from ceres_cal.scene.targets.target import Paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,10 +132,8 @@ def _patches(paper: Paper) -> Iterator[PathPatch]:
     for is_dark, shapes in groupby(paper.shapes(), lambda shape: shape.is_dark):
         paths = []
         for shape in shapes:
-            if isinstance(shape, Disc):
-                (x, y), size, path = shape.centre_m, shape.radius_m, Path.unit_circle()
-            else:
-                (x, y), size, path = shape.corner_m, shape.side_m, Path.unit_rectangle()
+            (x, y), size = shape.place_m, shape.size_m
+            path = Path.unit_circle() if shape.is_round else Path.unit_rectangle()
             paths.append(Path(np.asarray(path.vertices) * (size, -size) + (left + x, top - y), path.codes))
         yield PathPatch(Path.make_compound_path(*paths), facecolor="black" if is_dark else "white", linewidth=0.0)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ceres_cal.base import InputError, checked, two_digits
 from ceres_cal.scene.curves import Curve, Segment
-from ceres_cal.scene.targets.target import Disc, Grid, Paper, Square, Target, TargetKind, from_arguments, require_size
+from ceres_cal.scene.targets.target import Grid, Paper, Shape, Target, TargetKind, from_arguments, require_size
 
 
 def _require_counts(kind: str, what: str, columns: int, rows: int, least: int = 2) -> None:
@@ -44,11 +44,11 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
     return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper)
 
 
-def _squares(grid: Grid) -> Iterator[Square]:
+def _squares(grid: Grid) -> Iterator[Shape]:
     """The dark ones: that between "0,0" and "1,1", and so on, one more each way beyond the outer corners."""
     for row, column in product(range(-1, grid.rows), range(-1, grid.columns)):
         if (row + column) % 2 == 0:
-            yield Square((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
+            yield Shape((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
 
 
 CHECKERBOARD = TargetKind(
@@ -108,9 +108,9 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
     return Target(spec, places, {}, movable=True, bows=True, grid=None if asymmetric else size, paper=paper)
 
 
-def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) -> Iterator[Disc]:
+def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) -> Iterator[Shape]:
     for x, y, _ in places.values():
-        yield Disc((x, y), radius_m)
+        yield Shape((x, y), radius_m, is_round=True)
 
 
 CIRCLE_GRID = TargetKind(

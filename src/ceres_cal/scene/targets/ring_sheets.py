@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base import InputError, checked
 from ceres_cal.scene.curves import Arc, Curve
-from ceres_cal.scene.targets.target import Disc, Paper, Square, Target, TargetKind, from_arguments
+from ceres_cal.scene.targets.target import Paper, Shape, Target, TargetKind, from_arguments
 
 
 @checked
@@ -28,12 +28,12 @@ def rings(radii_m: Sequence[float]) -> Target:
     return Target({"kind": "rings", "radii_m": radii}, {"centre": (0.0, 0.0, 0.0)}, arcs, movable=True, paper=paper)
 
 
-def _shapes(radii: Sequence[float], border: float) -> Iterator[Square | Disc]:
+def _shapes(radii: Sequence[float], border: float) -> Iterator[Shape]:
     """From the outside in, each on the one before; beyond the last of an even number of rings it is dark, too."""
     if len(radii) % 2 == 0:
-        yield Square((-border, -border), 2.0 * border)
+        yield Shape((-border, -border), 2.0 * border)
     for number in reversed(range(len(radii))):
-        yield Disc((0.0, 0.0), radii[number], is_dark=number % 2 == 0)
+        yield Shape((0.0, 0.0), radii[number], is_round=True, is_dark=number % 2 == 0)
 
 
 KIND = TargetKind(

@@ -18,19 +18,15 @@ from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, con
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
-class Square(Struct, frozen=True):
-    """A dark square by its corner of the least x and y, and its side, m."""
+class Shape(Struct, frozen=True):
+    """A square by its corner of the least x and y, and its side, m, or a disc by its centre and radius.
 
-    corner_m: tuple[float, float]
-    side_m: float
-    is_dark: bool = True
+    A light one lies on a dark one.
+    """
 
-
-class Disc(Struct, frozen=True):
-    """A disc by its centre and radius, m; a light one lies on a dark one."""
-
-    centre_m: tuple[float, float]
-    radius_m: float
+    place_m: tuple[float, float]
+    size_m: float
+    is_round: bool = False
     is_dark: bool = True
 
 
@@ -44,7 +40,7 @@ class Paper(Struct, frozen=True, eq=False):
 
     low_m: tuple[float, float]
     high_m: tuple[float, float]
-    shapes: Callable[[], Iterator[Square | Disc]]
+    shapes: Callable[[], Iterator[Shape]]
 
 
 MOST_FEATURES = 100_000
