@@ -53,7 +53,7 @@ class Frozen:
         super().__init_subclass__(**others)
         dataclass(init=False, repr=False, eq=False, kw_only=kw_only)(cls)
         if eq:
-            cls.__eq__, cls.__hash__ = _are_equal, _hash_of  # type: ignore[assignment]
+            cls.__eq__, cls.__hash__ = _are_equal, lambda one: hash(_held(one))  # type: ignore[assignment]
 
     if not TYPE_CHECKING:
 
@@ -81,10 +81,6 @@ class Frozen:
 
 def _are_equal(one: Any, other: object) -> Any:
     return _held(one) == _held(other) if type(other) is type(one) else NotImplemented
-
-
-def _hash_of(one: Any) -> int:
-    return hash(_held(one))
 
 
 def _held(one: Any) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, command, option
 from ceres_cal.cli.files import read_calibration, station_of
-from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section, wrapped
 
 
@@ -42,7 +42,7 @@ def _run(
 
     known = read_calibration(calibration)
     name = station_of(calibration, station, known)
-    with naming(calibration), progress_bar(args.silent) as bar:
+    with naming(calibration), ProgressBar(args.silent) as bar:
         shown = None if board is None else scene.checkerboard(*board)
         advice = diagnostics.advise(known, name, arguments.metres(height_mm), enough, shown, bar.update)
     weak = [direction.words for direction in known.uncertainty.weak_directions]
@@ -128,9 +128,6 @@ def _measurement_data(measurement: diagnostics.Measurement) -> dict[str, Any]:
         "priors": [observations.prior_to_json(prior) for prior in measurement.priors],
         "targets": {name: target.spec for name, target in measurement.targets.items()},
         "tolerances": measurement.tolerances,
-        "placements": {
-            name: {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
-            for name, pose in measurement.placements.items()
-        },
+        "placements": {name: scene.PoseFile.of(pose) for name, pose in measurement.placements.items()},
         "views": measurement.views,
     }

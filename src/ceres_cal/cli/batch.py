@@ -96,13 +96,10 @@ def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path
         raise InputError(f"leave out {', '.join(sorted(_OWN))}: what jobs write goes into the folder of the batch")
     outputs = () if command == "check" else (to / f"{name}.json", *([to / f"{name}.html"] if reports else []))
     parsed = COMMANDS[command].parse([*arguments, *_written(outputs)])
-    named = [str(one) for what in _READ for one in _every(getattr(parsed, what, None))]
+    values = (getattr(parsed, what, None) for what in _READ)
+    named = [str(one) for value in values if value for one in (value if isinstance(value, tuple) else (value,))]
     placed = tuple(str(base / one) if one in named else one for one in arguments)
     return cli.Job(name, command, placed, tuple(file for one in named for file in _files(base / one)), outputs)
-
-
-def _every(value: Any) -> list[Any]:
-    return [] if value is None else list(value) if isinstance(value, tuple) else [value]
 
 
 def _written(outputs: Sequence[Path]) -> Iterator[str]:

@@ -13,7 +13,7 @@ from ceres_cal import diagnostics, scene
 from ceres_cal.base import InputError, replace
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import argument, command, option, switch
-from ceres_cal.cli.terminal import ProgressBar, progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _run(args: CalibrateArguments) -> Document:
     observations = files.read_observations(args.observations)
     photographs = files.report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
-    with progress_bar(args.silent) as bar, _client(args.scheduler) as client:
+    with ProgressBar(args.silent) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibration.calibrating import calibrate
 
         workers = {} if client is None else {"client": client}

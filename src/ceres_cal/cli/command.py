@@ -113,7 +113,8 @@ def filled(kind: type[_T], given: argparse.Namespace) -> _T:
     typed = {name.removeprefix(_FORM): text for name, text in values.items() if name.startswith(_FORM)}
     every = fields(kind)  # type: ignore[arg-type]
     of_forms = {one.name: typed for one in every if "forms" in one.metadata}
-    own = {one.name: _frozen(values[one.name]) for one in every if one.name not in of_forms}
+    typed_as = {one.name: values[one.name] for one in every if one.name not in of_forms}
+    own = {name: tuple(value) if isinstance(value, list) else value for name, value in typed_as.items()}
     given_of = {
         name: {key: text for key, text in texts.items() if text is not None} for name, texts in of_forms.items()
     }
@@ -136,10 +137,6 @@ def _require_beside(args: Arguments) -> None:
     for name, about in every.items():
         if (others := about.get("beside", ())) and every.keys().isdisjoint(others):
             raise InputError(f"{flag(name)} needs {' or '.join(map(flag, others))}: give both, or leave it out")
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, Any]]:

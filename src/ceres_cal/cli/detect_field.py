@@ -12,7 +12,7 @@ from ceres_cal.base import InputError, images_and_videos, plural
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import QuietArguments, argument, command, option, switch
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
-from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _run(args: FieldArguments) -> Document:
         target = field_of(start)
     if target is None:
         raise InputError("name the field with --target, such as --target ssl-b")
-    bar, merged = progress_bar(args.silent), {}
+    bar, merged = ProgressBar(args.silent), {}
 
     def pictures() -> list[Path]:
         if one is not None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ceres_cal import base, detect, diagnostics, observations, report, scene
 from ceres_cal.base import CalibrationError, InputError, attempt, image_files, no_such
 from ceres_cal.cli.arguments import ReportArguments, parse_board, parse_priors
-from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -261,7 +261,7 @@ def report_page(
     if args.report is None:
         return None, Section()
 
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         make = partial(report.make_report, calibration, observations, diagnosis, choices, photographs, bar.update)
         return attempted("report", make)
 

@@ -128,15 +128,10 @@ def remember(outcome: Outcome, folder: Path) -> None:
     """Add an outcome to what is remembered, as a whole line."""
     file = folder / RESULTS
     with file.open("ab+") as stream:
-        cut_short = stream.tell() and not _ends_a_line(file)
+        stream.seek(max(stream.tell() - 1, 0))
+        cut_short = stream.read() not in (b"", b"\n")
         stream.write((b"\n" if cut_short else b"") + msgspec.json.encode(outcome) + b"\n")
     note(file)
-
-
-def _ends_a_line(file: Path) -> bool:
-    with file.open("rb") as stream:
-        stream.seek(-1, 2)
-        return stream.read(1) == b"\n"
 
 
 def run_jobs(

@@ -17,7 +17,7 @@ from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
 from ceres_cal.cli.foreign import from_option, import_options, typed_options
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
-from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _photographed(
     args: InputArguments, images: list[Path], false_alarms: float, checks: int
 ) -> tuple[moves.Agreements, detect.KnownDetections]:
     calibration, not_painted = files.read_calibration(args.calibration), arguments.parse_names(args.not_painted)
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         return detect.check_photographs(
             calibration,
             images,
@@ -405,5 +405,5 @@ def _detected(args: RefitArguments, calibration: Calibration, images: list[Path]
             f"--moved {sorted(strange)[0]}: the photographs are of station {station!r}: name that, or none"
         )
     not_painted = arguments.parse_names(args.not_painted)
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         return detect.detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)

@@ -16,7 +16,7 @@ from ceres_cal.cli import arguments
 from ceres_cal.cli.arguments import frames_option, length, number, parse_length, parse_lengths
 from ceres_cal.cli.command import REQUIRED, Arguments, QuietArguments, argument, command, flag, option, switch
 from ceres_cal.cli.files import read_target, require_different, require_observations_output, require_output, save
-from ceres_cal.cli.terminal import ProgressBar, progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
 _T = TypeVar("_T")
@@ -207,7 +207,7 @@ def _run_board(args: BoardArguments) -> Document:
     same = ("camera", "station", "corner_fit", "charuco", "legacy", "frames")
     how: dict[str, Any] = {name: getattr(args, name) for name in same}
     how |= {"marker_m": args.marker, "folder": args.output.parent}
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         detections = detected(
             args.timeout, partial(detect_board, args.images, _board(args), **how, progress=bar.update)
         )

@@ -13,7 +13,7 @@ from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
 from ceres_cal.cli.files import attempted, require_shown
-from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
 _SHOWN = ("fit", "lens", "rig", "located", "widened", "weak", "unknown", "warning", "verdict", "error")
@@ -150,7 +150,7 @@ def _step(
 ) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
     typed = COMMANDS[name].typed(arguments)
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         bar.say(f"now       {_short(typed)}")
     answer = COMMANDS[name].answer(arguments, quiet=args.quiet or args.json)
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
@@ -167,7 +167,7 @@ def _attempted(args: RunArguments, name: str, arguments: Sequence[str], most: in
 def _photographs(args: RunArguments) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
     images, videos = images_and_videos(args.images)
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         return [*images, *detect.frames_of_videos(videos, args.frames, args.output, bar.update)]
 
 
@@ -253,14 +253,11 @@ def _sections(args: RunArguments, images: int, steps: Sequence[_Step], level: st
         yield Section(f"step {number}", [_short(step.command)])
         yield Section("", step.lines)
     yield _BLANK
-    yield Section("written", [f"{args.output}/: {', '.join(sorted(_made(args, steps)))}"])
+    files = {str(step.data[name]) for step in steps for name in ("output", "report") if step.data.get(name)}
+    made = sorted({str(Path(path).relative_to(args.output)) for path in files})
+    yield Section("written", [f"{args.output}/: {', '.join(made)}"])
     if args.to and level == "no":
         yield Section("warning", ["a calibration that is not to be trusted was not exported"])
-
-
-def _made(args: RunArguments, steps: Sequence[_Step]) -> set[str]:
-    files = {str(step.data[name]) for step in steps for name in ("output", "report") if step.data.get(name)}
-    return {str(Path(path).relative_to(args.output)) for path in files}
 
 
 def _short(command: str) -> str:

@@ -63,11 +63,6 @@ def _title(found: re.Match[str]) -> str:
 # ---- progress -------------------------------------------------------------------------------------------------------
 
 
-def progress_bar(silent: bool) -> ProgressBar:
-    """The bar of a command: nothing with --quiet or --json."""
-    return ProgressBar(silent=silent)
-
-
 class ProgressBar:
     """How far some long work is. A context: the bar is gone when it ends, however it ends.
 
@@ -78,7 +73,7 @@ class ProgressBar:
     """
 
     def __init__(
-        self, *, silent: bool, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+        self, silent: bool, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         first_line_s = 3.0  # where there is no terminal; each further line waits twice as long
         redraw_s = 0.1

@@ -11,7 +11,7 @@ from ceres_cal.base import InputError, frame_of, image_files
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import QuietArguments, argument, command, flag, given, option, switch
 from ceres_cal.cli.files import read_calibration, read_observations, require_folder, save, station_of
-from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _run(args: UndistortArguments) -> Document:
     lines: list[str] = []
     written: list[dict[str, Any]] = []
     about = args.output / f"{kind}.json"
-    with progress_bar(args.silent) as bar:
+    with ProgressBar(args.silent) as bar:
         for number, (path, output) in enumerate(outputs.items(), start=1):
             picture, own, line = make(path)
             _write(output, picture)

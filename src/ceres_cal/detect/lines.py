@@ -176,7 +176,8 @@ def measure(
     """
     clear, blur, beyond = np.broadcast_to(clear_px, len(course)), no_blur(len(course)), _BEYOND_PX
     for _ in range(2):
-        alone = clear > _window_px(course, beyond)
+        # How far a window may reach from its place: other paint, as blurred as its own, must be farther away.
+        alone = clear > 1.2 * (course.width_px + beyond) + HALF_WIDTH_PX + beyond - _BEYOND_PX
         course, clear, blur = course.take(alone), clear[alone], blur.take(alone)
         if not len(course):
             none = np.empty(0)
@@ -206,11 +207,6 @@ def measure(
     found = _goes_on(course, found, offset, sigma)
     offset = np.where(found, offset, np.nan)
     return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma_px)
-
-
-def _window_px(course: Course, beyond_px: float) -> Array:
-    """(N,) how far from a place its window may reach: other paint, as blurred as its own, must be farther away."""
-    return np.asarray(1.2 * (course.width_px + beyond_px) + HALF_WIDTH_PX + beyond_px - _BEYOND_PX)
 
 
 def _windows(grey: Array32, course: Course, rough_px: Array, beyond_px: float) -> Windows:

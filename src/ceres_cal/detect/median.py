@@ -55,7 +55,7 @@ def merged(pictures: Iterable[tuple[str, Image]]) -> Merged:
             once.
     """
     names, greys = _read(pictures)
-    sharpness = np.array([_sharpness(grey) for grey in greys])
+    sharpness = [float(np.mean(np.asarray(cv2.Laplacian(_smooth(one), cv2.CV_32F)) ** 2)) for one in greys]
     left_out = {n: "blurred" for n, one in enumerate(sharpness) if one < _BLURRED * np.median(sharpness)}
     sharp = [n for n in range(len(names)) if n not in left_out]
     half = (len(sharp) + 1) // 2  # the camera may have been moved half way
@@ -111,10 +111,6 @@ def _read(pictures: Iterable[tuple[str, Image]]) -> tuple[list[str], list[Image]
 def _smooth(grey: Image | Array32) -> Array32:
     smooth_px = 1.5
     return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), smooth_px))
-
-
-def _sharpness(grey: Image) -> float:
-    return float(np.mean(np.asarray(cv2.Laplacian(_smooth(grey), cv2.CV_32F)) ** 2))
 
 
 class _Reference(Frozen):

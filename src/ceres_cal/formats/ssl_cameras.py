@@ -35,17 +35,14 @@ def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
     Raises:
         InputError: not as many different whole numbers as there are stations.
     """
-    texts = [text.strip() for text in given.split(",")] if given else [_last_digits(name) for name in stations]
+    ends = [name[len(name.rstrip("0123456789")) :] for name in stations]
+    texts = [text.strip() for text in given.split(",")] if given else ends
     if not given and (not all(texts) or len(set(texts)) != len(texts)):
         texts = [str(number) for number in range(len(stations))]
     if len(texts) != len(stations) or len(set(texts)) != len(texts) or not all(text.isdigit() for text in texts):
         each = f"{', '.join(stations)} a whole number from 0 on, no two alike"
         raise InputError(f"camera_id {given!r}: give {each}")
     return tuple(map(int, texts))
-
-
-def _last_digits(name: str) -> str:
-    return name[len(name.rstrip("0123456789")) :]
 
 
 def to_entries(
@@ -136,14 +133,10 @@ def to_entry(camera: Camera, number: int) -> dict[str, Any]:
     numbers = [camera.phi, *camera.principal_point, camera.lens.values[0] * camera.phi**2]
     numbers += quaternion(camera.cam_from_world.rotation).tolist()
     numbers += [*(1e3 * camera.cam_from_world.translation), *(1e3 * camera.position)]
-    single = {name: _single(value) for name, value in zip((*NAMES, *_POSITION), numbers, strict=True)}
+    named = zip((*NAMES, *_POSITION), numbers, strict=True)
+    single = {name: float(str(np.float32(value))) for name, value in named}  # no more digits than float32 takes
     width, height = camera.image_size
     return {"camera_id": number, **single, "pixel_image_width": width, "pixel_image_height": height}
-
-
-def _single(value: float) -> float:
-    """A number as float32 holds it, with no more digits than that takes."""
-    return float(str(np.float32(value)))
 
 
 def to_cameras(entries: Iterable[Mapping[str, Any]], image_size: str) -> tuple[dict[str, Camera], list[str]]:

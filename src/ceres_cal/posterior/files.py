@@ -193,8 +193,7 @@ def lower_triangle(information: Information) -> list[float]:
 
 @cache
 def _lower_triangle(size: int) -> tuple[Indices, Indices]:
-    rows, columns = np.tril_indices(size)
-    return rows, columns
+    return np.tril_indices(size)
 
 
 def require_keys(keys: Sequence[Key], known: Collection[Key], where: str) -> None:
