@@ -100,9 +100,10 @@ def _of_shares(family: StrandFamily, place: tuple[int, bool, float], squared: fl
 def _left(family: StrandFamily, shared: Array, weights: Array) -> Array:
     """(A, Q, Q) X^T R^-1 X of shared columns (M, S, Q) along the eigenvectors, with weights (A, D, M) of each shape."""
     each = np.diff(family.bounds)
-    if 4 * len(each) > shared.shape[1]:  # else the products of all strands of a shape serve all shares, in a third
+    if 8 * len(each) > shared.shape[1]:  # else the products of all strands of a shape serve all shares, in half or less
         every, flat = np.repeat(np.swapaxes(weights, 1, 2), each, axis=2), shared.reshape(-1, shared.shape[2])
-        return np.array([(flat * weight.reshape(-1, 1)).T @ flat for weight in every])
+        halves = (flat * root.reshape(-1, 1) for root in np.sqrt(every))
+        return np.array([half.T @ half for half in halves])  # which BLAS knows to be symmetric
     products = (np.swapaxes(shared[:, own], 1, 2) @ shared[:, own] for own in family.of_shape)
     return np.asarray(sum(np.tensordot(weights[:, d], product, 1) for d, product in enumerate(products)))
 
