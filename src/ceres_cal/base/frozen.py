@@ -184,8 +184,8 @@ def _defined_in(module: Path) -> Iterator[str]:
 
 
 class LazyTable(UserDict[str, _Row]):
-    """A table by name; of a row that is a text the module of that name, below `package`, holds the row: what is of the
-    kind there, and of that name.
+    """A table by name; of a row that is a text the module of that name, below `package`, holds the row, alone or in a
+    tuple: what is of the kind there, and of that name.
     """
 
     def __init__(self, package: str, rows: Mapping[str, _Row | str], kind: type[_Row]) -> None:
@@ -196,7 +196,8 @@ class LazyTable(UserDict[str, _Row]):
         row = self.data[name]
         if isinstance(row, str):
             held = vars(import_module(f"{self._package}.{row}")).values()
-            row = next(one for one in held if isinstance(one, self._kind) and getattr(one, "name", "") == name)
+            every = (one for value in held for one in (value if isinstance(value, tuple) else (value,)))
+            row = next(one for one in every if isinstance(one, self._kind) and getattr(one, "name", "") == name)
             self.data[name] = row
         return row
 

@@ -22,17 +22,8 @@ from typing import Any
 import msgspec
 
 from ceres_cal import observations
-from ceres_cal.base import (
-    CalibrationError,
-    Frozen,
-    InputError,
-    __version__,
-    answer_or_reason,
-    attempt,
-    note,
-    printable,
-    replace,
-)
+from ceres_cal.base import Frozen, __version__, printable, replace
+from ceres_cal.base.errors import CalibrationError, InputError, answer_or_reason, attempt, note
 from ceres_cal.base.files import convert, parse_json, read_bytes
 
 RESULTS = "results.jsonl"

@@ -51,14 +51,15 @@ def _check(
         read=arguments.whole(1),
     ),
 ) -> Document:
-    images = photographs_in(args)
-    detections = None
-    if images:
-        answer, detections = _photographed(args, images, false_alarms, checks)
+    images, detections = photographs_in(args), None
+    calibration, names = files.read_calibration(args.calibration), arguments.parse_names(args.not_painted)
+    if not images:
+        answer = moves.check(calibration, files.read_observations(args.inputs), false_alarms, checks)
     else:
-        answer = moves.check(
-            files.read_calibration(args.calibration), files.read_observations(args.inputs), false_alarms, checks
-        )
+        with ProgressBar(args.silent) as bar:
+            answer, detections = detect.check_photographs(
+                calibration, images, args.station, false_alarms, checks=checks, not_painted=names, progress=bar.update
+            )
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
     rate = f"({100.0 * false_alarms:g} % false alarms{often})"
     holds = f"{'yes' if answer.holds else 'no'} {rate}"
@@ -66,22 +67,6 @@ def _check(
     stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
     stations = map(_checked_station, answer.values())
     return Document((Section("check", [holds], stated), shown(detections), *stations), answer.exit_code, headline)
-
-
-def _photographed(
-    args: InputArguments, images: list[Path], false_alarms: float, checks: int
-) -> tuple[moves.Agreements, detect.KnownDetections]:
-    calibration, not_painted = files.read_calibration(args.calibration), arguments.parse_names(args.not_painted)
-    with ProgressBar(args.silent) as bar:
-        return detect.check_photographs(
-            calibration,
-            images,
-            args.station,
-            false_alarms,
-            checks=checks,
-            not_painted=not_painted,
-            progress=bar.update,
-        )
 
 
 def _checked_station(one: moves.Agreement) -> Section:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from ceres_cal.base import Array, Array32, Frozen, Image, Image8, InputError
-from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.marker_targets import CORNERS
 
@@ -88,8 +88,8 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
     if not inside.any():
         return None
     edge = np.zeros((len(places), 1))
-    whole = Windows(windows.values[inside], windows.distance[inside], inside[inside])
-    fits = fit_profiles(windows, edge, fit_shape(whole, edge[inside], EdgeShape(1.0)).blur_px, 0.5 * half_px)
+    blur_px = fit_shape(windows.take(inside), edge[inside], EdgeShape(1.0)).blur_px
+    fits = fit_profiles(windows, edge, blur_px, 0.5 * half_px)
     offsets = np.where(fits.heights[:, 0] > 0.0, fits.offset_px, np.nan).reshape(4, count)
     every = zip(offsets, fits.sigma_px.reshape(4, count), lengths, strict=True)
     sides = [_side(2.0 * share - 1.0, *side) for side in every]

@@ -21,15 +21,7 @@ from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, 
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals
 from ceres_cal.problem.shares import Histogram, Looked, Share, ShareRequest, Used, cut
-from ceres_cal.robust.noise import (
-    SAME,
-    Inliers,
-    NoiseScales,
-    Redundancy,
-    by_count,
-    by_leverage,
-    noise_of,
-)
+from ceres_cal.robust.noise import SAME, Inliers, NoiseScales, Redundancy, by_count, by_leverage, noise_of
 from ceres_cal.robust.robust import RobustSolution, Rounds
 
 # Observations of the part, and views of it at least.

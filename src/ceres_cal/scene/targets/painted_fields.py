@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterator, Mapping
 from functools import cache, lru_cache, partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,9 +19,8 @@ import numpy as np
 
 from ceres_cal.base import IN_A_METRE, InputError, checked, convert, did_you_mean, no_such
 from ceres_cal.scene.curves import Arc, Curve, Segment, with_crossings
-from ceres_cal.scene.targets.target import LARGEST_M, Target, TargetKind
+from ceres_cal.scene.targets.target import FIELDS, LARGEST_M, Target, TargetKind
 
-_FOLDER = Path(__file__).parent / "fields"
 _FUNCTIONS = {name: getattr(math, name) for name in ("acos", "asin", "atan2", "pi", "sqrt")} | {"max": max}
 TOLERANCE = "tolerance_m"  # by how much lines of a field may lie aside: of every kind, and none of its dimensions
 _X, _Y = re.compile(r"\((\w*)\|(\w*)\)"), re.compile(r"\[(\w*)\|(\w*)\]")
@@ -273,8 +271,7 @@ def ssl_field(division: str | None = None, **given: float | bool) -> Target:
 @cache
 def templates() -> dict[str, Template]:
     """Kind -> its template; that of the small-size league first."""
-    every = [msgspec.json.decode(path.read_bytes(), type=Template) for path in sorted(_FOLDER.glob("*.json"))]
-    return {one.kind: one for one in sorted(every, key=lambda one: one.kind != "ssl-field")}
+    return {kind: msgspec.json.decode(path.read_bytes(), type=Template) for kind, path in FIELDS.items()}
 
 
 @lru_cache(maxsize=256)  # the same ones are asked for again and again: what a dimension moves, in every photograph
@@ -319,3 +316,6 @@ def _painted(every: Mapping[str, Any], parts: Mapping[str, bool]) -> Iterator[tu
 
 def _chosen(sign: int, found: re.Match[str]) -> str:
     return found[1] if sign > 0 else found[2]
+
+
+KINDS = tuple(template.as_kind() for template in templates().values())

@@ -1,6 +1,7 @@
 """What a target is: a rigid thing of known geometry with named points and named curves; and what a kind of them is.
 
-What a printed target looks like: its sheet of paper, and what is on it.
+What a printed target looks like: its sheet of paper, and what is on it. The table of the kinds, and the target that a
+file describes.
 """
 
 from __future__ import annotations
@@ -8,13 +9,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from inspect import signature
+from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, convert, field, median
+from ceres_cal.base import (
+    Array,
+    Frozen,
+    InputError,
+    LazyTable,
+    Mask,
+    cached_property,
+    convert,
+    did_you_mean,
+    field,
+    median,
+)
+from ceres_cal.base.errors import naming
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
@@ -275,3 +289,57 @@ class TargetKind(Struct, frozen=True):
     features: str
     examples: Callable[[], dict[str, Target]]
     from_spec: Callable[[dict[str, Any], str], Target]
+
+
+_FIELDS = sorted(Path(__file__).parent.glob("fields/*.json"), key=lambda path: (path.stem != "ssl-field", path))
+FIELDS = {path.stem: path for path in _FIELDS}
+"""Files of painted fields, by the kinds that they describe; that of the small-size league first."""
+_MODULES = {
+    **dict.fromkeys(FIELDS, "painted_fields"),
+    **dict.fromkeys(("tape-grid", "checkerboard", "circle-grid", "april-grid"), "grids"),
+    "markers": "marker_targets",
+    "rings": "ring_sheets",
+    "custom": "custom_targets",
+}
+TARGET_KINDS: LazyTable[TargetKind] = LazyTable("ceres_cal.scene.targets", _MODULES, TargetKind)
+
+
+def target_from_spec(spec: Any, where: str) -> Target:
+    """The target that a file describes.
+
+    Args:
+        spec: `{"kind": ..., ...}`.
+        where: how to name the place in messages, such as 'obs.json: target "field"'.
+
+    Raises:
+        InputError: unknown kind, or a description that does not fit its kind.
+    """
+    kind = spec.get("kind") if isinstance(spec, dict) else None
+    if not isinstance(kind, str) or kind not in TARGET_KINDS:
+        missing = '; its description has no "kind"' if kind is None else ""
+        choices = did_you_mean(kind, TARGET_KINDS) or f": choose one of {', '.join(TARGET_KINDS)}"
+        raise InputError(f"{where}: unknown kind {kind!r}{choices}{missing}")
+    with naming(where):
+        return TARGET_KINDS[kind].from_spec(spec, where)
+
+
+def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, Target]:
+    """The targets that a file describes, by name; InputError as `target_from_spec`, or where they are too large."""
+    targets: dict[str, Target] = {}
+    for name, spec in specs.items():
+        targets[name] = target_from_spec(spec, f"{where}target {name!r}")
+        features = sum(len(target.points) + len(target.curves) for target in targets.values())
+        require_size(features, f"{where}targets up to {name!r}")
+    return targets
+
+
+def target_named(name: str) -> Target | None:
+    """One of `targets_by_name`, without making the others; None where there is none of the name."""
+    every = (kind.examples() for kind in TARGET_KINDS.values() if name != kind.name)
+    return next((examples[name] for examples in every if name in examples), None)
+
+
+def targets_by_name() -> dict[str, Target]:
+    """The targets of any kind that exist in the world, such as ssl-a."""
+    every = ((kind, *example) for kind in TARGET_KINDS.values() for example in kind.examples().items())
+    return {name: target for kind, name, target in every if name != kind.name}
