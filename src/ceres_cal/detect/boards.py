@@ -42,6 +42,7 @@ _ADAPTIVE = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _FAST_PX, _FAST_SCALE = 2e5, 1.0 / 3.0
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
+_SAMPLED = 4  # each such row and column tells how bright a picture is
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
 _UNEVEN = 0.45  # natural logarithm: 1.57 times; a skipped square makes 2, perspective on three squares hardly 1.3
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
@@ -195,23 +196,26 @@ def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
 
 def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str) -> Array | str:
     levels = _as_8_bit(image)
-    found: list[tuple[Array, Saddles]] = []
-    for look in (_found_fast, _find_chessboard):
-        if (seen := look(levels, columns, rows)) is None:
-            continue
-        one = right_handed(seen), measure_saddles(image, right_handed(seen))
-        if _is_even(seen) and is_whole(image, one[1]):
-            found.append(one)
-            if not np.isnan(one[1].contrast).any():
-                break
-    if not found and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
-        return _placing(part_of_board(image, seed, columns, rows))
+    found, squares = _as_whole(image, _found_fast(levels, columns, rows)), None
+    if not found or np.isnan(found[0][1].contrast).any():
+        whole, squares = _found_thoroughly(levels, columns, rows)
+        found += _as_whole(image, whole)
+    if not found and corner_fit == "saddle" and squares is not None:
+        return _placing(part_of_board(image, squares, columns, rows))
     if not found:
         return f"no chessboard of {columns} x {rows} inner corners found"
     seen, saddles = max(found, key=lambda one: np.count_nonzero(np.isfinite(one[1].contrast)))
     grid = saddles.grid if corner_fit == "saddle" else _subpixel(levels, seen)
     turned = (columns + rows) % 2 == 1 and not is_begun_dark(saddles.contrast)
     return _enough(grid[::-1, ::-1] if turned else grid)
+
+
+def _as_whole(image: Image, seen: Array | None) -> list[tuple[Array, Saddles]]:
+    """What was found, and its corners as they are measured, where it is a whole board; nothing where it is none."""
+    if seen is None or not _is_even(seen):
+        return []
+    measured = measure_saddles(image, right_handed(seen))
+    return [(right_handed(seen), measured)] if is_whole(image, measured) else []
 
 
 def _subpixel(image: Image8, grid: Array) -> Array:
@@ -247,28 +251,24 @@ def _found_fast(image: Image8, columns: int, rows: int) -> Array | None:
     return _places_in(image, scaled, corners).reshape(rows, columns, 2) if shown else None
 
 
-def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
-    """The same by OpenCV's two detectors at several scales: boards that are blurred, far away or in the dark, too."""
+def _found_thoroughly(image: Image8, columns: int, rows: int) -> tuple[Array | None, Array | None]:
+    """The same by OpenCV's newer detector at several scales: boards that are blurred, far away or in the dark, too; and
+    where no whole one is found corners of neighbouring squares, (h, w, 2) px, right-handed: three each way or more.
+    """
+    squares, levels = None, _stretched(image[::_SAMPLED, ::_SAMPLED], image)  # it is blind where it is dark
     for scale in _scales(image.shape):
-        scaled = _resized(image, scale)
-        # The newer detector is the better one, but blind where it is dark.
-        shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
-        if not shown:
-            flags = _ADAPTIVE | cv2.CALIB_CB_FAST_CHECK
-            shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=flags)
-        if shown:
-            return _places_in(image, scaled, corners).reshape(rows, columns, 2)
-    return None
-
-
-def _find_squares(image: Image8) -> Array | None:
-    """Roughly where the corners of neighbouring squares are, (h, w, 2) px, right-handed: three each way or more."""
-    for scale in _scales(image.shape):
-        scaled = _resized(image, scale)
+        scaled = _resized(levels, scale)
+        # Some squares are looked for first: where there are none, there is no board either.
         shown, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled, (3, 3), cv2.CALIB_CB_LARGER)
-        if shown and _is_even(grid := _places_in(image, scaled, corners).reshape(*meta.shape, 2)):
-            return right_handed(grid)
-    return None
+        if not shown:
+            continue
+        some = _places_in(image, scaled, corners).reshape(*meta.shape, 2)
+        shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
+        if shown:
+            return _places_in(image, scaled, corners).reshape(rows, columns, 2), None
+        if squares is None and _is_even(some):
+            squares = right_handed(some)
+    return None, squares
 
 
 def _is_even(grid: Array) -> bool:
@@ -330,9 +330,12 @@ def _enough(grid: Array) -> Array | str:
 
 def _as_8_bit(image: Image) -> Image8:
     """What OpenCV's detectors take; deeper images are stretched, but for half a percent at either end."""
-    if image.dtype == np.uint8:
-        return image.astype(np.uint8, copy=False)
-    low, high = np.percentile(image, [0.5, 99.5])
+    return image.astype(np.uint8, copy=False) if image.dtype == np.uint8 else _stretched(image, image)
+
+
+def _stretched(sample: Image, image: Image) -> Image8:
+    """From black to white, but for half a percent at either end of a sample."""
+    low, high = np.percentile(sample, [0.5, 99.5])
     stretched: Array = (image - low) * (255.0 / max(float(high - low), 1e-12))
     return np.clip(stretched, 0.0, 255.0).astype(np.uint8)
 
