@@ -109,10 +109,10 @@ def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own
     """At the mean noise of all the noisy one's floor was 2.9 times as far off as was stated, and in 60 % of places
     beyond what holds 95 %; the others stated twice as much as they do now.
     """
-    runs = [calibrated_together(seed) for seed in range(4)]
+    runs = [calibrated_together(seed) for seed in range(2)]
     for name in ("c0", "c1", "c2", "c3"):
         ratios = [floors(run, name)[0] for run in runs]
-        assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.2, (name, ratios)  # 0.68 to 0.78 measured
+        assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.2, (name, ratios)  # 0.42 to 1.02; of four 0.68 to 0.78
     noise = runs[0].fit.of_cameras
     assert noise["c3"] / np.mean([noise[name] for name in ("c0", "c1", "c2")]) == pytest.approx(
         6.0, rel=0.3
