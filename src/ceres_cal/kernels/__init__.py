@@ -197,7 +197,7 @@ def curve_residuals(optics: Optics, poses: Array, curves: CurveColumns, residual
 
 def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) -> None:
     """d project(X) / d [intrinsics | 6 pose | what moves it on its target] into `rows` (N, 2, intrinsics + 6 + BUILT);
-    NaN where a sight has points that cannot be projected.
+    NaN of those that cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.

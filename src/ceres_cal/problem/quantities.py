@@ -42,7 +42,7 @@ def pixel_slopes(camera: Camera, places: Array) -> PixelSlopes:
     known = np.flatnonzero(np.isfinite(places).all(axis=1))
     count, size = len(known), len(scales)
     points = kernels.PointColumns(
-        np.arange(count + 1),  # a sight each: one that is not shown keeps no other one's from being known
+        np.array([0, count]),
         np.ascontiguousarray(places[known]),
         np.zeros((count, 2)),
         kernels.NOTHING,
@@ -51,7 +51,7 @@ def pixel_slopes(camera: Camera, places: Array) -> PixelSlopes:
     )
     rows = np.full((len(places), 2, size + 6 + kernels.BUILT), np.nan)
     shown = rows[known]
-    kernels.point_rows(optics, np.repeat(camera.cam_from_world.matrix[None], count, axis=0), points, shown)
+    kernels.point_rows(optics, camera.cam_from_world.matrix[None], points, shown)
     rows[known] = shown
     intrinsics, turns, shifts, _ = np.split(rows, [size, size + 3, size + 6], axis=2)
     pose = camera.cam_from_world  # whose translation turns along about the camera

@@ -169,6 +169,18 @@ class Sums {
 
 // ---- every observation for itself, in px: residuals, and the Jacobian that the sums are made of ----
 
+// of_chunk(start, n) for all of a sight's chunks, and of one that fails for each observation alone: none(k) where that
+// fails, too. False where some did.
+template <class Columns, class Chunk, class None>
+inline bool one_by_one_where_some_fail(const Columns& seen, int64_t sight, Chunk of_chunk, None none) {
+    return all_chunks(seen, sight, [&](int64_t start, int n) {
+        const bool good = of_chunk(start, n);
+        for (int64_t k = start; !good && k < start + n; ++k)
+            if (!of_chunk(k, 1)) none(k);
+        return good;
+    });
+}
+
 // The residuals of one sight, project(X) - p of points and the signed distance from pixels to their curves, to the
 // places `rows` (null: in order); NaN, and false, where there is none. s is moved to the foot.
 template <class Columns>
@@ -185,28 +197,22 @@ inline bool residuals_of(int64_t sight, Projection& shown, const double* pose, c
         }
         return true;
     };
-    return all_chunks(seen, sight, [&](int64_t start, int n) {
-        const bool good = of_chunk(start, n);
-        for (int64_t k = start; !good && k < start + n; ++k)
-            if (!of_chunk(k, 1)) std::fill_n(place(k), MANY, NO_ANSWER);
-        return good;
-    });
+    return one_by_one_where_some_fail(seen, sight, of_chunk,
+                                      [&](int64_t k) { std::fill_n(place(k), MANY, NO_ANSWER); });
 }
 
 // d residual / d [intrinsics | 6 pose | what moves the observation, BUILT] of one sight into `rows`, RESIDUALS of them
-// for each observation; false, and NaN, where a chunk of it cannot be projected. normals: of curves (M, 2), filled with
-// the image normal at the foot.
+// for each observation; NaN, and false, where there is none. normals: of curves (M, 2), filled with the image normal at
+// the foot.
 template <class Columns>
 inline bool rows_of(int64_t sight, Projection& shown, const double* pose, const Columns& seen, double* rows,
                     double* normals) {
     constexpr int MANY = Columns::RESIDUALS;
     const int numbers = shown.last_row, size = numbers + BUILT;
-    return all_chunks(seen, sight, [&](int64_t start, int n) {
-        double* row = rows + MANY * size * start;
-        if (!shown.show(start, n, pose, seen)) {
-            std::fill_n(row, static_cast<size_t>(MANY) * size * n, NO_ANSWER);
-            return false;
-        }
+    const auto place = [&](int64_t k) { return rows + MANY * size * k; };
+    const auto of_chunk = [&](int64_t start, int n) {
+        if (!shown.show(start, n, pose, seen)) return false;
+        double* row = place(start);
         shown.differentiate(false);
         for (int k = 0; k < shown.pose_row; ++k) shown.rows.open(k);
         for (int i = 0; i < n; ++i) {
@@ -223,7 +229,9 @@ inline bool rows_of(int64_t sight, Projection& shown, const double* pose, const 
             }
         }
         return true;
-    });
+    };
+    return one_by_one_where_some_fail(
+        seen, sight, of_chunk, [&](int64_t k) { std::fill_n(place(k), static_cast<size_t>(MANY) * size, NO_ANSWER); });
 }
 
 }  // namespace ceres_cal
