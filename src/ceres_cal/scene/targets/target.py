@@ -16,19 +16,8 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base import (
-    Array,
-    Frozen,
-    InputError,
-    LazyTable,
-    Mask,
-    cached_property,
-    convert,
-    did_you_mean,
-    field,
-    median,
-)
-from ceres_cal.base.errors import naming
+from ceres_cal.base import Array, Frozen, LazyTable, Mask, cached_property, convert, did_you_mean, field, median
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
