@@ -365,10 +365,10 @@ def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.Monke
     start = initialise(gather_sights(observations), options)
     every = choose_lens(observations, Options(), start).among
     posterior = calibrate(observations, options).uncertainty.posterior
-    assert every is not None and every.others(posterior).others
+    assert every is not None and every.others(posterior, Options()).others
     monkeypatch.setattr(seen, "solve", solved)
     few = choose_lens(observations, Options(), start).among
-    assert few is not None and not few.others(posterior).others
+    assert few is not None and not few.others(posterior, Options()).others
 
 
 def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -379,7 +379,7 @@ def test_a_lens_that_ends_elsewhere_than_was_promised_says_nothing(monkeypatch: 
     posterior = calibrate(observations, options).uncertainty.posterior
     monkeypatch.setattr(seen, "_KEPT", 0.0)
     assert chosen.among is not None
-    few = chosen.among.others(posterior)
+    few = chosen.among.others(posterior, Options())
     assert not few.others and not few.failed
 
 

@@ -54,6 +54,11 @@ def test_a_height_in_millimetres_is_asked_about_whatever_its_sigma(sigma: float)
     "stated, words",
     [
         ({"priors": (Prior("station", "overhead", "position_m", (-2270.0, -120.0, 4022.0), (20.0,) * 3),)}, "-2270 m"),
+        ({"priors": (height(-4.02, 0.005),)}, r"is -4.02 m, but it is at least 1e-06 m: the camera sees .* from above"),
+        (
+            {"priors": (Prior("station", "overhead", "position_m", (0.0, 0.0, 0.0), (0.1,) * 3),)},
+            "position_m .* is 0 m",
+        ),
         ({"priors": (phi(8.0),)}, r"phi of camera 'overhead' is 8 px.*is it in mm\?"),
         ({"priors": (phi(8.0e5),)}, "phi of camera 'overhead' is 800000 px"),
         ({"priors": (Prior("camera", "overhead", "cy", (1e6,), (5.0,)),)}, "cy of camera 'overhead' is 1e"),

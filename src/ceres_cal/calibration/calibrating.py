@@ -21,18 +21,17 @@ from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.problem import (
     EXACT,
     SolveProgress,
-    free_keys,
     gather_priors,
     make_structure,
     problem_of,
     require_possible_numbers,
 )
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
-from ceres_cal.problem.priors import stated_priors
+from ceres_cal.problem.priors import freed, loosely
 from ceres_cal.robust.as_built import Built, free_dimensions
-from ceres_cal.robust.conflicts import contradicted_by, without_suspicious
+from ceres_cal.robust.conflicts import contradicted_by
 from ceres_cal.robust.noise import noise_of_cameras
-from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
 
@@ -85,11 +84,10 @@ def calibrate(
 
             if apart := next(shifted(observations), None):
                 raise type(error)(f"{apart}: {error}") from None
-            free = _without_priors(observations, options)
-            if free is None:
+            words = _contradicted(observations, options)
+            if words is None:
                 raise type(error)(f"{error}{_others_can(error, observations, options)}", error.camera) from None
-            words = _contradicted(observations, options, free)
-            raise SolutionError(words or _OTHERWISE) from None
+            raise SolutionError(words) from None
 
 
 def _others_can(failure: CalibrationError, observations: Observations, options: Options) -> str:
@@ -190,20 +188,30 @@ def _calibrated(
 
 
 def _chosen(task: Task, observations: Observations, options: Options) -> Calibration:
-    """With the lens that is named, or the one that is chosen; what a first solution contradicts is stated at the end.
+    """With the lens that is named, or the one that is chosen; what is stated says little until all is explained.
 
     A height 25 % wrong was taken up by a principal point that moves from view to view and by a board that is bent.
     """
-    sights = gather_sights(observations)
-    start = initialise(sights, _named(options))
-    agreed = _without_disputed(sights, options, start)
-    if agreed is not None:
-        (rest, fewer), asked = agreed, replace(task, stated=(observations, options))
-        # quiet: nothing of what was stated is set aside
-        found = attempt(lambda: _of_lens_asked(asked, initialise(rest, _named(fewer)), rest, fewer))
-        if isinstance(found, Calibration) and found.conflicts:
+    sights, free = gather_sights(observations), freed(observations, options)
+    little, loose = loosely(observations, free)
+    if not options.closed_form_only and (little, loose) != (observations, options):
+        asked = replace(task, stated=(observations, options))
+
+        def explained_first() -> Calibration:
+            start = initialise(sights, _named(free))
+            return _of_lens_asked(asked, start, replace(sights, observations=little), loose)
+
+        # quiet: there are too few observations without what is stated
+        found = attempt(explained_first)
+        if isinstance(found, Calibration):
             return found
-    return _of_lens_asked(task, start, sights, options)
+    return _of_lens_asked(task, initialise(sights, _named(options)), sights, options)
+
+
+def _of_lens_asked(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
+    if options.lens == AUTO:
+        return _of_any_lens(replace(task, chosen=True), start, sights, options)
+    return _of_lens(task, start, sights, options)
 
 
 def _named(options: Options) -> Options:
@@ -211,42 +219,6 @@ def _named(options: Options) -> Options:
     from ceres_cal.calibration.lens_forms import papers
 
     return options if options.lens != AUTO else papers(options)
-
-
-def _without_disputed(sights: Sights, options: Options, start: Start) -> tuple[Sights, Options] | None:
-    """Without what is stated or held and a first solution contradicts; None where it contradicts nothing."""
-    # Ten standard deviations: with the paper's lens for another one right heights of a rig are up to 6.5 off.
-    grossly = 1e-22
-    observations = sights.observations
-    each = (observations.priors, options.priors)
-    holds = options.fixed or not options.free_principal_point
-    if not (any(each) or holds) or options.closed_form_only:
-        return None
-    end = attempt(partial(_first_solved, sights, options, start))  # quiet: whoever solves for all meets it again
-    if isinstance(end, CalibrationError):
-        return None
-    agreed = without_suspicious(end.problem, end, grossly)
-    kept = {key for prior in agreed.priors for key in prior.keys}
-    stated = stated_priors(observations, end.problem.options)
-    disputed = [one for one, prior in stated.items() if kept.isdisjoint(prior.keys)]
-    now, before = (set(free_keys(end.estimate, one.layout)) for one in (agreed, end.problem))
-    freed = {key.quantity for key in now - before}
-    if not (disputed or freed):
-        return None
-    of_views, of_options = (tuple(prior for prior in priors if prior not in disputed) for priors in each)
-    sights = replace(sights, observations=replace(observations, priors=of_views))
-    return sights, replace(options.freeing(freed), priors=of_options)
-
-
-def _first_solved(sights: Sights, options: Options, start: Start) -> RobustSolution:
-    problem = problem_of(sights, _named(options), start.estimate)
-    return solve_robustly(problem, start.estimate, is_near=start.is_near)
-
-
-def _of_lens_asked(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
-    if options.lens == AUTO:
-        return _of_any_lens(replace(task, chosen=True), start, sights, options)
-    return _of_lens(task, start, sights, options)
 
 
 def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
@@ -288,7 +260,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
 
     calibration, chosen = last.first_solved(known_with)
     if calibration.posterior is not None:
-        others = chosen.others(calibration.posterior, calibration.estimate)
+        others = chosen.others(calibration.posterior, calibration.estimate, calibration.options)
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
         if others.failed:
@@ -300,8 +272,10 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
 
 def _part(bulk: Bulk, options: Options) -> Subset:
     """The part that decides: of the world some views, with those that stand out at a first solution of others."""
-    sights = gather_sights(bulk.part().observations)
-    return bulk.part(bulk.standing_out(_first_solved(sights, options, initialise(sights, _named(options)))))
+    sights, options = gather_sights(bulk.part().observations), _named(options)
+    start = initialise(sights, options)
+    problem = problem_of(sights, options, start.estimate)
+    return bulk.part(bulk.standing_out(solve_robustly(problem, start.estimate, is_near=start.is_near)))
 
 
 def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
@@ -314,15 +288,12 @@ def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Cali
 
 
 @or_none  # quiet: the caller raises the first failure
-def _without_priors(observations: Observations, options: Options) -> Calibration | None:
-    """None where nothing was stated, or the observations make no calibration by themselves either."""
+def _contradicted(observations: Observations, options: Options) -> str | None:
+    """What a calibration without any priors contradicts; None where there are none, or it makes none either."""
     if not (observations.priors or options.priors):
         return None
-    return _calibrated(replace(observations, priors=()), replace(options, priors=()))
-
-
-def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:
-    """What the priors that no calibration came out of contradict, when one comes out without them."""
+    free = _calibrated(replace(observations, priors=()), replace(options, priors=()))
     stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior
-    return contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
+    words = contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
+    return words or _OTHERWISE

@@ -32,15 +32,12 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Key, Options, moved
-from ceres_cal.problem.parameters import OF_PIXELS
+from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
 
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
-# Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
-# of a valley along phi that frontal views leave open.
-_VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
 
 
 class Chosen(Frozen):
@@ -77,9 +74,10 @@ class Chosen(Frozen):
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
 
-    def others(self, posterior: Posterior) -> OtherLenses:
+    def others(self, posterior: Posterior, options: Options) -> OtherLenses:
         """What other lenses would say, as far as they are probable, see `Comparison.others`."""
-        return OtherLenses(self.start.estimate, (), (), {}) if self.among is None else self.among.others(posterior)
+        none = OtherLenses(self.start.estimate, (), (), {})
+        return none if self.among is None else self.among.others(posterior, options)
 
 
 _Steps = Mapping[Key, Mapping[Key, float]]
@@ -112,11 +110,11 @@ class Comparison(Frozen):
         worse = standard_errors(self.chosen.squares, self.passed.squares)
         return worse if worse > self.as_good else 0.0
 
-    def others(self, posterior: Posterior) -> OtherLenses:
+    def others(self, posterior: Posterior, options: Options) -> OtherLenses:
         """What other lenses would say, as far as they are probable; nothing beside one without a formula.
 
         Args:
-            posterior: by the chosen one.
+            posterior: by the chosen one. options: they hold what was free when lenses were compared.
         """
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
@@ -138,9 +136,11 @@ class Comparison(Frozen):
                 each.append((one, likely[one], steps))
         if not each:
             return found
+        seen = self.seen.holding(options)
 
         def solved(one: Candidate, *, as_promised: bool = False) -> Estimate:
-            return one.estimate if one.is_near else self.seen.solved_near(one, as_promised=as_promised)
+            is_there = one.is_near and seen is self.seen
+            return one.estimate if is_there else seen.solved_near(one, as_promised=as_promised)
 
         near = attempt(partial(solved, self.chosen))  # reads: "other lenses could not be compared, ..."
         if isinstance(near, CalibrationError):
@@ -152,7 +152,7 @@ class Comparison(Frozen):
             if isinstance(near, CalibrationError):
                 left -= weight
                 continue
-            ends = self._ends(one, near, steps)
+            ends = self._ends(seen, one, near, steps)
             weights = (weight / len(ends),) * len(ends)
             found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
         # What they say by chance is less by as much as there are more observations than took part.
@@ -179,12 +179,13 @@ class Comparison(Frozen):
                 steps |= {key: steps.get(key, 0.0) + far * value / step[phi] for key, value in step.items()}
         return steps
 
-    def _ends(self, one: Candidate, near: Estimate, steps: dict[Key, float]) -> Sequence[Estimate]:
+    @staticmethod
+    def _ends(seen: InlierRows, one: Candidate, near: Estimate, steps: dict[Key, float]) -> Sequence[Estimate]:
         """Another lens so far to either side; where there are no steps itself."""
 
         def end(side: float) -> Estimate:
             start = moved(near, list(steps), side * np.array(list(steps.values())))
-            return self.seen.solved_near(one, as_promised=True, there=start)
+            return seen.solved_near(one, as_promised=True, there=start)
 
         # quiet: where it ends in another minimum, its middle counts alone
         ends = attempt(lambda: [end(-1.0), end(1.0)]) if steps else [near]
@@ -242,10 +243,7 @@ def choose_lens(
         by_most: whether most of the observations are asked, not some of them, which left what goes together.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
-    priors = (*map(_loosely, options.priors), *_about_guesses(observations, options, start))
-    by_themselves = replace(options, priors=priors)
-    if observations.priors:
-        observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
+    by_themselves = replace(options, priors=(*options.priors, *_about_guesses(observations, options, start)))
 
     def compared() -> Chosen:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built, by_most=by_most)
@@ -265,15 +263,7 @@ def _about_guesses(observations: Observations, options: Options, start: Start) -
     for name, phi_from in start.phi_from.items():
         if phi_from == "guess" and name not in stated and "phi" not in options.held:
             phi = start.estimate.cameras[name].phi
-            yield Prior("camera", name, "phi", (phi,), (_VAGUE_SHARE * phi,))
-
-
-def _loosely(prior: Prior) -> Prior:
-    """What was stated of a camera or a station, so vaguely that no lens wins by taking up what is wrong with it."""
-    if prior.owner == "target" or prior.quantity not in _VAGUE:
-        return prior
-    least = _VAGUE_SHARE * max(map(abs, prior.value))
-    return replace(prior, sigma=tuple(max(sigma, least) for sigma in prior.sigma))
+            yield Prior("camera", name, "phi", (phi,), (VAGUE * phi,))
 
 
 def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candidate]:

@@ -16,6 +16,7 @@ from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_erro
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem import Estimate, Information, Key, Options, Problem, moved, problem_of, solve, values_of
+from ceres_cal.problem.parameters import as_held
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.as_built import Built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
@@ -279,6 +280,12 @@ class InlierRows(Frozen):
 
         return _or_failed(near_best, forms, start)
 
+    def holding(self, options: Options) -> InlierRows:
+        """The same with what other options hold of cameras."""
+        held = {name: getattr(options, name) for name in ("fixed", "free_principal_point")}
+        now = replace(self.options, **held)
+        return self if now == self.options else replace(self, options=now)
+
     @property
     def splits_placements(self) -> bool:
         """Whether placements are too few to be held out whole."""
@@ -321,8 +328,9 @@ class InlierRows(Frozen):
         # Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected;
         # and of all, where the next step is of a thousandth of a standard deviation.
         at_best = 1e-6
-        start = there or candidate.estimate
-        problem = self._problem(candidate.form.of(self.options), start)
+        options = candidate.form.of(self.options)
+        start = as_held(there or candidate.estimate, options)
+        problem = self._problem(options, start)
         for name in () if there is None else start.cameras:
             problem = problem.holding(name, 0)
         solution = solve(problem, start, precision=at_best, posed=at_best)

@@ -112,10 +112,12 @@ class ChosenLenses(Frozen):
                 others[name] = other
         return self._with(others) if others else None
 
-    def others(self, posterior: Posterior, end: Estimate) -> OtherLenses:
-        """What other lenses would say of cameras whose stations stand, where they see no floor, as at the end."""
+    def others(self, posterior: Posterior, end: Estimate, options: Options) -> OtherLenses:
+        """What other lenses would say of cameras whose stations stand, where they see no floor, as at the end, and of
+        which these options hold numbers.
+        """
         floors = {key.station for key in self.sights.keys if key.placement is None}
-        return together([one.others(posterior) for one in self.each.values()], floors, end)
+        return together([one.others(posterior, options) for one in self.each.values()], floors, end)
 
     def _with(self, others: Mapping[str, Chosen]) -> ChosenLenses:
         return replace(self, each={**self.each, **others})

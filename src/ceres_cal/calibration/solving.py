@@ -28,8 +28,9 @@ from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution, SolveProgress
 from ceres_cal.problem.information import Key, over
 from ceres_cal.problem.parameters import Estimate, Layout, Options, as_held, make_layout
-from ceres_cal.problem.priors import GaussianPrior, stated_priors
+from ceres_cal.problem.priors import stated_priors
 from ceres_cal.problem.problem import Problem, problem_of
+from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
@@ -134,34 +135,65 @@ class Explained(Frozen):
     @property
     def shifts_at(self) -> ShiftsAt | None:
         """By which numbers scatter besides."""
-        if self.unsteady is None:
-            return self.beside.shifts_at if self.beside else None
         unsteady, beside = self.unsteady, self.beside
+        if unsteady is None and beside is None:
+            return None
+        here = self.problem if self.task.stated else None
 
-        def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
-            keys, shifts = beside.shifts_at(there, priors) if beside else (unsteady.keys, ())
+        def shifts_at(there: Estimate, other: Problem | None) -> tuple[Sequence[Key], Sequence[Array]]:
+            keys, shifts = beside.shifts_at(there, other or here) if beside else (unsteady.keys if unsteady else (), ())
+            if unsteady is None:
+                return keys, shifts
             return keys, [*shifts, *over(unsteady.shifts, unsteady.keys, keys)]
 
         return shifts_at
 
     @property
     def as_stated(self) -> Explained:
-        """The answer with what was set aside at the start, solved for from where everything else was explained."""
+        """The answer with everything as it was stated, solved for from where it counted little."""
         if self.task.stated is None:
             return self
-        observations, options = self.task.stated
-        lenses = {name: camera.lens for name, camera in self.end.estimate.cameras.items()}
+        (observations, options), here = self.task.stated, self.end.estimate
+        lenses = {name: camera.lens for name, camera in here.cameras.items()}
+        loose = stated_priors(self.problem.observations, self.problem.options, lenses).values()
+        known = {key for prior in loose for key in prior.keys}
+        others = [prior for prior in (one.without(known) for one in self.problem.priors) if prior.keys]
         stated = {name: getattr(options, name) for name in ("priors", "fixed", "free_principal_point")}
         options = replace(self.problem.options, **stated)
         every = stated_priors(observations, options, lenses).values()
-        known = {key for prior in every for key in prior.keys}
-        others = [prior for prior in (one.without(known) for one in self.problem.priors) if prior.keys]
         sights = replace(self.problem.sights, observations=observations)
         layout = make_layout(observations, options)
         problem = replace(self.problem, sights=sights, layout=layout, options=options, priors=(*every, *others))
-        cameras = {name: as_held(camera, options) for name, camera in self.end.estimate.cameras.items()}
-        end = solve_robustly(problem, replace(self.end.estimate, cameras=cameras), self.task.scales, self.task.progress)
-        return replace(self, problem=problem, end=end)
+        part, start = taking_part(problem, self.explanations), as_held(here, options)
+        end = solve_robustly(part, start, self.task.scales, self.task.progress, is_near=True)
+        if part is not problem:
+            end = replace(end, residuals=residuals(sights, end.estimate))
+        phi_from = dict.fromkeys(self.start.phi_from, "fixed") if "phi" in options.fixed else self.start.phi_from
+        elsewhere = tuple(as_held(one, options) for one in self.start.others)
+        begun = replace(self.start, phi_from=phi_from, others=elsewhere)
+        return replace(self, problem=problem, start=begun, end=end).at_least
+
+    @property
+    def at_least(self) -> Explained:
+        """At the least of few minima."""
+        end = self.end
+        is_whole = end.problem.sights.equations == self.problem.sights.equations
+        least, others = least_of_few(end.problem, end.estimate, self.start.others, is_whole=is_whole)
+        if least is not end.estimate:
+            end = replace(end.moved_to(least, self.problem), reduced=None)
+        return replace(self, end=end, others=others)
+
+    def doubted_as(self, before: Explained) -> Explained:
+        """With the less probable of two explanations as far off as it was before all was stated."""
+        if before.task.stated is None:
+            return self
+        there, here, keys = before.end.estimate, self.end.estimate, self.end.told.shared.keys
+
+        def other(one: Explanation) -> Estimate:
+            return moved(here, keys, difference(one.other, there, keys))
+
+        doubted = (replace(one, other=other(one)) if one.is_doubtful else one for one in self.explanations)
+        return replace(self, explanations=tuple(doubted))
 
     def without(self, conflicts: Conflicts) -> Explained:
         """The answer without what was stated and everything else contradicts."""
@@ -198,11 +230,12 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
 def known_of(seen: Explained) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
     task, conflicts = seen.task, Conflicts()
-    near, seen = seen.end if task.stated else None, seen.as_stated
+    before, seen = seen, seen.as_stated
+    near = before.end if task.stated else None
     if task.tested:
         part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
         conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at, near)
-        seen = seen.without(conflicts)
+        seen = seen.without(conflicts).doubted_as(before)
     settled = None
     if task.settle is not None:
         settled = task.settle(seen.problem, seen.end, seen.explanations, task.progress)
@@ -295,11 +328,7 @@ def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
         part, is_all = taking_part(problem, explanations), seen.task.settle is None
         beside = solve_beside_effects(problem, part, end, solves=is_all)
         problem, end = beside.problem, beside.end
-    is_whole = end.problem.sights.equations == problem.sights.equations
-    least, others = least_of_few(end.problem, end.estimate, seen.start.others, is_whole=is_whole)
-    if least is not end.estimate:
-        end = replace(end.moved_to(least, problem), reduced=None)
-    return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside, others)
+    return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside).at_least
 
 
 def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]:

@@ -60,7 +60,7 @@ def require_shown(
     """The field that photographs are to show; InputError, before any is searched, where what is said of it, of the
     board or of the camera cannot be.
     """
-    from ceres_cal.problem import Options, camera_ranges, place_range
+    from ceres_cal.problem import Options, camera_ranges, floor_of, place_ranges
 
     least = 0.1  # of the picture's diagonal, that a field is large which can be found
     if board is not None:
@@ -69,7 +69,8 @@ def require_shown(
     for prior in parse_priors(priors, {"station": cameras, "camera": cameras}, Options(lens=lens)):
         bounds: list[Range] = []
         if field is not None and prior.owner == "station":
-            bounds = [place_range(field.places, least, "a tenth of the picture")] * len(prior.value)
+            ranges = place_ranges(field.places, least, "a tenth of the picture", floor_of(field.places))
+            bounds = list(ranges[-len(prior.value) :])
         elif images and prior.owner == "camera":
             height, width = detect.read_colour(images[0]).shape[:2]
             bounds = list(camera_ranges(prior.quantity, (width, height), None))

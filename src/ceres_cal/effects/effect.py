@@ -16,7 +16,7 @@ from ceres_cal.effects.columns import EffectColumns, ScoreTest, Selection
 from ceres_cal.effects.evidence import SizePrior
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
-from ceres_cal.problem import Estimate, GaussianPrior, Key, Kind, Problem, Structure, intrinsic_names, unit_px
+from ceres_cal.problem import Estimate, Key, Kind, Problem, Structure, intrinsic_names, unit_px
 from ceres_cal.problem.residuals import Equations, plane_shift, whole_structure
 from ceres_cal.scene.camera import Camera
 
@@ -97,8 +97,8 @@ class EffectEstimate(Frozen, eq=True):
         return f"{self.sentence}; it was solved for"
 
 
-ShiftsAt = Callable[[Estimate, Sequence[GaussianPrior] | None], tuple[Sequence[Key], Sequence[Array]]]
-"""By how much effects let numbers scatter at an estimate, under other priors where these are given: the numbers, and
+ShiftsAt = Callable[[Estimate, Problem | None], tuple[Sequence[Key], Sequence[Array]]]
+"""By how much effects let numbers scatter at an estimate, with what another problem states and holds: the numbers, and
 shifts of them whose products with themselves, added up, go into their covariance."""
 
 

@@ -48,6 +48,8 @@ class Prior(Frozen, eq=True):
     quantity: str
     value: tuple[float, ...]
     sigma: tuple[float, ...]
+    gives_way: bool = False
+    """Whether it counts less, the farther off it is: files have none that does."""
 
     def __post_init__(self) -> None:
         take_types(self)

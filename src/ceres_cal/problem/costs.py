@@ -375,7 +375,7 @@ class PriorCost(CachedCost):
             off, slope = self._prior.bent(off)
             root = root * slope
         residuals = self._root @ off
-        if self._prior.is_usual:
+        if self._prior.gives_way:
             residuals, slope = _bent(residuals)
             root = slope[:, None] * root
         return CostValue(at, residuals, [(root[:, columns] @ by_block).reshape(-1) for columns, by_block in slopes])

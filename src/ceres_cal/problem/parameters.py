@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 
 import numpy as np
@@ -188,12 +188,6 @@ class Options(Frozen, eq=True):
         lens = self._unset
         return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names]) if self.fixed else lens
 
-    def freeing(self, names: Collection[str]) -> Options:
-        """These options with some of the numbers free that they hold."""
-        fixed = {name: value for name, value in self.fixed.items() if name not in names}
-        free_principal_point = self.free_principal_point or not {"cx", "cy"}.isdisjoint(names)
-        return replace(self, fixed=fixed, free_principal_point=free_principal_point)
-
     def with_first_power(self, views: int) -> Options:
         """These options with a skew, which displaces by the first power, of a lens whose powers are left open, where so
         many views tell it.
@@ -242,7 +236,12 @@ def with_intrinsics(camera: Camera, vector: Array) -> Camera:
     return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens, skew=float(vector[-1]))
 
 
-def as_held(camera: Camera, options: Options) -> Camera:
+def as_held(estimate: Estimate, options: Options) -> Estimate:
+    """The estimate with the numbers of its cameras put in that the options hold."""
+    return replace(estimate, cameras={name: _as_held(camera, options) for name, camera in estimate.cameras.items()})
+
+
+def _as_held(camera: Camera, options: Options) -> Camera:
     """The camera with the numbers put in that the options hold."""
     middle = 0.5 * (np.array(camera.image_size) - 1.0)
     held = {} if options.free_principal_point else dict(zip(("cx", "cy"), middle.tolist(), strict=True))

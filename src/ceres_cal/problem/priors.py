@@ -15,8 +15,8 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, InputError, field, replace, rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
-from ceres_cal.problem.parameters import Estimate, Options, intrinsic_names
-from ceres_cal.problem.quantities import intrinsic_keys, values_of
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options, intrinsic_names
+from ceres_cal.problem.quantities import FINEST, intrinsic_keys, values_of
 from ceres_cal.problem.structure import Structure
 from ceres_cal.scene import Camera, Lens
 
@@ -33,6 +33,10 @@ ANY_PHI = 1.1, 0.8
 """phi in half image diagonals, and the standard deviation of its logarithm: fisheyes of 0.3 and lenses of cranes and
 stands, five half diagonals, are within two of it. Without it a view from straight above, which tells phi over height
 alone, let solves run away along their valley, to cameras that are none."""
+VAGUE = 0.1
+"""Of its size, what is stated of a number counts as known to so much until all else is explained: enough to stay in the
+middle of a valley along phi that frontal views leave open."""
+_VAGUE_QUANTITIES = (*OF_PIXELS, "principal_point", "height_m", "position_m")
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
 
 
@@ -42,14 +46,15 @@ class GaussianPrior(Frozen):
     Attributes:
         information: about its K numbers. mean: (K,) in the units of the keys; of a turn from its rotation.
         rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
-        is_usual: whether nobody stated it: it is what is usual of cameras, under a distribution with heavy tails, which
-            gives way to observations that say otherwise.
+        gives_way: to observations that say otherwise: it is under a distribution with heavy tails.
+        is_usual: whether nobody stated it: it is what is usual of cameras, and gives way.
         logs: those of its numbers whose logarithms are normal: their offsets are mean log(x / mean).
     """
 
     information: Information
     mean: Array
     rotations: Mapping[str, Array] = field(default_factory=dict)
+    gives_way: bool = False
     is_usual: bool = False
     logs: frozenset[Key] = frozenset()
 
@@ -136,11 +141,11 @@ class GaussianPrior(Frozen):
     def cost(self, estimate: Estimate) -> float:
         """Twice what it adds to the cost: squares of its residuals, Cauchy's loss of what is usual."""
         squares = self.residuals(estimate) ** 2
-        return float(np.sum(USUAL_BENDS**2 * np.log1p(squares / USUAL_BENDS**2) if self.is_usual else squares))
+        return float(np.sum(USUAL_BENDS**2 * np.log1p(squares / USUAL_BENDS**2) if self.gives_way else squares))
 
     def weighted_at(self, estimate: Estimate) -> GaussianPrior:
         """The normal distribution that pulls as much at an estimate: what is usual counts with Cauchy's weights."""
-        if not self.is_usual:
+        if not self.gives_way:
             return self
         off = self.offsets(estimate)
         weights = 1.0 / (1.0 + (off / USUAL_BENDS) ** 2 * np.diagonal(self.information.matrix))
@@ -149,10 +154,10 @@ class GaussianPrior(Frozen):
         return replace(self._times(weights * slope**2), mean=here - off / slope, logs=frozenset())
 
     def loosened(self, factor: float) -> GaussianPrior:
-        """With standard deviations so many times as large, where it is usual: beside observations that are off by as
+        """With standard deviations so many times as large, where it gives way: beside observations that are off by as
         much more than their noise.
         """
-        return self._times(np.full(len(self.keys), factor**-2)) if self.is_usual else self
+        return self._times(np.full(len(self.keys), factor**-2)) if self.gives_way else self
 
     def _times(self, weights: Array) -> GaussianPrior:
         """Of numbers that are stated one by one."""
@@ -196,6 +201,34 @@ def stated_priors(
     return stated
 
 
+def freed(observations: Observations, options: Options) -> Options:
+    """The options with what they hold of cameras, but for lenses, stated as closely as anything is."""
+    held = {name: (value,) for name, value in options.fixed.items() if name in ("phi", "cx", "cy") and value}
+    each = list[Prior]()
+    for name, size in observations.cameras.items():
+        middle = () if options.free_principal_point else tuple(0.5 * (side - 1.0) for side in size)
+        own = {**held, "principal_point": middle} if middle else held
+        each += [Prior("camera", name, one, value, (FINEST,) * len(value)) for one, value in own.items()]
+    if not each:
+        return options
+    fixed = {name: value for name, value in options.fixed.items() if name not in held}
+    return replace(options, fixed=fixed, free_principal_point=True, priors=(*options.priors, *each))
+
+
+def loosely(observations: Observations, options: Options) -> tuple[Observations, Options]:
+    """Both with what is stated of cameras and stations known so vaguely that nothing takes up what is wrong with it."""
+    every, options_too = (tuple(map(_vague, one.priors)) for one in (observations, options))
+    of_views = observations if every == observations.priors else replace(observations, priors=every)
+    return of_views, options if options_too == options.priors else replace(options, priors=options_too)
+
+
+def _vague(prior: Prior) -> Prior:
+    least = VAGUE * max(map(abs, prior.value))
+    if prior.owner == "target" or prior.quantity not in _VAGUE_QUANTITIES or min(prior.sigma) >= least:
+        return prior
+    return replace(prior, sigma=tuple(max(sigma, least) for sigma in prior.sigma), gives_way=True)
+
+
 def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
     """A prior that somebody stated, number by number.
 
@@ -212,7 +245,7 @@ def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
     every = intrinsic_keys(prior.name, lens) if prior.owner == "camera" else pose_keys("station", prior.name)
     keys = {key.quantity: key for key in every}
     sigmas = {keys[quantity]: sigma for quantity, sigma in zip(wanted, prior.sigma, strict=True)}
-    return GaussianPrior(Information.of_sigmas(sigmas), np.asarray(prior.value, dtype=float))
+    return GaussianPrior(Information.of_sigmas(sigmas), np.asarray(prior.value, dtype=float), {}, prior.gives_way)
 
 
 def usual_cameras(
@@ -236,7 +269,7 @@ def usual_cameras(
         if about:
             information = Information.of_sigmas({key: sigma for key, (_, sigma) in about.items()})
             logs = frozenset(key for key in about if key.quantity == "phi")
-            yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), {}, True, logs)
+            yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), {}, True, True, logs)
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:

@@ -252,7 +252,7 @@ PHI_RANGE = (0.15, 15.0)
 _REDRAWN = 20.0  # times a dimension as drawn, or the inverse: beyond it another target was drawn
 # Of the longest side of the target's bounding box. Paper that is held by hand bends by a fiftieth.
 _BUILT = 0.05
-_FINEST = 1e-6
+FINEST = 1e-6
 """m and px: a standard deviation below a micrometre, or a millionth of a pixel, was measured by nobody. A hundredth of
 it is solved for without loss; at a ten-thousandth the solve no longer converges."""
 
@@ -291,7 +291,8 @@ class Range(Frozen, eq=True):
     def _in_mm(self, value: float) -> str:
         """The likely cause: a length, or a focal length, in millimetres."""
         if self.unit == "m":
-            return "; is it in mm? Give metres" if self.holds(value / 1000.0) else "; give metres"
+            far = "; give metres" if abs(value) > self.most else ""
+            return "; is it in mm? Give metres" if self.holds(value / 1000.0) else far
         if self.unit == "px" and value < self.least:
             return "; is it in mm? Divide it by the size of a pixel"
         return ""
@@ -324,13 +325,13 @@ def _ranges(prior: Prior, observations: Observations, options: Options) -> Itera
     if prior.owner == "camera":
         yield from camera_ranges(prior.quantity, observations.cameras[prior.name], _named_lens(options, prior.name))
     elif prior.owner == "station":
-        yield from [_of_place(prior.name, observations)] * len(prior.value)
+        yield from _of_place(prior.name, observations)[-len(prior.value) :]
     elif prior.dimension:
         drawn_m = dimensions_of(observations.targets).get(prior.dimension, np.nan)
         if np.isfinite(drawn_m):  # another error names a dimension that is not there
             yield dimension_range(drawn_m)
     elif prior.curve:
-        yield Range(0.0, 0.0, "m", _FINEST, "an offset is about 0")
+        yield Range(0.0, 0.0, "m", FINEST, "an offset is about 0")
 
 
 def _named_lens(options: Options, camera: str) -> Lens | None:
@@ -347,7 +348,7 @@ def camera_ranges(quantity: str, image_size: tuple[int, int], lens: Lens | None)
 def dimension_range(drawn_m: float) -> Range:
     """Of a dimension of a target, by how it is drawn."""
     why = f"the target is drawn with {drawn_m:g} m"
-    return Range(drawn_m / _REDRAWN, drawn_m * _REDRAWN, "m", _FINEST, why)
+    return Range(drawn_m / _REDRAWN, drawn_m * _REDRAWN, "m", FINEST, why)
 
 
 def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Range:
@@ -365,10 +366,10 @@ def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Ran
     half = 0.5 * float(np.hypot(*size))
     image = f"the image is {image_size[0]} x {image_size[1]} px"
     if name == "phi":
-        return Range(phi[0] * half, phi[1] * half, "px", _FINEST, f"the focal length in pixels, where {image}")
+        return Range(phi[0] * half, phi[1] * half, "px", FINEST, f"the focal length in pixels, where {image}")
     if name in ("cx", "cy"):
         middle, reach = 0.5 * (size[int(name == "cy")] - 1.0), off_centre * 2.0 * half
-        return Range(middle - reach, middle + reach, "px", _FINEST, image)
+        return Range(middle - reach, middle + reach, "px", FINEST, image)
     if name == "aspect":
         return Range(*aspect, "", finest_ratio, "it is fy / fx, near 1")
     if name == "skew":
@@ -377,32 +378,50 @@ def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Ran
     return Range(-coefficient / scale, coefficient / scale, "", finest_ratio / scale, "more bends no image")
 
 
-def _of_place(station: str, observations: Observations) -> Range:
-    """Of a coordinate of a station's position: from farther away no lens would show what was observed as large.
+def _of_place(station: str, observations: Observations) -> tuple[Range, Range, Range]:
+    """Of a station's position: from farther away no lens would show what was observed as large.
 
     Points at most L apart, seen from d, lie at most phi L / d apart in the image.
     """
-    spread_px, places = 0.0, [np.empty((0, 3))]
+    spread_px, places, floors = 0.0, [np.empty((0, 3))], [np.empty((0, 3))]
     for number, view in enumerate(observations.views):
         if view.station != station or view.placement is not None:
             continue
         places.append(observations.targets[view.target].places)
+        floors += [] if observations.targets[view.target].movable else places[-1:]
         for ends, column in zip(observations.ends, (observations.points, observations.curves), strict=True):
             pixels = column.pixels[ends[number] : ends[number + 1]]
             if len(pixels):
                 spread_px = max(spread_px, float(np.hypot(*(pixels.max(axis=0) - pixels.min(axis=0)))))
     seen = np.concatenate(places)
     if not len(seen) or spread_px == 0.0:  # boards alone, whose world is wherever one likes
-        return Range(-np.inf, np.inf, "m", _FINEST, "")
+        return (Range(-np.inf, np.inf, "m", FINEST, ""),) * 3
     diagonal_px = float(np.hypot(*observations.cameras[observations.stations[station]]))
-    return place_range(seen, spread_px / diagonal_px, f"{spread_px:.0f} px")
+    return place_ranges(seen, spread_px / diagonal_px, f"{spread_px:.0f} px", floor_of(np.concatenate(floors)))
 
 
-def place_range(seen: Array, spread: float, said: str) -> Range:
-    """Of a coordinate of a station that sees places (P, 3) m over so much of its image's diagonal; `said` in words."""
+def floor_of(places: Array) -> float | None:
+    """Height of the lowest place, where they lie about level; None where they stand upright, or on a line."""
+    if len(places) < 3:
+        return None
+    _, sizes, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
+    level = abs(axes[2, 2]) > np.sqrt(0.5) and sizes[1] > 1e-6 * sizes[0]
+    return float(places[:, 2].min()) if level else None
+
+
+def place_ranges(seen: Array, spread: float, said: str, floor_m: float | None) -> tuple[Range, Range, Range]:
+    """Of x, y and height of a station that sees places (P, 3) m over so much of its image's diagonal; `said` in words.
+
+    Args:
+        floor_m: height of a floor among them, which is seen from above.
+    """
     size_m = 2.0 * float(np.linalg.norm(seen.max(axis=0) - seen.min(axis=0)))  # of arcs half is among the places
     most_m = 0.5 * PHI_RANGE[1] * size_m / spread + float(np.max(np.linalg.norm(seen, axis=1)))
-    return Range(-most_m, most_m, "m", _FINEST, f"no lens shows its target {said} large from farther away")
+    place = Range(-most_m, most_m, "m", FINEST, f"no lens shows its target {said} large from farther away")
+    if floor_m is None:
+        return place, place, place
+    why = f"the camera sees its floor from above, where z points, and {place.why}"
+    return place, place, replace(place, least=min(floor_m, 0.0) + FINEST, why=why)
 
 
 def _require_tolerance(tolerance: Tolerance, target: str, observations: Observations) -> None:

@@ -22,7 +22,6 @@ from ceres_cal.effects.aside import DOUBTFUL, Explanation, FeatureGroups, Observ
 from ceres_cal.observations.sights import column_of, shown_rows, some_views, thinned_by_key
 from ceres_cal.problem import Problem, with_placements_at_best
 from ceres_cal.problem.residuals import residuals, write_equations
-from ceres_cal.robust.conflicts import without_suspicious
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_fits
 
@@ -75,15 +74,13 @@ def compete(problem: Problem, end: RobustSolution, solver: Solver) -> tuple[Robu
     every = Subproblem(problem, end, list(aside.groups_of(problem.sights)))
     if not every.kinds:
         return end, ()
-    part = compared_part(every)
-    some = _freed(part, solver)
+    some = compared_part(every)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
     taking_part = np.ones(problem.observations.rows, dtype=bool)
     for trial in trials:
         groups = every.kinds[some.kinds.index(trial.suspects[0])]
         own = [groups.among([number]) & taking_part for number in trial.suspects[1]]
-        found = trial.explanations if some is part else [_as_stated(one, part, solver) for one in trial.explanations]
-        explanations += [replace(one, rows=rows) for one, rows in zip(found, own, strict=True)]
+        explanations += [replace(one, rows=rows) for one, rows in zip(trial.explanations, own, strict=True)]
         if trial.log_odds >= 0.0:
             taking_part &= ~np.any(own, axis=0)
             end = trial.end
@@ -91,29 +88,6 @@ def compete(problem: Problem, end: RobustSolution, solver: Solver) -> tuple[Robu
         end = end if some is every else solver(every.without(~taking_part), every)
         end = replace(end, residuals=residuals(problem.sights, end.estimate))
     return end, tuple(explanations)
-
-
-def _freed(every: Subproblem, solver: Solver) -> Subproblem:
-    """Without the statements that look wrong: a line is not blamed for what they bend."""
-    freed = without_suspicious(every.problem, every.end)
-    # Where that fails they are competed with as stated; what contradicts them is tested afterwards.
-    end = None if freed is every.problem else _solved(freed, every, solver)
-    return every if end is None else replace(every, problem=freed, end=end)
-
-
-def _as_stated(one: Explanation, part: Subproblem, solver: Solver) -> Explanation:
-    """With the other estimate under all that is stated: what moves without that is no doubt about a group."""
-    if not one.is_doubtful:
-        return one
-    # Where that fails the doubt stays as large as it was.
-    other = part.end if one.is_taken else _solved(part.without(one.rows), part, solver)
-    return one if other is None else replace(one, other=other.estimate)
-
-
-@or_none  # quiet: whoever asks goes on without it
-def _solved(problem: Problem, part: Subproblem, solver: Solver) -> RobustSolution | None:
-    end = solver(problem, part)
-    return None if end.solution.failed else end
 
 
 _Suspects = tuple[ObservationGroups, tuple[int, ...]]

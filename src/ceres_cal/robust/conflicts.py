@@ -13,17 +13,25 @@ slope of the cost along it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
 from ceres_cal.base import Array, CalibrationError, Frozen, attempt, log_f_tail, numerical, or_none, replace
 from ceres_cal.effects.dependence import measure_scatter, scattered
 from ceres_cal.effects.effect import ShiftsAt
-from ceres_cal.effects.evidence import FEATURE_ASIDE
-from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Problem, over, solve
+from ceres_cal.problem import (
+    Estimate,
+    GaussianPrior,
+    Information,
+    Key,
+    Problem,
+    intrinsics_vector,
+    over,
+    solve,
+    with_intrinsics,
+)
 from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
 from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
@@ -37,7 +45,9 @@ from ceres_cal.robust.stated import (
     contradicting,
     doubted,
     grouped,
+    likely_wrong,
     statements,
+    together,
 )
 
 LARGEST_FREEDOM = 1e6
@@ -54,8 +64,12 @@ class Rest(Frozen):
     freedom: float
 
 
-def linear_rest(statement: Statement, end: RobustSolution) -> Rest:
-    """By the linear picture where the problem with the statement was solved."""
+def linear_rest(statement: Statement, end: RobustSolution, near: RobustSolution | None = None) -> Rest:
+    """By the linear picture where the problem with the statement was solved.
+
+    Args:
+        near: where everything that is stated said little, if that was solved: less noise than there is none.
+    """
     estimate, freedom = end.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
         reduced = end.told
@@ -73,6 +87,9 @@ def linear_rest(statement: Statement, end: RobustSolution) -> Rest:
         step = rest.inverse @ slope
     # It swells the noise that the rest is measured by, as far as the linear picture goes.
     noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
+    if near is not None:
+        ratios = np.divide(near.problem.weighting.scales, end.problem.weighting.scales)
+        noise = max(noise, min(1.0, float(ratios.min()) ** 2))
     return Rest(estimate, step, Information(rest.keys, rest.matrix / noise), freedom)
 
 
@@ -240,30 +257,6 @@ def find_conflicts(
     return Conflicts(named, reduced.shared.keys, tuple(shifts), answer, tuple(search.doubts))
 
 
-def without_suspicious(problem: Problem, end: RobustSolution, probability: float = _SUSPICIOUS) -> Problem:
-    """The problem without what is stated of cameras and looks wrong where it was solved, by chance at most so often: it
-    may bend what is said of others. Tolerances stay: a line that its own one does not hold is a line aside.
-    """
-    estimate, suspicious = end.estimate, np.log(probability)
-    every = [one for one in statements(problem, estimate) if one.kind not in ("earlier", "tolerance")]
-    for one in every:
-        if worst_test(one, linear_rest(one, end)).log_p < suspicious:
-            problem = one.left_out(problem, estimate)
-    told, left = _together(every), _together(statements(problem, estimate))
-    if told and left and worst_test(left, linear_rest(told, end)).log_p < suspicious:
-        problem = left.left_out(problem, estimate)
-    return problem
-
-
-def _together(every: Iterable[Statement]) -> Statement | None:
-    """Priors of different numbers as one statement, for wrong ones may confirm one another: a phi and a height that are
-    both a fifth too large, heights that are all in feet. None where there are no two.
-    """
-    parts = [one for one in every if one.kind == "prior"]
-    keys, priors = (tuple(chain.from_iterable(getattr(one, of) for one in parts)) for of in ("keys", "priors"))
-    return Statement("prior", keys, priors, np.empty(0)) if len(parts) > 1 else None
-
-
 def contradicted_by(
     priors: Sequence[GaussianPrior], estimate: Estimate, posterior: Information, degrees_of_freedom: float
 ) -> str | None:
@@ -286,13 +279,6 @@ def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
     covariance = reduced.shared.inverse
     column = reduced.shared.columns([key])[0]
     return np.asarray(covariance[:, column] / covariance[column, column] * offset)
-
-
-def _wrong(squared: float) -> float:
-    """Probability that a statement so far off is wrong, which one in twenty is: as of a line that lies aside."""
-    scatter = 1.0 + FEATURE_ASIDE.scatter**2
-    right, *others = FEATURE_ASIDE.probabilities * np.exp(0.5 * squared * (1.0 - 1.0 / scatter)) / np.sqrt(scatter)
-    return float(np.sum(others) / (right + np.sum(others)))
 
 
 @or_none  # quiet: the linear test decides, and the answer stays
@@ -322,6 +308,8 @@ class _ForwardSelection:
 
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
+        if self.near is not None:
+            self.near = replace(self.near, reduced=self.near.told)
         self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
         self.doubts: list[Doubt] = []
         self._level = float(np.log(LEVEL / len(self.every)))
@@ -335,7 +323,7 @@ class _ForwardSelection:
         # were above 0.028.
         worth_a_solve = 0.2
         doubtful = 0.05  # probability that a statement is wrong, from which on both explanations are named
-        tests = [worst_test(one, linear_rest(one, self.end)) for one in self.left]
+        tests = [self._linear_test(one) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
         if number < 0 or tests[number].log_p > np.log(worth_a_solve):
             return False
@@ -344,11 +332,11 @@ class _ForwardSelection:
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.estimate)
-        after = None if suspect.kind == "earlier" else _solved(freed, self.near or self.end, self.usual)
+        after = None if suspect.kind == "earlier" else _solved(freed, self._start_of(freed), self.usual)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
-            likely = _wrong(test.squared)
+            likely = likely_wrong(test.squared)
             if after is not None and suspect.kind == "prior" and likely > doubtful:
                 shift = difference(after.estimate, self.end.estimate, self._first.shared.keys)
                 words = doubted(suspect, test, len(self.every) == 1, likely)
@@ -362,21 +350,44 @@ class _ForwardSelection:
             self.problem, self.end = freed, after
         return True
 
+    def _start_of(self, freed: Problem) -> RobustSolution:
+        """Where little was stated, with what is held still."""
+        if self.near is None:
+            return self.end
+        cameras, there = dict(self.near.estimate.cameras), self.end.estimate.cameras
+        for name, free in freed.layout.free.items():
+            values, near = intrinsics_vector(there[name]), intrinsics_vector(cameras[name])
+            values[free] = near[free]
+            cameras[name] = with_intrinsics(cameras[name], values)
+        return self.near.moved_to(replace(self.near.estimate, cameras=cameras), freed)
+
+    def _linear_test(self, one: Statement) -> WaldTest:
+        """By the linear picture under everything that is stated, or where it said little: a lens without a formula, as
+        rough as it becomes under a wrong phi, says nothing against it.
+        """
+        near = self.near
+        test = worst_test(one, linear_rest(one, self.end, near))
+        if near is None or one.kind not in ("prior", "fixed") or not {*one.keys} <= {*near.told.shared.keys}:
+            return test
+        said = near.problem.priors_at(near.estimate)
+        loose = replace(one, priors=tuple(prior for prior in said if {*one.keys} & {*prior.keys}))
+        return min(test, worst_test(one, linear_rest(loose, near)), key=lambda test: test.log_p)
+
     def leave_out_together(self) -> None:
         """Judge all that is left of what was stated by what is solved for without any of it."""
         out = [one for one, *_ in self.out]
         parts = [one for one in self.every if one.kind == "prior" and one not in out]
-        together = _together(parts)
-        if together is None or worst_test(together, linear_rest(together, self.end)).log_p > np.log(_SUSPICIOUS):
+        every = together(parts)
+        if every is None or worst_test(every, linear_rest(every, self.end)).log_p > np.log(_SUSPICIOUS):
             return
-        freed = together.left_out(self.problem, self.end.estimate)
-        after = _solved(freed, self.near or self.end, self.usual)
+        freed = every.left_out(self.problem, self.end.estimate)
+        after = _solved(freed, self._start_of(freed), self.usual)
         if after is None:
             return
         rise = self._rise(after)
-        if rise is None or log_probability(rise, rest_at(together, after)) > self._level:
+        if rise is None or log_probability(rise, rest_at(every, after)) > self._level:
             return
-        rest = rest_at(together, after, self._known(after))
+        rest = rest_at(every, after, self._known(after))
         tests = [(one, worst_test(one, rest)) for one in parts]
         wrong = [(one, test, ()) for one, test in tests if test.log_p <= self._level]
         if wrong:
@@ -413,7 +424,7 @@ class _ForwardSelection:
         known = scattered(reduced, measure_scatter(end.problem, end.residuals, estimate, reduced))
         if self.shifts_at is None:
             return known
-        keys, shifts = self.shifts_at(estimate, end.problem.priors)
+        keys, shifts = self.shifts_at(estimate, end.problem)
         return known.widened(over(np.array(shifts), keys, known.keys)) if len(shifts) else known
 
     def _confirmed(self, statement: Statement, after: RobustSolution) -> WaldTest:

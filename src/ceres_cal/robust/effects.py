@@ -18,7 +18,7 @@ from ceres_cal.effects import FLOOR_OFF, LIKELY, RepeatedAmounts, make_linear_mo
 from ceres_cal.effects.columns import EffectColumns, ScoreTest, SparseColumns
 from ceres_cal.effects.effect import Case, Effect, EffectEstimate, ShiftsAt
 from ceres_cal.effects.table import estimated
-from ceres_cal.problem import Estimate, GaussianPrior, Key, Problem, free_keys, write_equations
+from ceres_cal.problem import Estimate, Key, Problem, free_keys, write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
 _FEWEST_SIGHTS = 3  # that tell an effect from a lens that leaves something
@@ -64,13 +64,13 @@ def solve_beside_effects(problem: Problem, part: Problem, end: RobustSolution, *
             break
     last, solved = end, end.estimate
 
-    def shifts_at(there: Estimate, priors: Sequence[GaussianPrior] | None) -> tuple[Sequence[Key], Sequence[Array]]:
-        # Along a valley, and without what was stated, numbers go together differently.
-        own = amounts
-        if there is not solved or priors is not None:
-            under = displaced if priors is None else replace(displaced, priors=tuple(priors))
+    def shifts_at(there: Estimate, other: Problem | None) -> tuple[Sequence[Key], Sequence[Array]]:
+        # Along a valley, and where something else is stated, numbers go together differently.
+        own, under = amounts, displaced
+        if there is not solved or other is not None:
+            under = displaced if other is None else replace(displaced, priors=other.priors, layout=other.layout)
             own = amounts_at(under, last.moved_to(there, under))
-        return free_keys(there, part.layout, part.private), list(own.shifts())
+        return free_keys(there, under.layout, part.private), list(own.shifts())
 
     if np.any(off):
         problem = replace(problem, sights=problem.sights.displaced(-off[:points], -off[points:]))

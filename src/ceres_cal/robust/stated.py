@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, is_diagonal, log_chi2_tail, replace, two_digits
+from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Options, Problem, intrinsic_keys, values_of
 
 LEVEL = 1e-3
@@ -114,7 +115,7 @@ def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
     groups: list[Statement] = []
     nothing = np.empty(0)
     for prior in (one for one in priors if one.keys):
-        if prior.is_usual:  # which gives way by itself
+        if prior.gives_way:
             continue
         if not is_plain(prior):
             yield Statement("earlier", prior.keys, (prior,), nothing)
@@ -127,6 +128,15 @@ def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
             keys = tuple(dict.fromkeys(key for one in together for key in one.keys))
             groups.append(Statement("prior", keys, together, nothing))
     yield from groups
+
+
+def together(every: Iterable[Statement]) -> Statement | None:
+    """Priors of different numbers as one statement, for wrong ones may confirm one another: a phi and a height that are
+    both a fifth too large, heights that are all in feet. None where there are no two.
+    """
+    parts = [one for one in every if one.kind == "prior"]
+    keys, priors = (tuple(chain.from_iterable(getattr(one, of) for one in parts)) for of in ("keys", "priors"))
+    return Statement("prior", keys, priors, np.empty(0)) if len(parts) > 1 else None
 
 
 def agreed(priors: Sequence[GaussianPrior], conflicts: Sequence[Conflict]) -> tuple[GaussianPrior, ...]:
@@ -173,6 +183,13 @@ def number_text(value: float, sd: float, key: Key) -> str:
     places = len(spread.partition(".")[2])
     text = f"{value:.4g}" if "e" in spread else f"{value:.{places}f}"
     return f"{text} ± {spread}{unit}"
+
+
+def likely_wrong(squared: float) -> float:
+    """Probability that a statement so far off is wrong, which one in twenty is: as of a line that lies aside."""
+    scatter = 1.0 + FEATURE_ASIDE.scatter**2
+    right, *others = FEATURE_ASIDE.probabilities * np.exp(0.5 * squared * (1.0 - 1.0 / scatter)) / np.sqrt(scatter)
+    return float(np.sum(others) / (right + np.sum(others)))
 
 
 def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequence[str]) -> Conflict:

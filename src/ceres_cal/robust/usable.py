@@ -15,7 +15,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Mask, SolutionError, distinct
 from ceres_cal.observations import Observations, Sights
-from ceres_cal.problem import Estimate, Problem, Residuals
+from ceres_cal.problem import Estimate, Problem, Residuals, floor_of
 from ceres_cal.robust.noise import Inliers
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
@@ -59,7 +59,7 @@ def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -
     """
     for station, sight in sights.of_world.items():
         camera = estimate.camera_at(station)
-        floor_m = _floor_m(_places_of_world(sight))
+        floor_m = floor_of(_places_of_world(sight))
         if floor_m is not None and camera.position[2] <= min(floor_m, 0.0):
             raise SolutionError(
                 f"station {station!r}: the camera stands {floor_m - camera.position[2]:.2f} m under the floor that it "
@@ -103,15 +103,6 @@ def _places_of_world(sight: Sights) -> Array:
     points = sight.points[world[observations.points.view[sight.point_rows]]]
     tracks = sight.tracks[distinct(sight.track_index[world[observations.curves.view[sight.curve_rows]]])]
     return np.concatenate([points, *(tracks[:, 0] + along for along in (0.0, tracks[:, 1], tracks[:, 2]))])
-
-
-def _floor_m(places: Array) -> float | None:
-    """Height of the lowest place, where they lie about level; None where they stand upright, or on a line."""
-    if len(places) < 3:
-        return None
-    _, sizes, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
-    level = abs(axes[2, 2]) > np.sqrt(0.5) and sizes[1] > 1e-6 * sizes[0]
-    return float(places[:, 2].min()) if level else None
 
 
 def _cause(camera: Camera) -> str:

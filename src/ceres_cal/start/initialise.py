@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Pose, attempt, field, median, numerical, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, Indices, Pose, attempt, field, median, numerical, replace
 from ceres_cal.observations import Prior, SightKey, Sights
 from ceres_cal.problem import ANY_PHI, PHI_RANGE, Estimate, Options, Station, unit_px
 from ceres_cal.scene.camera import Camera
@@ -137,8 +137,12 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
         blank = _blank_camera(name, image_size, given, priors)
         own = sights.numbers(camera=name)
         seen = sights.take(own).about(blank)
+        # What is stated may be wrong: it is asked where the views do not tell phi, or not where the camera stands.
+        posed_by = partial(_start_camera, name, blank, seen, given, may_search=may_search)
+        one = attempt(partial(posed_by, ()))  # quiet: it is tried with what is stated, or fails so, too
         own_priors = [p for p in priors if _concerns(p, name, seen)]
-        one = _start_camera(name, blank, seen, given, own_priors, may_search=may_search)
+        if isinstance(one, CalibrationError) or (own_priors and one.phi_from[name] == "guess"):
+            one = posed_by(own_priors)
         places, there = ({int(own[n]): value for n, value in part.items()} for part in (one.places, one.open))
         parts.append(replace(one, numbers=own[one.numbers], places=places, open=there))
     return PosedSights(
