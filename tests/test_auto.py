@@ -14,6 +14,7 @@ from rendering.photography import taken_as
 from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -319,6 +320,14 @@ def test_corners_are_not_extrapolated_along_a_lens_that_folds() -> None:
     assert not seen.folds
     corner = FIELD.points["TopRightCorner"]
     assert np.max(np.abs(seen.project([corner]) - shot.camera.project([corner]))) < 0.3  # 0.15 px; 0.6 with Brown's
+
+
+def test_lines_are_measured_again_only_where_a_camera_has_them_elsewhere(shot: script.Shot) -> None:
+    tracker = Tracker(light(shot.picture.image), FIELD, NAMES, FreeIntrinsics())
+    lines = tracker.measured(shot.camera)
+    near, elsewhere = (replace(shot.camera, phi=times * shot.camera.phi) for times in (1.0 + 1e-5, 1.001))
+    assert tracker.measured(near) is lines
+    assert tracker.measured(elsewhere) is not lines
 
 
 def test_strokes_of_striped_floors_are_not_alone() -> None:

@@ -23,6 +23,8 @@ from ceres_cal.calibration.lens_forms import AS_GOOD_BESIDE_LENGTHS, PAPER, deci
 from ceres_cal.cli import main
 from ceres_cal.cli.arguments import parse_estimates
 from ceres_cal.detect.photographs.candidates import Auto, candidates, prepare_search
+from ceres_cal.detect.photographs.follow import Tracker
+from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refits import refit
@@ -185,7 +187,7 @@ def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
     assert min(np.linalg.norm(away, axis=1)) < 0.3
 
 
-def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     path, observed, out = (str(tmp_path / name) for name in ("odd.png", "field.json", "calibration.json"))
     cv2.imwrite(path, picture())
     target, camera = ssl_field("B", **TRUE), scene().camera_at("s")
@@ -193,7 +195,15 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     clicked = np.round(camera.project(np.array([target.points[name] for name in names]))).astype(int)
     corners = [word for name, (x, y) in zip(names, clicked, strict=True) for word in ("--corner", f"{name}={x},{y}")]
     asked = ["detect", "field", path, "--target", "ssl-b", *corners, "-o", observed]
+    refined, seen = Tracker.refined, list[Followed]()
+
+    def counted(tracker: Tracker, followed: Followed) -> Followed:
+        seen.append(followed)
+        return refined(tracker, followed)
+
+    monkeypatch.setattr(Tracker, "refined", counted)
     assert main([*asked, "--picture", str(tmp_path / "refused.png")]) == 2
+    assert len(seen) == 1  # other dimensions suit square pixels: no picture that is stretched is looked for
     error = capsys.readouterr().err
     assert re.search(r"the field (length|width) is [78]\.\d % smaller than the target says", error)
     assert "--estimate" in error  # says what would help

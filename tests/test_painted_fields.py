@@ -16,8 +16,7 @@ from ceres_cal import InputError, Observations, calibrate, painted_field, ssl_fi
 from ceres_cal.base.frozen import replace
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import predict
-from ceres_cal.detect.photographs.follow import best_fit
-from ceres_cal.detect.photographs.refit import observations_of
+from ceres_cal.detect.photographs.refit import best_fit, observations_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Segment, curve_points, distance_to_curve
 from ceres_cal.scene.lens import Brown

@@ -113,7 +113,8 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
     where it stands, but for how what is known of it bends.
 
     Args:
-        knows: whether it is asked what is then known of its numbers: else phi may be anywhere along its valley.
+        knows: whether it is asked which curves do not belong, and what is then known of its numbers: else phi may be
+            anywhere along its valley, and outliers are single places.
 
     Raises:
         CalibrationError: see `calibrate`.

@@ -57,9 +57,9 @@ class Task(Frozen):
     Attributes:
         progress: called at every iteration. settle: where the observations are a part, what solves for all of them
             from the end of the part, see `Bulk.settled`.
-        tested: whether what was stated is held against everything else. knows: whether it is then asked what is known
-            of the numbers; bends: and how that bends. chosen: whether the data chose the lens: what one that is too
-            simple leaves looks like a principal point that moves.
+        tested: whether what was stated is held against everything else. knows: whether it is asked what does not belong
+            as a whole, and then what is known of the numbers; bends: and how that bends. chosen: whether the data chose
+            the lens: what one that is too simple leaves looks like a principal point that moves.
         before: of a calibration that is taken up again, the layout of everything that is known by a posterior, also
             where the solve holds it. scales: noise scales of points and curves that were seen before it.
     """
@@ -309,7 +309,7 @@ def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
         return solve_robustly(others, _start_of(others, some, first), task.scales)
 
-    end, explanations = compete(first.problem, first.end, solved)
+    end, explanations = compete(first.problem, first.end, solved) if task.knows else (first.end, ())
     seen = Explained(task, replace(first.problem, sights=drawn), first.start, end, explanations)
     if task.before is None:
         seen = _of_targets(seen, solved, built)

@@ -16,10 +16,9 @@ from ceres_cal.effects import Explanation, Scatter, ShiftsAt
 from ceres_cal.posterior.bent import Node, ends_of, profile, valley
 from ceres_cal.posterior.mixture import Mixture
 from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
-from ceres_cal.problem import PHI_RANGE, Estimate, Information, Problem, Solution, difference, moved, over, unit_px
+from ceres_cal.problem import Estimate, Information, Problem, Solution, difference, is_lens, moved, over, unit_px
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.robust import Conflicts, RobustSolution, minima_of
-from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 if TYPE_CHECKING:
@@ -74,11 +73,11 @@ def assess(
     astray = problem  # with phi held of the cameras that went astray, while others are looked at
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         camera = estimate.cameras[name]
-        if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
+        if is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
         nodes = valleys[name] = valley(name, astray, estimate, _inflation(posterior, name), width)
         rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
-        if not _is_lens(camera) or rise < width**2:
+        if not is_lens(camera) or rise < width**2:
             estimate = _usual(name, nodes)
             astray = astray.holding(name, 0)
     if astray is not problem:
@@ -158,11 +157,6 @@ def _scattered(
         return posterior.wider(across, lambda seen: Information(keys, seen.matrix / factor).widened(own))
 
     return replace(along, information=tuple(map(wider, along.information, every)))
-
-
-def _is_lens(camera: Camera) -> bool:
-    unit = unit_px(camera)
-    return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
 
 
 def _usual(name: str, nodes: Sequence[Node]) -> Estimate:

@@ -249,6 +249,13 @@ def difference(estimate: Estimate, reference: Estimate, keys: Sequence[Key]) -> 
 
 PHI_RANGE = (0.15, 15.0)
 """In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
+
+
+def is_lens(camera: Camera) -> bool:
+    """Whether its phi is one that a lens over a field has."""
+    return PHI_RANGE[0] <= camera.phi / parameters.unit_px(camera) <= PHI_RANGE[1]
+
+
 _REDRAWN = 20.0  # times a dimension as drawn, or the inverse: beyond it another target was drawn
 # Of the longest side of the target's bounding box. Paper that is held by hand bends by a fiftieth.
 _BUILT = 0.05

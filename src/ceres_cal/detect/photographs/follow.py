@@ -4,29 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice, product
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array32
-from ceres_cal.base.errors import attempt
 from ceres_cal.base.frozen import replace
-from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.calibrating import calibrate_near
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.beside import among_others
 from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.painted import painted_curves, visible_curves
-from ceres_cal.detect.photographs.refit import TARGET, FreeIntrinsics, misfit, moved_px, observations_of, refit_camera
+from ceres_cal.detect.photographs.refit import (
+    TARGET,
+    FreeIntrinsics,
+    best_fit,
+    misfit,
+    moved_px,
+    observations_of,
+    redrawn_px,
+    refit_camera,
+    squared_pixels,
+)
 from ceres_cal.detect.registration import nearness, shifted
-from ceres_cal.observations import Observations, Prior
-from ceres_cal.problem.parameters import Options, intrinsic_names
+from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target, target_from_spec
 
 FAR_PX = 130.0  # how far off the start may be
@@ -45,7 +50,7 @@ _MOST_OTHERS = 3  # ways to see the field that are tried where the best looks li
 _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
-_AT_REST_PX, _NEARLY_PX = 0.02, 0.3  # the second where it is only asked whether this is the field
+_AT_REST_PX = 0.1  # lines that are predicted so little elsewhere are not measured again: they are found up to 5 px off
 _SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
 
 Made = TypeVar("Made")
@@ -86,8 +91,7 @@ class Tracker:
 
     Attributes:
         missing: curves that the target may lack, and this field does. reached: what starts led to so far.
-        known: what was made of a camera before. rest_px: by which nothing moves any more. is_even: whether the picture
-            is known to have no coma.
+        known: what was made of a camera before. is_even: whether the picture is known to have no coma.
     """
 
     grey: Array32
@@ -97,14 +101,13 @@ class Tracker:
     missing: tuple[str, ...] = ()
     reached: list[Followed] = field(default_factory=list)
     known: list[tuple[Camera, tuple[object, ...], Any]] = field(default_factory=list)
-    rest_px: float = _AT_REST_PX
     is_even: bool = False
 
     def approached(self, camera: Camera) -> Followed:
         """`follow` from one start, up to where the lens remains that it started from. What others led to, and leads to
         again, is not followed to its end.
         """
-        return next(replace(self, rest_px=_NEARLY_PX).tried([camera]))
+        return next(self.tried([camera]))
 
     def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> Followed:
         """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside, as
@@ -204,11 +207,17 @@ class Tracker:
         """Measured and refitted, with these intrinsics free, until nothing moves any more, or no less than before."""
         return self._once(camera, (names,), lambda: self._at_rest(camera, names))
 
-    def _once(self, camera: Camera, what: tuple[object, ...], made: Callable[[], Made]) -> Made:
-        """What is made from a camera, of these lines: the same ones are asked for time and again."""
+    def _once(
+        self,
+        camera: Camera,
+        what: tuple[object, ...],
+        made: Callable[[], Made],
+        is_same: Callable[[Camera, Made], bool] = lambda start, came: False,
+    ) -> Made:
+        """What is made from a camera, or one that is the same, of these lines: they are asked for time and again."""
         asked = *what, tuple(self.curves), self.target.spec
         for start, before, came in self.known:
-            if start is camera and before == asked:
+            if before == asked and (start is camera or is_same(start, came)):
                 return cast(Made, came)
         came = made()
         self.known.append((camera, asked, came))
@@ -226,7 +235,7 @@ class Tracker:
             last, before, (tracker, there) = moved, there, refitted
             moved = moved_px(before, there, lines.course.pixels)
             lines = tracker.measured(there, is_even=lines.is_even)
-            if moved < self.rest_px or moved > no_nearer * last:
+            if moved < _AT_REST_PX or moved > no_nearer * last:
                 break
         return tracker.followed(there, lines)
 
@@ -235,11 +244,11 @@ class Tracker:
         whole = self._with(followed)
         followed = whole.without_aside(followed)
         if followed.built.is_other:  # as by a lens that does not suit: a polynomial bends a strong one's lines
-            followed = whole.without_aside(whole.with_best_lens(followed))
-        if followed.built.is_other:
-            followed = self.as_drawn(followed)
-        if followed.built.is_other:
-            return followed
+            other = whole.without_aside(whole.with_best_lens(followed))
+            other = self.as_drawn(other) if other.built.is_other else other
+            if other.built.is_other:  # the lens that its lines suit better with those dimensions says which they are
+                return min(followed, other, key=whole._misfit_as_built)
+            followed = other
         curves = [name for name in whole.curves if name not in followed.built.aside_m]
         left = replace(whole, curves=curves, target=followed.target)
         there = whole.without_aside(left.with_best_lens(followed))
@@ -267,19 +276,23 @@ class Tracker:
         """
         square = self.squared(followed)
         even = self.refined(square)
-        if even.is_field and not self._suits_worse(square, followed):
+        built, nearest = self._with(square).as_built(square)
+        is_told = even.is_field or bool(built.dimensions and not built.aside_m)
+        if is_told and not self._suits_worse(nearest, followed):
             return even
         stretched = self.refined(followed)
-        if not stretched.is_field:
-            return even
-        built, nearest = self._with(square).as_built(square)
-        is_another = even.is_field or (built.dimensions and not built.aside_m)
-        return even if is_another and not self._suits_worse(nearest, stretched) else stretched
+        return even if not stretched.is_field or (is_told and not self._suits_worse(nearest, stretched)) else stretched
 
     def _suits_worse(self, one: Followed, other: Followed) -> bool:
         """Whether less paint is found where one has the lines than where another has them, or it lies off that."""
-        one_px, other_px = (misfit(it.camera, self._with(it)._observed(it.lines, it.camera)) for it in (one, other))
-        return one.share < _KEPT * other.share or one_px > _WORSE * other_px
+        return one.share < _KEPT * other.share or self._misfit(one) > _WORSE * self._misfit(other)
+
+    def _misfit(self, followed: Followed) -> float:
+        return misfit(followed.camera, self._with(followed)._observed(followed.lines, followed.camera))
+
+    def _misfit_as_built(self, followed: Followed) -> float:
+        """The same where its lines are followed to with the dimensions that they say."""
+        return self._misfit(self.as_built(followed)[1])
 
     def _with(self, followed: Followed) -> Tracker:
         """The same for curves, and a target as drawn, as they were followed."""
@@ -287,7 +300,7 @@ class Tracker:
 
     def squared(self, followed: Followed) -> Followed:
         """The same lines through a camera with square pixels."""
-        camera = _squared(followed.camera)
+        camera = squared_pixels(followed.camera)
         return self._with(followed).at_rest(camera, _free(camera))
 
     def without_aside(self, followed: Followed) -> Followed:
@@ -315,6 +328,9 @@ class Tracker:
         Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
         others; so they are looked for again, and measured, where those dimensions put them.
         """
+        return self._once(followed.camera, ("as built",), lambda: self._as_built(followed))
+
+    def _as_built(self, followed: Followed) -> tuple[FieldAsBuilt, Followed]:
         free, target = _free(followed.camera), self.target
         nearest = replace(followed, lines=self.measured(followed.camera))
         built = as_built(nearest.lines, nearest.camera, target, self.free.priors)
@@ -322,6 +338,8 @@ class Tracker:
             if not built.dimensions:
                 break
             there = replace(self, target=target_from_spec({**target.spec, **built.dimensions}, target.kind))
+            if redrawn_px(nearest.camera, nearest.lines.course, there.target) < _AT_REST_PX:
+                break
             nearer = there.at_rest(nearest.camera, free)
             if nearer.share < nearest.share - _LESS:
                 break
@@ -372,9 +390,14 @@ class Tracker:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
     def measured(self, camera: Camera, *, is_even: bool = False) -> Lines:
-        """The lines next to where a camera has them."""
+        """The lines next to where a camera has them, or another one of its kind has them that far from there."""
         is_even = is_even or self.is_even
-        return self._once(camera, ("lines", is_even), lambda: self._measured(camera, is_even))
+
+        def is_same(start: Camera, came: Lines) -> bool:
+            return bool(len(came.course)) and moved_px(start, camera, came.course.pixels) < _AT_REST_PX
+
+        what = "lines", camera.lens.kind
+        return self._once(camera, what, lambda: self._measured(camera, is_even), is_same)
 
     def _measured(self, camera: Camera, is_even: bool) -> Lines:
         course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
@@ -386,52 +409,6 @@ class Tracker:
         return observations_of(
             self.target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows]
         )
-
-
-def best_fit(
-    camera: Camera, observations: Observations, lengths: tuple[Prior, ...] = (), *, is_stretched: bool = False
-) -> Calibration | None:
-    """The calibration of one view with the kind of lens that suits it best, from a camera near by.
-
-    Pixels are square where this camera's are, or where they suit the view nearly as well and it is not stretched.
-    """
-    # Times the noise with other pixels: 1.00 to 1.07 where a court was drawn a millimetre off, 1.18 where a photograph
-    # of worn lines was stretched by 4 %, 7 where a clear one was by 7 %.
-    nearly = 1.12
-    fits = [] if is_stretched else _fits(_squared(camera), observations, lengths)
-    if camera.aspect != 1.0:
-        fits += [(nearly * off, found, own) for off, found, own in _fits(camera, observations, lengths)]
-    order = sorted(fits, key=lambda fit: (fit[1].station().folds, fit[0]))
-    asked = (  # of where phi may be only the one that is taken: that takes longer
-        # quiet: the next one is taken
-        one if one.posterior is not None else attempt(partial(calibrate_near, one.station(), observations, own))
-        for _, one, own in order
-    )
-    return next((one for one in asked if isinstance(one, Calibration)), None)
-
-
-def _fits(
-    near: Camera, observations: Observations, lengths: tuple[Prior, ...]
-) -> list[tuple[float, Calibration, Options]]:
-    """With each kind of lens: how far off the view is, in noise, and the calibration with its options."""
-    stretched, fits = near.aspect != 1.0, list[tuple[float, Calibration, Options]]()
-    for kind, lens in LENSES.items():
-        if lens.set_at_start:
-            continue  # a few lines do not tell a lens without a formula
-        powers = (lens.trial_powers or ((),))[-1]
-        own = Options(lens=kind, powers=powers, priors=lengths, as_built="as drawn", free_aspect=stretched)
-        # The first one comes to rest where phi is usual, should its valley be open, and the others start there.
-        # quiet: where none fits these lines, they are judged as found
-        found = attempt(partial(calibrate_near, near, observations, own, knows=not fits))
-        if isinstance(found, Calibration):
-            fits.append((found.fit.curve_scale * len(observations.curves) / found.fit.curves, found, own))
-            near = min(fits, key=lambda fit: fit[0])[1].station()
-    return fits
-
-
-def _squared(camera: Camera) -> Camera:
-    """The same with square pixels of the same size."""
-    return replace(camera, phi=camera.phi * camera.aspect**0.5, aspect=1.0)
 
 
 def _free(camera: Camera) -> tuple[str, ...]:

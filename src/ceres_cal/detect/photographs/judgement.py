@@ -10,7 +10,7 @@ from ceres_cal.detect.photographs.candidates import FieldSearch
 from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
 from ceres_cal.detect.photographs.matching import divergence
 from ceres_cal.detect.photographs.painted import BY_CHANCE
-from ceres_cal.problem.quantities import PHI_RANGE
+from ceres_cal.problem.quantities import is_lens
 from ceres_cal.scene import Arc, Target
 
 # Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
@@ -65,8 +65,7 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
         return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
-    phi = followed.camera.phi / search.stroke_map.unit_px
-    if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
+    if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not is_lens(followed.camera):
         return "its lines were not found in any view from above: start from corners"
     share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
     told, as_drawn = coincidence(search, followed), followed.built.names and not followed.built.dimensions
