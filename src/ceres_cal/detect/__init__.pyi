@@ -1,4 +1,3 @@
-from ceres_cal.detect import profiles as profiles
 from ceres_cal.detect.boards import BoardDetections as BoardDetections
 from ceres_cal.detect.boards import detect_boards as detect_boards
 from ceres_cal.detect.boards import finder_of as finder_of

@@ -7,9 +7,17 @@ from itertools import product
 import numpy as np
 
 from ceres_cal.base import Array, Indices, Rows, replace
-from ceres_cal.detect import profiles
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import LEAST_BLUR_PX, MOST_BLUR_PX, EdgeShape, Profiles, Windows, fit_shape
+from ceres_cal.detect.profiles import (
+    LEAST_BLUR_PX,
+    MOST_BLUR_PX,
+    MOST_SMEAR_PX,
+    EdgeShape,
+    Profiles,
+    Windows,
+    fit_profiles,
+    fit_shape,
+)
 
 _WINDOWS = 150  # that tell a blur
 # Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
@@ -43,7 +51,7 @@ class Blur(Rows):
     def fitted(self, windows: Windows, course: Course) -> Profiles:
         """What fits the windows of these places best."""
         reach_px, edges = 1.5, self.stretch * course.edges
-        return profiles.fit_profiles(windows, edges, self.blur_px, reach_px, self.smear_px, self.lean)
+        return fit_profiles(windows, edges, self.blur_px, reach_px, self.smear_px, self.lean)
 
     def smeared(self, rows: Indices) -> EdgeShape:
         """What these places look like if what is beyond a lens's blur is a smear."""
@@ -160,7 +168,7 @@ def _between(angle: Array, own: list[Indices], shapes: list[EdgeShape]) -> tuple
     normal = columns.T @ (count[:, None] * columns) + np.diag([0.0, _ALIKE, _ALIKE])
     terms = np.linalg.solve(normal, columns.T @ (count[:, None] * squares))
     across = np.clip(
-        terms[0] + _doubled(angle) @ terms[1:], (LEAST_BLUR_PX**2, 0.0), (MOST_BLUR_PX**2, profiles.MOST_SMEAR_PX**2)
+        terms[0] + _doubled(angle) @ terms[1:], (LEAST_BLUR_PX**2, 0.0), (MOST_BLUR_PX**2, MOST_SMEAR_PX**2)
     )
     return np.sqrt(across[:, 0]), np.sqrt(across[:, 1])
 

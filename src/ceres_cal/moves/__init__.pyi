@@ -1,5 +1,3 @@
-from ceres_cal.moves import agreement as agreement
-from ceres_cal.moves import explanations as explanations
 from ceres_cal.moves.agreement import Agreement as Agreement
 from ceres_cal.moves.agreement import Agreements as Agreements
 from ceres_cal.moves.agreement import require_posterior as require_posterior

@@ -16,8 +16,23 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, checked, numerical, or_none, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.effects.dependence import measure_scatter
-from ceres_cal.moves import agreement
-from ceres_cal.moves.agreement import NOISIER, Agreement, Agreements, Contrast, MapChange, Misfit, NormalDistribution
+from ceres_cal.moves.agreement import (
+    FALSE_ALARMS,
+    NOISIER,
+    Agreement,
+    Agreements,
+    Contrast,
+    MapChange,
+    Misfit,
+    NormalDistribution,
+    change_of,
+    contrast,
+    field_grids,
+    matched,
+    price_nats,
+    require_posterior,
+    require_stations,
+)
 from ceres_cal.moves.explanations import WORDS
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, moved_from, moved_words, pose_candidates
 from ceres_cal.moves.refit_plan import loosened
@@ -39,7 +54,7 @@ _USUAL_EQUATIONS = 4.0
 @checked
 @numerical("the check")
 def check(
-    calibration: Calibration, observations: Observations, false_alarms: float = agreement.FALSE_ALARMS, checks: int = 1
+    calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1
 ) -> Agreements:
     """Test whether a calibration still holds for new observations of its stations.
 
@@ -61,9 +76,9 @@ def check(
         raise InputError(f"false_alarms must be a probability between 0 and 1, not {false_alarms}")
     if checks < 1:
         raise InputError(f"checks must be 1 or more, not {checks}")
-    agreement.require_posterior(calibration)
-    observed = agreement.matched(calibration, observations)
-    agreement.require_stations(calibration, observed)
+    require_posterior(calibration)
+    observed = matched(calibration, observations)
+    require_stations(calibration, observed)
     sights = gather_sights(observed)
     world = sights.of_world
     for name in observed.stations:
@@ -204,7 +219,7 @@ def _cause(case: _CheckCase, used: Sights, posed: _Fit) -> tuple[str, Estimate]:
             fits[what] = len(freed), fit
     noise = _noise(used, min(fit[0] for _, fit in fits.values()), len(case.prior.keys))[0]
     count = len(used.point_rows) + len(used.curve_rows)
-    cost = {what: fit[0] / noise**2 + 2.0 * agreement.price_nats(let_go, count) for what, (let_go, fit) in fits.items()}
+    cost = {what: fit[0] / noise**2 + 2.0 * price_nats(let_go, count) for what, (let_go, fit) in fits.items()}
     what = min(cost, key=cost.__getitem__)
     return what, fits[what][1][1]
 
@@ -220,8 +235,8 @@ def _change(case: _CheckCase, cause: str | None, anew: Estimate) -> MapChange:
     key, posterior = case.sight.key, case.calibration.uncertainty.posterior
     let_go = loosened(cause or "", key.camera, case.estimate.cameras[key.camera].lens)
     shift_m, turn = moved_from(case.prior.without(let_go), posterior, case.name, anew)
-    grids = agreement.field_grids(case.calibration.targets)
-    change = agreement.change_of(case.estimate, case.name, anew.camera_at(case.name), grids)
+    grids = field_grids(case.calibration.targets)
+    change = change_of(case.estimate, case.name, anew.camera_at(case.name), grids)
     return replace(change, moved_mm=1e3 * shift_m, turned_deg=math.degrees(turn))
 
 
@@ -247,7 +262,7 @@ def _apart(
         *replace(case, prior=before).known(used, (), estimate, keys),
         case.calibration.uncertainty.posterior.degrees_of_freedom,
     )
-    return noise, agreement.contrast(old, NormalDistribution(seen, -best, freedom), tested)
+    return noise, contrast(old, NormalDistribution(seen, -best, freedom), tested)
 
 
 def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:

@@ -12,8 +12,15 @@ import numpy as np
 from ceres_cal.base import Array, InputError, grid_places, median, nearest_rotation, numerical, rotation_log, upper_tail
 from ceres_cal.base.typed import checked
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import agreement
-from ceres_cal.moves.agreement import FALSE_ALARMS, Agreement, Agreements, ImageDifference, NormalDistribution
+from ceres_cal.moves.agreement import (
+    FALSE_ALARMS,
+    Agreement,
+    Agreements,
+    ImageDifference,
+    NormalDistribution,
+    change_of,
+    contrast,
+)
 from ceres_cal.posterior import FieldGrid, field_grid, field_map
 from ceres_cal.problem import EXACT, Estimate, Key, difference
 
@@ -54,7 +61,7 @@ def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> 
         return np.asarray(np.hypot(*maps))
 
     expected = expected_mm if len(known) == 2 else None
-    change = agreement.change_of(a.estimate, station, b.station(station), [grid], expected)
+    change = change_of(a.estimate, station, b.station(station), [grid], expected)
     if len(known) < 2:
         return Agreement(name=station, change=change, solution=b)
     keys, others = (c.uncertainty.posterior.keys_of(c.estimate, station) for c in known)
@@ -69,7 +76,7 @@ def _tested(a: Calibration, b: Calibration, keys: Sequence[Key], off: Array, oth
     if set(keys) != set(others) or not keys:
         return {}
     first, second = (c.uncertainty.posterior for c in (a, b))
-    apart = agreement.contrast(
+    apart = contrast(
         NormalDistribution(first.normal.marginal(keys), np.zeros(len(keys)), first.degrees_of_freedom),
         NormalDistribution(second.normal.marginal(keys), -off, second.degrees_of_freedom),
         keys,

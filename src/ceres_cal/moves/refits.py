@@ -13,8 +13,16 @@ import numpy as np
 from ceres_cal.base import DegenerateError, Pose, SolutionError, checked, numerical, replace
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.calibration.solving import Task, solved_from
-from ceres_cal.moves import explanations
-from ceres_cal.moves.explanations import WORDS, OtherChangeError, judged, old_poses, require_labels, why_nothing_fits
+from ceres_cal.moves.explanations import (
+    WORDS,
+    OtherChangeError,
+    judged,
+    old_poses,
+    require_labels,
+    require_supported,
+    why_nothing_fits,
+    zoomed_search,
+)
 from ceres_cal.moves.poses import PoseSearch, equations, moved_from, moved_words, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, loosened, make_plan, refit_problem
 from ceres_cal.observations import Observations, Sights, gather_sights
@@ -88,7 +96,7 @@ def _refitted(
     result = solved_with(what, estimate, assessed=True)
     try:
         searches = [PoseSearch(sight, estimate, plan.scales) for sight in _moved_sights(plan)]
-        if explanations.require_supported(plan, result, searches, solved_with):
+        if require_supported(plan, result, searches, solved_with):
             raise why_nothing_fits(plan, searches)
     except SolutionError as error:
         stated = [conflict.words for conflict in result.conflicts if conflict.kind == "prior"]
@@ -145,7 +153,7 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
         _require_unique(search, pose, old)
         return search, pose
     if plan.what in ("zoom", "iris", "everything"):
-        zoomed = explanations.zoomed_search(search, old)
+        zoomed = zoomed_search(search, old)
         if zoomed is not None:
             return zoomed[0], zoomed[1].pose
     raise why_nothing_fits(plan, [search])

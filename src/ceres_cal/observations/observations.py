@@ -17,8 +17,17 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base import Indices, Indices32, InputError, Mask, cached_property, checked, field, naming, replace
 from ceres_cal.base.words import no_such, printable
-from ceres_cal.observations import columns
-from ceres_cal.observations.columns import Columns, Curves, Prior, View, each_block, joined, taken, view_label
+from ceres_cal.observations.columns import (
+    Columns,
+    Curves,
+    Prior,
+    View,
+    each_block,
+    in_blocks,
+    joined,
+    taken,
+    view_label,
+)
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.validation import Copies, find_copies, odd_sizes, require_alike, stray_pixels
 from ceres_cal.scene.targets import Target
@@ -166,7 +175,7 @@ class Observations(Content):
         content = hashlib.sha256(msgspec.json.encode(header))
         for column in (self.points, self.curves):
             for name in vars(column):  # the whole of a column before the next
-                for _, block in columns.in_blocks(getattr(column, name)):
+                for _, block in in_blocks(getattr(column, name)):
                     content.update(np.ascontiguousarray(block).data)
         return content.hexdigest()
 

@@ -1,4 +1,3 @@
-from ceres_cal.posterior import maps as maps
 from ceres_cal.posterior.assess import with_doubts as with_doubts
 from ceres_cal.posterior.assess import with_other_lenses as with_other_lenses
 from ceres_cal.posterior.bent import *

@@ -293,10 +293,10 @@ def ends_of(
             found = [_excess(end, step, least, rise)]
             far = _end(problem, estimate, keys, far_out * along) if few else None
             if far is not None:
-                if (other := solved_soon(problem, far[0])) is not None:
+                if (other := solved_soon(problem, far.estimate)) is not None:
                     others.append(replace(other, cost=other.cost - 0.5 * least))
                 # Where the cost rises ever less, the interval ends between; far ends by themselves tell nothing.
-                nearer = far_out * _reach(far[2], least, rise)
+                nearer = far_out * _reach(far, least, rise)
                 if nearer > 1.0:
                     found.append(_excess(_end(problem, estimate, keys, nearer * along), step, least, rise, nearer))
             steps.append(step)
@@ -305,8 +305,12 @@ def ends_of(
     return Ends(keys, reached * sizes, (reached + excesses) * sizes, half_width, information, tuple(others))
 
 
-_End = tuple[Estimate, Array, float]
-"""An estimate, where its numbers are (K,), in natural sizes from the first one, and twice the cost there."""
+class _End(Frozen):
+    """Where the numbers are (K,), in natural sizes from the estimate, and twice the cost there."""
+
+    estimate: Estimate
+    off: Array
+    cost: float
 
 
 @or_none  # quiet: no camera there; the end counts as far away as any
@@ -320,12 +324,12 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
         return None
     pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
     off = difference(solution.estimate, estimate, keys) / sizes
-    return solution.estimate, off, 2.0 * solution.cost - pulled
+    return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
 
 
-def _reach(cost: float, least: float, rise: float) -> float:
+def _reach(end: _End, least: float, rise: float) -> float:
     """How many times as far as an end the cost has risen as it should, if it is a parabola up to there."""
-    return float(np.clip(np.sqrt(rise / max(cost - least, 1e-12)), 1.0 / _FARTHEST, _FARTHEST))
+    return float(np.clip(np.sqrt(rise / max(end.cost - least, 1e-12)), 1.0 / _FARTHEST, _FARTHEST))
 
 
 def _excess(end: _End | None, step: Array, least: float, rise: float, factor: float = 1.0) -> Array:
@@ -334,7 +338,6 @@ def _excess(end: _End | None, step: Array, least: float, rise: float, factor: fl
     """
     if end is None:
         return (_FARTHEST - 1.0) * step if factor == 1.0 else np.zeros(len(step))
-    _, off, cost = end
-    excess = off * _reach(cost, least, rise) - step
+    excess = end.off * _reach(end, least, rise) - step
     along = step / np.linalg.norm(step)
     return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # that it ends earlier narrows nothing

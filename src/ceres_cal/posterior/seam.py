@@ -11,8 +11,17 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, replace, rms, rotation_log
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.posterior import maps
-from ceres_cal.posterior.maps import FieldGrid, FieldMap, Functional, Reading, field_map, located_by, read
+from ceres_cal.posterior.maps import (
+    FieldGrid,
+    FieldMap,
+    Functional,
+    Reading,
+    field_map,
+    located_by,
+    read,
+    station_keys,
+    visible_pixels,
+)
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Key, moved, natural_sizes
 from ceres_cal.scene import Camera, Target, along_track, nearest_on_track, turned_on
@@ -94,8 +103,8 @@ def predicted(
     """What is known of first less second about those places (N, 2) m that both see, and which (N,) these are."""
     pixels = []
     for station in pair:
-        maps.station_keys(estimate, posterior, station)
-        pixels.append(maps.visible_pixels(estimate, station, places, height_m))
+        station_keys(estimate, posterior, station)
+        pixels.append(visible_pixels(estimate, station, places, height_m))
     visible = np.isfinite(pixels[0][:, 0]) & np.isfinite(pixels[1][:, 0])
     first, second = (located_by(name, own[visible], height_m) for name, own in zip(pair, pixels, strict=True))
     seam = Functional(

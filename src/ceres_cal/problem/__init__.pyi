@@ -1,4 +1,3 @@
-from ceres_cal.problem import parameters as parameters
 from ceres_cal.problem.bundle import *
 from ceres_cal.problem.costs import *
 from ceres_cal.problem.engines import *

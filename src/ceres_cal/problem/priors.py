@@ -139,12 +139,12 @@ class GaussianPrior(Frozen):
         return np.asarray(self.information.root @ self.offsets(estimate))
 
     def cost(self, estimate: Estimate) -> float:
-        """Twice what it adds to the cost: squares of its residuals, Cauchy's loss of what is usual."""
+        """Twice what it adds to the cost: squares of its residuals, Cauchy's loss of what gives way."""
         squares = self.residuals(estimate) ** 2
         return float(np.sum(USUAL_BENDS**2 * np.log1p(squares / USUAL_BENDS**2) if self.gives_way else squares))
 
     def weighted_at(self, estimate: Estimate) -> GaussianPrior:
-        """The normal distribution that pulls as much at an estimate: what is usual counts with Cauchy's weights."""
+        """The normal distribution that pulls as much at an estimate: what gives way counts with Cauchy's weights."""
         if not self.gives_way:
             return self
         off = self.offsets(estimate)
@@ -245,7 +245,7 @@ def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
     every = intrinsic_keys(prior.name, lens) if prior.owner == "camera" else pose_keys("station", prior.name)
     keys = {key.quantity: key for key in every}
     sigmas = {keys[quantity]: sigma for quantity, sigma in zip(wanted, prior.sigma, strict=True)}
-    return GaussianPrior(Information.of_sigmas(sigmas), np.asarray(prior.value, dtype=float), {}, prior.gives_way)
+    return GaussianPrior(Information.of_sigmas(sigmas), np.asarray(prior.value, dtype=float), gives_way=prior.gives_way)
 
 
 def usual_cameras(
@@ -269,7 +269,8 @@ def usual_cameras(
         if about:
             information = Information.of_sigmas({key: sigma for key, (_, sigma) in about.items()})
             logs = frozenset(key for key in about if key.quantity == "phi")
-            yield GaussianPrior(information, np.array([mean for mean, _ in about.values()]), {}, True, True, logs)
+            means = np.array([mean for mean, _ in about.values()])
+            yield GaussianPrior(information, means, gives_way=True, is_usual=True, logs=logs)
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:

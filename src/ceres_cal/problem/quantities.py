@@ -15,9 +15,18 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.base import Array, Frozen, InputError, Pose, replace, rotation_exp, rotation_log, skew, two_digits
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.problem import parameters
 from ceres_cal.problem.information import POSE_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
-from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names, intrinsics_scales
+from ceres_cal.problem.parameters import (
+    Estimate,
+    Layout,
+    Options,
+    Station,
+    intrinsic_names,
+    intrinsics_scales,
+    intrinsics_vector,
+    unit_px,
+    with_intrinsics,
+)
 from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.problem.structure import Tolerance, dimensions_of
 from ceres_cal.scene import Camera, Lens
@@ -70,7 +79,7 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
         if kind == "camera":
             camera = estimate.cameras[owner]
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0, "skew": 1.0}
-            natural = camera.lens.natural_sizes(camera.phi, parameters.unit_px(camera))
+            natural = camera.lens.natural_sizes(camera.phi, unit_px(camera))
             known |= zip(camera.lens.names, natural, strict=True)
             sizes[columns] = [known[keys[column].quantity] for column in columns]
         elif kind == "structure":
@@ -183,10 +192,10 @@ def camera_moved(camera: Camera, quantities: Sequence[str], step: Array) -> Came
     Raises:
         InputError: phi or aspect is no longer above 0.
     """
-    vector, known = parameters.intrinsics_vector(camera), intrinsic_names(camera.lens)
+    vector, known = intrinsics_vector(camera), intrinsic_names(camera.lens)
     at = [known.index(name) for name in quantities]
     vector[at] += step * intrinsics_scales(camera)[at]
-    return parameters.with_intrinsics(camera, vector)
+    return with_intrinsics(camera, vector)
 
 
 def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
@@ -253,7 +262,7 @@ PHI_RANGE = (0.15, 15.0)
 
 def is_lens(camera: Camera) -> bool:
     """Whether its phi is one that a lens over a field has."""
-    return PHI_RANGE[0] <= camera.phi / parameters.unit_px(camera) <= PHI_RANGE[1]
+    return PHI_RANGE[0] <= camera.phi / unit_px(camera) <= PHI_RANGE[1]
 
 
 _REDRAWN = 20.0  # times a dimension as drawn, or the inverse: beyond it another target was drawn

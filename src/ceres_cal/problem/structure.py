@@ -55,8 +55,12 @@ class Tolerance(Frozen, eq=True):
                 raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")
 
 
-BuiltTarget = tuple[Target, Array, Array]
-"""A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
+class BuiltTarget(Frozen):
+    """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
+
+    target: Target
+    points: Array
+    tracks: Array
 
 
 class Structure(Frozen):
@@ -174,7 +178,7 @@ class Structure(Frozen):
         for name, target in targets.items():
             own, points = np.split(points, [len(target.points)])
             curves, tracks = np.split(tracks, [3 * len(target.curves)])
-            built[name] = target, own, curves.reshape(3, -1, 3, 3)
+            built[name] = BuiltTarget(target, own, curves.reshape(3, -1, 3, 3))
         return built
 
     def _points(self, points: Array, feature: Indices) -> Array:

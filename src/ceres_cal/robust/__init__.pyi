@@ -1,4 +1,3 @@
-from ceres_cal.robust import noise as noise
 from ceres_cal.robust.as_built import *
 from ceres_cal.robust.bulk import *
 from ceres_cal.robust.competing import *

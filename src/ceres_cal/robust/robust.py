@@ -16,8 +16,17 @@ from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem import Estimate, Problem, Solution, SolveProgress, Weighting, solve, with_placements_at_best
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, residuals_alone
-from ceres_cal.robust import noise
-from ceres_cal.robust.noise import Fitted, Inliers, Redundancy, by_count, by_deleted_residuals, judge, visible_from
+from ceres_cal.robust.noise import (
+    Fitted,
+    Inliers,
+    Redundancy,
+    by_count,
+    by_deleted_residuals,
+    by_leverage,
+    judge,
+    median_scales,
+    visible_from,
+)
 from ceres_cal.robust.other_minima import with_lost_boards_posed, without_mirrored_poses
 
 MOST_ROUNDS = 15
@@ -241,7 +250,7 @@ class _RowRounds(Rounds[RobustSolution]):
         solution = solve(few, estimate, self._progress, precision=self._rough_end, is_near=False)
         for _ in range(_MOST_REFINED if others_follow else 0):
             points, curves = residuals_alone(few.sights, solution.estimate, few.feet).lengths
-            scales = noise.median_scales(points / few.sights.sigma_px, curves / few.sights.curve_sigma_px)
+            scales = median_scales(points / few.sights.sigma_px, curves / few.sights.curve_sigma_px)
             if not _much_below(scales, self._scales):
                 break
             self._scales = scales
@@ -299,7 +308,7 @@ class _RowRounds(Rounds[RobustSolution]):
         sights = state.problem.sights
         points, curves = reduced.leverages
         taken = points + self._problem.taken_up, curves
-        self._redundancy = noise.by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
+        self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
         inliers, rows = self._judge(state.solution, state.residuals), state.inliers.rows
         estimate, there = state.estimate, state.residuals
         fitted = Fitted(self._problem, estimate, there, rows, reduced)

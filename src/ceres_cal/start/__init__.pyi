@@ -1,4 +1,3 @@
-from ceres_cal.start import closed_forms as closed_forms
 from ceres_cal.start.closed_forms import *
 from ceres_cal.start.initialise import USUAL_PHI as USUAL_PHI
 from ceres_cal.start.initialise import USUAL_PHI_FACTOR as USUAL_PHI_FACTOR

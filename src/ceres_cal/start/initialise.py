@@ -16,8 +16,14 @@ from ceres_cal.base import Array, CalibrationError, Frozen, Indices, Pose, attem
 from ceres_cal.observations import Prior, SightKey, Sights
 from ceres_cal.problem import ANY_PHI, PHI_RANGE, Estimate, Options, Station, unit_px
 from ceres_cal.scene.camera import Camera
-from ceres_cal.start import closed_forms
-from ceres_cal.start.closed_forms import RADII, LensProfile, RadialProfile, edge_over, orthogonality_error
+from ceres_cal.start.closed_forms import (
+    RADII,
+    LensProfile,
+    RadialProfile,
+    edge_over,
+    orthogonality_error,
+    poses_from_homographies,
+)
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 from ceres_cal.start.world import CameraPlace, Placed, beforehand, chained_poses, left_of, placed
 
@@ -242,7 +248,7 @@ def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
 
 def _poses_at(homographies: Homographies, phi: float) -> Array:
     """cam_from_frame (K, 3, 4) of the homographies for one phi."""
-    matrices = closed_forms.poses_from_homographies(homographies.matrices, phi)
+    matrices = poses_from_homographies(homographies.matrices, phi)
     matrices[:, :, 3] -= homographies.heights_m[:, None] * matrices[:, :, 2]
     return matrices
 

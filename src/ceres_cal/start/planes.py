@@ -12,8 +12,18 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, distinct, evenly, kept_signals, median, or_none, rms
 from ceres_cal.observations import Sights, bounds_of, joined, ranges
-from ceres_cal.start import closed_forms
-from ceres_cal.start.closed_forms import PlaneData, RadialProfile, fit_lines, homographies_of_sights, radial_alignment
+from ceres_cal.start.closed_forms import (
+    PlaneData,
+    RadialProfile,
+    fit_lines,
+    homographies_of_sights,
+    homography_from_points,
+    misfits_of_lines,
+    point_lines,
+    profile_from_lines,
+    radial_alignment,
+    ring_profile,
+)
 
 # A median beyond it may be no fit at all, however even: corners are detected to a tenth of it. Nothing changes from
 # half to double.
@@ -74,7 +84,7 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
         sight,
         height,
         points,
-        np.vstack([closed_forms.point_lines(points), np.column_stack([normal, -np.sum(normal * c, axis=1)])]),
+        np.vstack([point_lines(points), np.column_stack([normal, -np.sum(normal * c, axis=1)])]),
         np.vstack([sight.pixels[on], sight.pixels[on], sight.curve_pixels[straight]]),
     )
 
@@ -226,12 +236,12 @@ def _profile_from_lines(planes: Sequence[tuple[Array, Array]], unit: float) -> R
     def best_of(candidates: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
         profiles = [RadialProfile(c, unit) for c in candidates if _is_lens(c)]
         misfit = sum(
-            closed_forms.misfits_of_lines(lines, np.array([profile.lift(offsets) for profile in profiles]), rounds=2)
+            misfits_of_lines(lines, np.array([profile.lift(offsets) for profile in profiles]), rounds=2)
             for lines, offsets in planes
         )
         return profiles[int(np.argmin(misfit))].coefficients
 
-    known = [closed_forms.profile_from_lines(lines, offsets, unit, 2) for lines, offsets in planes]
+    known = [profile_from_lines(lines, offsets, unit, 2) for lines, offsets in planes]
     grid = [(c1, c2) for c1 in np.linspace(-1.0, 0.4, 8) for c2 in np.linspace(-0.6, 0.6, 5)]
     best = best_of([(0.0, 0.0), *known, *grid])
     for width in (0.1, 0.03, 0.01, 0.003):
@@ -270,7 +280,7 @@ def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
     if len(distinct(ring_m)) < 3:  # they tell a magnification, and nothing of the lens
         profile, kappa = RadialProfile((0.0, 0.0), unit), float(np.mean(measured_px / ring_m))
     else:
-        profile, kappa = closed_forms.ring_profile(measured_px, ring_m, unit)
+        profile, kappa = ring_profile(measured_px, ring_m, unit)
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 
@@ -305,4 +315,4 @@ def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array 
     if consensus is None:
         return None
     inliers = np.asarray(consensus["inlier_mask"], dtype=bool)
-    return closed_forms.homography_from_points(plane[inliers], lifted[inliers])
+    return homography_from_points(plane[inliers], lifted[inliers])

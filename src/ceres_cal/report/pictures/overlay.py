@@ -234,22 +234,24 @@ def model_seen(
         camera = estimate.camera_at(station, placement)
         camera = camera.at(camera.cam_from_world @ lift)
         lines += _lines(built[name], camera)
-        points.append(camera.project(built[name][1]))
+        points.append(camera.project(built[name].points))
     return Model(estimate.camera_at(station).image_size, tuple(lines), np.concatenate(points))
 
 
 def _lines(built: BuiltTarget, camera: Camera) -> Iterator[tuple[Array, ...]]:
     wide_px = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
     steps = 240  # along a curve
-    target, points, tracks = built
+    target = built.target
     for number, curve in enumerate(target.curves.values()):
         s, is_arc = np.linspace(*curve.parameter_range, steps), bool(target.is_arc[number])
-        middle, left, right = (camera.project(along_track(tracks[side, number], is_arc, s)) for side in (0, 1, -1))
+        middle, left, right = (
+            camera.project(along_track(built.tracks[side, number], is_arc, s)) for side in (0, 1, -1)
+        )
         width = np.linalg.norm(left - right, axis=1)[in_image(middle, camera.image_size)]
         wide = len(width) > 0 and float(np.median(width)) >= wide_px
         yield (middle, left, right) if wide else (middle,)
     if target.grid is not None:
-        grid = points.reshape(target.grid.rows, -1, 3)
+        grid = built.points.reshape(target.grid.rows, -1, 3)
         yield from ((camera.project(_between(row)),) for row in (*grid, *grid.swapaxes(0, 1)))
 
 
