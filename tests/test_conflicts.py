@@ -180,6 +180,36 @@ def test_two_numbers_that_are_held_wrong_are_both_named() -> None:
     assert all(abs(value - truth[name]) < 3.0 * sd < 5.0 for name, (value, sd) in seen.items())
 
 
+@pytest.mark.parametrize(
+    "lens, quantity, held, truth",
+    [("radial", "a2", -2e-4, -5.2e-5), ("brown", "k1", -0.2, -0.349), ("auto", "aspect", 0.98, 1.0)],
+)
+def test_nothing_takes_up_what_is_held_wrong_of_a_lens(lens: str, quantity: str, held: float, truth: float) -> None:
+    """Boards and a line were taken out, and the aspect was a rolling shutter, without a word."""
+    calibration = calibrate(sample(), Options(lens=lens, fixed={quantity: held}))
+    (conflict,) = calibration.conflicts
+    assert (conflict.kind, conflict.quantity) == ("fixed", quantity) and conflict.stated == pytest.approx(held)
+    assert abs(conflict.seen - truth) < 3.0 * conflict.seen_sd < 0.2 * abs(held - truth)
+    assert "the observations alone say" in conflict.words
+    assert not any(word in line for line in calibration.warnings for word in ("whole of", "rolling shutter"))
+    assert calibration.options.fixed == {quantity: held} and calibration.options.free_aspect is None
+
+
+def test_a_right_coefficient_that_is_held_tells_what_does_not_belong() -> None:
+    """Solved for without it, a few lines kept an outlier, and phi was 37 px farther off."""
+    scene = field_scene(
+        ssl_field("B"),
+        {"overhead": camera("brown")},
+        {"overhead": Station("overhead", overhead_pose(0.1, -0.2, 4.0, tilt_x_deg=8.0, yaw_deg=3.0))},
+        spacing_m=1.0,
+    )
+    held = {"k1": camera("brown").lens.coefficients["k1"]}
+    observed = simulate(scene, Disturbance(0.3, 0.3, outliers=0.05), seed=9).observations
+    calibration = calibrate(observed, Options(lens="brown", fixed=held))
+    phi = calibration.uncertainty.verdict("camera", "overhead", "phi")
+    assert not calibration.conflicts and abs(phi.value - 825.0) < phi.sd < 15.0  # 4.3 of 11.3 px
+
+
 def test_what_is_held_is_known_beside_everything_else() -> None:
     """Lenses are compared with phi free, but what they leave open of the height, 36 mm, is of one phi."""
     known = calibrate(seen(), Options(fixed={"phi": 868.0})).uncertainty

@@ -204,9 +204,9 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
 
         # quiet: there are too few observations without what is stated
         found = attempt(explained_first)
-        # A number that is held, and agrees, tells the lens: without it another was taken, and a height 10 sd off.
-        tells_lens = free is not options and options.lens == AUTO
-        if isinstance(found, Calibration) and (found.conflicts or not tells_lens):
+        # A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd off,
+        # and one of a few lines' outliers was not.
+        if isinstance(found, Calibration) and (found.conflicts or free is options):
             return found
     return _of_lens_asked(task, initialise(sights, _named(options)), sights, options)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from ceres_cal.base import Array, Frozen, Mask, attempt, cached_property, meanwhile, replace
@@ -33,7 +34,7 @@ from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.robust.as_built import AS_DRAWN, Built, require_measured, solve_as_built, taking_part, tolerances_of
+from ceres_cal.robust.as_built import Built, require_measured, solve_as_built, solve_held, taking_part, tolerances_of
 from ceres_cal.robust.competing import Solver, Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
@@ -158,14 +159,15 @@ class Explained(Frozen):
         loose = stated_priors(self.problem.observations, self.problem.options, lenses).values()
         known = {key for prior in loose for key in prior.keys}
         others = [prior for prior in (one.without(known) for one in self.problem.priors) if prior.keys]
-        stated = {name: getattr(options, name) for name in ("priors", "fixed", "free_principal_point")}
+        stated = {name: getattr(options, name) for name in ("priors", "fixed", "free_principal_point", "free_aspect")}
         options = replace(self.problem.options, **stated)
         every = stated_priors(observations, options, lenses).values()
         sights = replace(self.problem.sights, observations=observations)
         layout = make_layout(observations, options)
         problem = replace(self.problem, sights=sights, layout=layout, options=options, priors=(*every, *others))
         part, start = taking_part(problem, self.explanations), as_held(here, options)
-        end = solve_robustly(part, start, self.task.scales, self.task.progress, is_near=True)
+        near = partial(solve_robustly, usual=self.task.scales, progress=self.task.progress, is_near=True)
+        end = solve_held(near, part, start, self.as_built)
         if part is not problem:
             end = replace(end, residuals=residuals(sights, end.estimate))
         phi_from = dict.fromkeys(self.start.phi_from, "fixed") if "phi" in options.fixed else self.start.phi_from
@@ -210,7 +212,7 @@ def solved_from(task: Task, start: Start, problem: Problem) -> Calibration:
     Raises:
         CalibrationError: see `calibrate`.
     """
-    return known_of(explained(task, start, problem, AS_DRAWN))
+    return known_of(explained(task, start, problem, Built()))
 
 
 def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
@@ -234,7 +236,8 @@ def known_of(seen: Explained) -> Calibration:
     near = before.end if task.stated else None
     if task.tested:
         part = None if task.before is not None else taking_part(seen.problem, seen.explanations)
-        conflicts = find_conflicts(seen.problem, seen.end, task.scales, part, seen.shifts_at, near)
+        solver = partial(solve_held, partial(solve_robustly, usual=task.scales), every=seen.as_built)
+        conflicts = find_conflicts(seen.problem, seen.end, solver, part, seen.shifts_at, near)
         seen = seen.without(conflicts).doubted_as(before)
     settled = None
     if task.settle is not None:
@@ -287,7 +290,7 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
         steady = unsteady.taken_off(again)
         end = solve_robustly(steady, start, None, task.progress, is_near=True)
         solved = Explained(task, steady, replace(first.start, estimate=start, is_near=True), end)
-        seen = replace(_explained(solved, steady.sights, AS_DRAWN), unsteady=unsteady)
+        seen = replace(_explained(solved, steady.sights, Built()), unsteady=unsteady)
     return seen
 
 

@@ -202,17 +202,20 @@ def stated_priors(
 
 
 def freed(observations: Observations, options: Options) -> Options:
-    """The options with what they hold of cameras, but for lenses, stated as closely as anything is."""
-    held = {name: (value,) for name, value in options.fixed.items() if name in ("phi", "cx", "cy") and value}
+    """The options with what they hold of cameras stated as closely as anything is; coefficients of lenses, which have
+    no size to be known to a share of, are free.
+    """
+    held = {name: (value,) for name, value in options.fixed.items() if name in OF_PIXELS}
     each = list[Prior]()
     for name, size in observations.cameras.items():
         middle = () if options.free_principal_point else tuple(0.5 * (side - 1.0) for side in size)
         own = {**held, "principal_point": middle} if middle else held
         each += [Prior("camera", name, one, value, (FINEST,) * len(value)) for one, value in own.items()]
-    if not each:
+    fixed = {name: value for name, value in options.fixed.items() if name == "skew"}
+    if not each and fixed == options.fixed:
         return options
-    fixed = {name: value for name, value in options.fixed.items() if name not in held}
-    return replace(options, fixed=fixed, free_principal_point=True, priors=(*options.priors, *each))
+    free_aspect, priors = "aspect" in held or options.free_aspect, (*options.priors, *each)
+    return replace(options, fixed=fixed, free_principal_point=True, free_aspect=free_aspect, priors=priors)
 
 
 def loosely(observations: Observations, options: Options) -> tuple[Observations, Options]:

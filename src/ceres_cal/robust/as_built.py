@@ -28,7 +28,7 @@ from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import Equations, equations_of, whole_structure
 from ceres_cal.problem.structure import EXACT, Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn
 from ceres_cal.robust.competing import Solver, compete
-from ceres_cal.robust.robust import RobustSolution, judge_at, solve_robustly
+from ceres_cal.robust.robust import RobustSolution, SolvedFrom, judge_at, solve_robustly
 from ceres_cal.scene.targets import Target
 
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
@@ -96,15 +96,35 @@ def solve_as_built(
         end, explanations = compete(_held(problem, before), end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
-    estimate = replace(end.estimate, structure=structure)
     part = taking_part(problem, explanations)
-    if {view.target for view in observations.views if view.placement is None} & {one.target for one in every}:
-        end = solve_robustly(part, estimate, is_near=True)
+    if _is_held(every, problem):
+        end = _as_measured(part, end, structure)
     else:
-        settled = replace(end.solution, estimate=estimate)
-        end = replace(judge_at(part, estimate), solution=settled, rounds=end.rounds)
+        end = solve_robustly(part, replace(end.estimate, structure=structure), is_near=True)
     end, structure = end.moved_to(end.estimate, problem), end.estimate.structure
     return end, problem, explanations, tuple(_measured(every, structure, observations.targets))
+
+
+def solve_held(solver: SolvedFrom, problem: Problem, estimate: Estimate, every: Sequence[AsBuilt]) -> RobustSolution:
+    """The problem solved from an estimate that has targets as they are built: what was found of boards is held."""
+    if not _is_held(every, problem):
+        return solver(problem, estimate)
+    built, stated = estimate.structure, problem.options.structure_of(problem.observations.targets)
+    start = replace(estimate, structure=stated.carrying(built))
+    end = solver(_held(problem, Built(tuple(every), built)), start)
+    return _as_measured(problem, end, built.carrying(built, end.estimate.structure))
+
+
+def _is_held(every: Sequence[AsBuilt], problem: Problem) -> bool:
+    """Whether what is not as drawn is held while everything else is solved for: not where the world is among it."""
+    world = {view.target for view in problem.observations.views if view.placement is None}
+    return bool(every) and not world & {one.target for one in every}
+
+
+def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) -> RobustSolution:
+    """The end of the problem with targets held as they are built, judged where these are free."""
+    settled = replace(end.solution, estimate=replace(end.estimate, structure=structure))
+    return replace(judge_at(problem, settled.estimate), solution=settled, rounds=end.rounds)
 
 
 def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:

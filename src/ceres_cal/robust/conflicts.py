@@ -34,7 +34,7 @@ from ceres_cal.problem import (
 )
 from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
 from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
-from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.robust import RobustSolution, SolvedFrom
 from ceres_cal.robust.stated import (
     LEVEL,
     Conflict,
@@ -222,7 +222,7 @@ class Doubt(Frozen):
 def find_conflicts(
     problem: Problem,
     end: RobustSolution,
-    usual: tuple[float, float] | None = None,
+    solver: SolvedFrom,
     part: Problem | None = None,
     shifts_at: ShiftsAt | None = None,
     near: RobustSolution | None = None,
@@ -230,7 +230,7 @@ def find_conflicts(
     """Everything stated that the rest contradicts, the worst first, each with those before it left out.
 
     Args:
-        problem: of all the observations. end: its solution. usual: noise scales that were seen before.
+        problem: of all the observations. end: its solution. solver: of the same without something, from an estimate.
         part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
             without an outlier; None where the answer stays. shifts_at: by which numbers scatter besides.
         near: where it was solved without what looks wrong, if it was: a wrong statement may lead to another minimum.
@@ -240,7 +240,7 @@ def find_conflicts(
     if not every:
         return Conflicts()
     reduced = end.told
-    search = _ForwardSelection(problem, end, usual, every, shifts_at, near)
+    search = _ForwardSelection(problem, end, solver, every, shifts_at, near)
     while search.solves < most and search.leave_out_the_worst():
         pass
     search.leave_out_together()
@@ -248,7 +248,7 @@ def find_conflicts(
     named = (*(one for _, one in pairs), *search.conflicts())
     priors, answer = agreed(problem.priors, named), None
     if part is not None and priors != problem.priors:
-        answer = _solved(replace(part, priors=priors), search.end, usual)
+        answer = _solved(replace(part, priors=priors), search.end, solver)
     if answer is None:
         shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.places[1:]]
     else:
@@ -282,9 +282,9 @@ def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
 
 
 @or_none  # quiet: the linear test decides, and the answer stays
-def _solved(problem: Problem, end: RobustSolution, usual: tuple[float, float] | None) -> RobustSolution | None:
+def _solved(problem: Problem, end: RobustSolution, solver: SolvedFrom) -> RobustSolution | None:
     """The problem solved from where another one ended; None where it cannot be."""
-    after = solve_robustly(replace(problem, feet=end.residuals.feet), end.estimate, usual)
+    after = solver(replace(problem, feet=end.residuals.feet), end.estimate)
     return None if after.solution.failed else after
 
 
@@ -301,7 +301,7 @@ class _ForwardSelection:
 
     problem: Problem
     end: RobustSolution
-    usual: tuple[float, float] | None
+    solver: SolvedFrom
     every: tuple[Statement, ...]
     shifts_at: ShiftsAt | None
     near: RobustSolution | None = None
@@ -332,7 +332,7 @@ class _ForwardSelection:
             (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.estimate)
-        after = None if suspect.kind == "earlier" else _solved(freed, self._start_of(freed), self.usual)
+        after = None if suspect.kind == "earlier" else _solved(freed, self._start_of(freed), self.solver)
         self.solves += 1
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
@@ -381,7 +381,7 @@ class _ForwardSelection:
         if every is None or worst_test(every, linear_rest(every, self.end)).log_p > np.log(_SUSPICIOUS):
             return
         freed = every.left_out(self.problem, self.end.estimate)
-        after = _solved(freed, self._start_of(freed), self.usual)
+        after = _solved(freed, self._start_of(freed), self.solver)
         if after is None:
             return
         rise = self._rise(after)

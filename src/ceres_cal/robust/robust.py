@@ -6,6 +6,7 @@ One loop for rows that are at hand and for sums over shares of very many: what a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Generic, Self, TypeVar
 
 import numpy as np
@@ -77,6 +78,8 @@ class RobustSolution(Frozen):
         return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
 
 
+SolvedFrom = Callable[[Problem, Estimate], RobustSolution]
+"""How a problem is solved from an estimate."""
 _Round = TypeVar("_Round", bound=RobustSolution)
 
 
