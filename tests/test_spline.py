@@ -28,6 +28,7 @@ from ceres_cal.problem.parameters import Options, Station, make_layout
 from ceres_cal.problem.problem import Problem
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Spline, make_lens
+from ceres_cal.scene.lens.planar import invert_increasing
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Simulation, simulate
 
@@ -68,6 +69,17 @@ def test_no_two_rays_have_one_pixel(lens: Spline) -> None:
     here, right, down = (lens.undistort(offsets + shift, 500.0) for shift in ((0.0, 0.0), (step, 0.0), (0.0, step)))
     turned = np.einsum("ij,ij->i", np.cross(right - here, down - here), here)
     assert np.all(turned > 0.0)
+
+
+@settings(deadline=None, max_examples=20)
+@given(splines())
+def test_its_pieces_are_its_profile(lens: Spline) -> None:
+    """The inverse goes by polynomials, the map along the radius by the compiled lens; straight on from 1."""
+    profile = lens._profile
+    places = np.append(0.0, np.linspace(0.03, 0.98 * profile.limit, 40))
+    np.testing.assert_allclose(invert_increasing(profile, profile.value(places)), places, rtol=1e-11)
+    beyond = invert_increasing(profile, profile.value(np.array([0.5, profile.limit])) + np.array([0.0, 0.1]))
+    assert np.isfinite(beyond).tolist() == [True, False]
 
 
 def test_phi_is_the_focal_length_at_the_axis() -> None:

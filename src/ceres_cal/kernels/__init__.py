@@ -149,6 +149,16 @@ def lens_images(optics: Optics, rays: Array, images: Array) -> None:
     core().lens_images(optics, rays, images)
 
 
+def inverse_of_growing(above: Array, width: float, below: Array, limit: float, targets: Array, places: Array) -> None:
+    """Where a map that grows from 0 is as large as `targets` (N,), to `places` (N,); NaN where it is not up to `limit`.
+
+    Args:
+        above: (K, T) polynomials, lowest power first, of stretches `width` wide side by side, each by the share of its
+            own; the last one goes on. below: (Q,) a polynomial that it is divided by; empty for none.
+    """
+    core().inverse_of_growing(above, width, below, limit, targets, places)
+
+
 # ---- the start ------------------------------------------------------------------------------------------------------
 
 

@@ -5,6 +5,7 @@
 #endif
 
 #include "arguments.hpp"
+#include "inverse.hpp"
 #include "planes.hpp"
 #include "profiles.hpp"
 #include "saddles.hpp"
@@ -43,6 +44,17 @@ void lens_images(Tuple optics, const Read<N, 3>& rays, const Filled<2, 4, N>& im
             made->project(filled, chunk, seen);
             for (int k = 0; k < 8; ++k) std::copy_n(own[k]->value, n, images.data() + k * count + first);
         }
+    });
+}
+
+void inverse_of_growing(const Read<N, N>& above, double width, const Read<N>& below, double limit,
+                        const Read<N>& targets, const Filled<N>& places) {
+    const size_t pieces = above.shape(0), terms = above.shape(1);
+    require(pieces > 0 && terms > 0 && width > 0.0, "above: polynomials of a width are needed");
+    require(places.size() == targets.size(), "targets and places are (N,)");
+    unlocked([&] {
+        const Growing map(whole(pieces), whole(terms), above.data(), width, whole(below.size()), below.data(), limit);
+        for (size_t i = 0; i < targets.size(); ++i) places.data()[i] = map.inverse(targets.data()[i]);
     });
 }
 
@@ -286,6 +298,7 @@ bool has_avx2() {
 NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("has_avx2", &has_avx2);
     m.def("lens_images", &lens_images);
+    m.def("inverse_of_growing", &inverse_of_growing);
     m.def("plane_homographies", &plane_homographies);
     m.def("radial_alignment", &radial_alignment);
     m.def("cholesky", &factor);

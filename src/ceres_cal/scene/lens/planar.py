@@ -14,10 +14,10 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from ceres_cal.base import AnyArray, Array, Frozen, cached_property
-from ceres_cal.kernels import Optics, lens_images
+from ceres_cal.kernels import NOTHING, Optics, inverse_of_growing, lens_images
 from ceres_cal.scene.lens.base import Lens, unit_rays
 
-STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
+STEPS = 60  # a safeguard: Newton needs 4 to 8
 
 
 def horner(polynomial: Array, x: Array) -> Array:
@@ -57,39 +57,50 @@ def _first_root(polynomial: tuple[float, ...]) -> float:
 
 
 class Profile(Protocol):
-    """A map along a radius: value 0 and slope 1 at 0, growing up to its limit."""
+    """A map along a radius: value 0 and slope 1 at 0, growing up to its limit.
+
+    Attributes:
+        pieces: (K, T) polynomials, lowest power first, side by side, each by the share of its own `width`; the last one
+            goes on. below: (Q,) a polynomial that they are divided by; empty for none.
+    """
 
     @property
     def limit(self) -> float: ...
+    @property
+    def pieces(self) -> Array: ...
+    @property
+    def width(self) -> float: ...
+    @property
+    def below(self) -> Array: ...
     def value(self, x: Array) -> Array: ...
-    def slope(self, x: Array) -> Array: ...
 
 
 class Ratio(Frozen):
     """p(x) / q(x): a profile of two polynomials, lowest power first, q(0) = 1; without the second, p alone.
 
     Attributes:
-        above, below: p and q. end: it is asked for up to there.
+        above, below: p and q, empty for none. end: it is asked for up to there.
     """
 
     above: Array
-    below: Array | None = None
+    below: Array
     end: float = np.inf
+    width: ClassVar[float] = 1.0
+
+    @property
+    def pieces(self) -> Array:
+        """(1, T) p."""
+        return self.above[None]
 
     def value(self, x: Array) -> Array:
         """At x (N,)."""
         total = horner(self.above, x)
-        return total if self.below is None else np.asarray(total / horner(self.below, x))
-
-    def slope(self, x: Array) -> Array:
-        """Its derivative at x (N,)."""
-        total = horner(self._rising, x)
-        return total if self.below is None else np.asarray(total / horner(self.below, x) ** 2)
+        return np.asarray(total / horner(self.below, x)) if len(self.below) else total
 
     @cached_property
     def _rising(self) -> Array:
         """Its derivative times q^2."""
-        if self.below is None:
+        if not len(self.below):
             return derivative(self.above)
         first, second = (derivative(self.above), self.below), (self.above, derivative(self.below))
         return less(np.convolve(*first), np.convolve(*second))
@@ -99,45 +110,14 @@ class Ratio(Frozen):
         """Where it stops growing or q reaches 0, or else its end."""
         short = 1e-9  # of a pole: the map is finite before it
         limit = min(self.end, first_root(self._rising))
-        return limit if self.below is None else min(limit, (1.0 - short) * first_root(self.below))
-
-
-def _reach(profile: Profile, target: Array) -> Array:
-    """An x (N,) where the profile is not below its target: its limit or, without one, found by doubling."""
-    if np.isfinite(profile.limit):
-        return np.full_like(target, profile.limit)
-    high = target.copy()
-    for _ in range(STEPS):
-        short = profile.value(high) < target
-        if not np.any(short):
-            break
-        high[short] *= 2.0
-    return high
+        return min(limit, (1.0 - short) * first_root(self.below)) if len(self.below) else limit
 
 
 def invert_increasing(profile: Profile, target: Array) -> Array:
-    """x up to the limit with profile(x) = target (N,), by Newton safeguarded with bisection; NaN where none is."""
-    high = _reach(profile, target)
-    answer = np.full_like(target, np.nan)
-    rows = np.flatnonzero((target >= 0.0) & np.isfinite(target) & (target <= profile.value(high)))
-    target, high = target[rows], high[rows]
-    low, x, last = np.zeros_like(high), np.minimum(target, high), np.full_like(high, np.inf)
-    for _ in range(STEPS):
-        error = profile.value(x) - target
-        low, high = np.where(error < 0.0, x, low), np.where(error > 0.0, x, high)
-        move = -error / profile.slope(x)
-        # A step that does not halve the last one may run in a circle.
-        good = (x + move >= low) & (x + move <= high) & (np.abs(move) <= 0.5 * last)
-        move = np.where(good, move, 0.5 * (low + high) - x)
-        move = np.where(np.abs(error) > 1e-15 * target, move, 0.0)
-        last, x = np.abs(move), x + move
-        moving = last > 1e-13 * x
-        answer[rows[~moving]] = x[~moving]
-        if not np.any(moving):
-            break
-        rows = rows[moving]
-        target, low, high, x, last = (column[moving] for column in (target, low, high, x, last))
-    return answer
+    """x up to the limit with profile(x) = target (N,); NaN where none is."""
+    places = np.empty(len(target))
+    inverse_of_growing(profile.pieces, profile.width, profile.below, profile.limit, target, places)
+    return places
 
 
 def inverted(profile: Profile, target: Array, mapped: Callable[[Array], Array] | None = None) -> Array:
@@ -299,7 +279,7 @@ class Decentred(Planar):
         above = np.kron(np.append(1.0, self._named(self.above)), (0.0, 1.0))
         worst = np.array([0.0, 0.0, 3.0 * np.hypot(p1, p2) + np.hypot(s1, s3), 0.0, np.hypot(s2, s4)])
         if not np.any(self._named(self.below)):
-            return Ratio(less(above, worst), None, self._end)
+            return Ratio(less(above, worst), NOTHING, self._end)
         below = np.asarray(np.kron(np.append(1.0, self._named(self.below)), (1.0, 0.0))[:-1], dtype=float)
         return Ratio(less(above, np.convolve(worst, below)), below, self._end)
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base import Array, Indices, InputError
+from ceres_cal.base import Array, Indices, InputError, cached_property
+from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, derivative, horner, invert_increasing, inverted, less
 
@@ -99,15 +100,16 @@ class Radial(Lens):
         p1, p2 = self.values[len(self.powers) :] or (0.0, 0.0)
         return p1, p2
 
-    @property
+    @cached_property
     def _polynomial(self) -> Array:
         """The map along a radius, lowest power first: r + sum a_k r^k."""
         return dense_polynomial(self._along, self.powers)
 
+    @lru_cache(maxsize=256)  # noqa: B019 a camera that is moved and asked anew has the lens that it had
     def _profile(self, phi: float) -> Ratio:
         """That map in units of phi, in the direction in which a decentring takes most off it, 3 |p| r^2."""
         along = dense_polynomial(self._along * phi ** np.subtract(self.powers, 1.0), self.powers)
-        return Ratio(less(along, np.array([0.0, 0.0, 3.0 * np.hypot(*self._across)])))
+        return Ratio(less(along, np.array([0.0, 0.0, 3.0 * np.hypot(*self._across)])), NOTHING)
 
     def ideal_radius(self, measured_radius: ArrayLike) -> Array:
         """r' of r, both in px (paper, section 2); no check of the monotone radius."""
@@ -117,7 +119,7 @@ class Radial(Lens):
         """r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
         ideal = np.asarray(ideal_radius, dtype=float)
         with np.errstate(all="ignore"):
-            return invert_increasing(Ratio(self._polynomial), ideal.ravel()).reshape(ideal.shape)
+            return invert_increasing(Ratio(self._polynomial, NOTHING), ideal.ravel()).reshape(ideal.shape)
 
     def _distort(self, rays: Array, phi: float) -> Array:
         profile, ideal = self._profile(phi), rays[:, :2] / ahead(rays)
@@ -125,20 +127,27 @@ class Radial(Lens):
         return np.where(np.hypot(measured[:, :1], measured[:, 1:]) <= profile.limit, phi * measured, np.nan)
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
-        ideal = self._mapped(offsets / phi, phi)[:, 0].T
+        ideal = self._ideal(offsets / phi, phi).T
         return unit_rays(np.where(self.shows(offsets, phi)[:, None], ideal, np.nan), 1.0)
+
+    def _ideal(self, flat: Array, phi: float) -> Array:
+        """(2, N) ideal points of measured ones (N, 2), both in units of phi."""
+        (p1, p2), (x, y) = self._across, flat.T
+        ideal = flat.T * horner(self._polynomial[1:], phi * np.hypot(x, y))
+        if p1 or p2:  # Brown's decentring
+            ideal -= 2.0 * p1 * x * y + p2 * (3.0 * x * x + y * y), p1 * (x * x + 3.0 * y * y) + 2.0 * p2 * x * y
+        return ideal
 
     def _mapped(self, flat: Array, phi: float) -> Array:
         """(2, 3, N) ideal points of measured ones (N, 2) in units of phi, and the derivatives of that by their x, y."""
         (p1, p2), (x, y), radius = self._across, flat.T, phi * np.hypot(flat[:, 0], flat[:, 1])
         stretch, slope = horner(self._polynomial[1:], radius), horner(derivative(self._polynomial), radius)
         bend = np.where(radius > 0.0, (slope - stretch) / (radius / phi) ** 2, 0.0)
-        across, down = p1 * x + p2 * y, p1 * y + p2 * x  # Brown's decentring, and the halves of its derivatives
-        ideal_x = x * stretch - (2.0 * p1 * x * y + p2 * (3.0 * x * x + y * y))
-        ideal_y = y * stretch - (p1 * (x * x + 3.0 * y * y) + 2.0 * p2 * x * y)
+        across, down = p1 * x + p2 * y, p1 * y + p2 * x  # halves of the decentring's derivatives
         xy = bend * x * y - 2.0 * across
         xx = stretch + bend * x * x - 2.0 * (down + 2.0 * p2 * x)
         yy = stretch + bend * y * y - 2.0 * (down + 2.0 * p1 * y)
+        ideal_x, ideal_y = self._ideal(flat, phi)
         return np.array([[ideal_x, xx, xy], [ideal_y, xy, yy]])
 
     def monotone_radius(self, phi: float) -> float:

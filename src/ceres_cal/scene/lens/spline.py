@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, grid_places, rms, two_digits
+from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 
@@ -128,6 +129,19 @@ class Growth(Frozen):
     """The profile u + G(u) in rims, of a lens that displaces by nothing else."""
 
     lens: Spline
+    width: ClassVar[float] = 1.0 / INTERVALS
+    below: ClassVar[Array] = NOTHING
+
+    @cached_property
+    def pieces(self) -> Array:
+        """(intervals + 1, degree + 1) polynomials of the intervals, and the straight line beyond the last knot."""
+        each = np.append(np.zeros(2), np.array(self.lens.values[1 : 1 + COUNT]) / self.lens.rim_px)
+        own = np.array([each[j : j + DEGREE + 1] @ table for j, table in enumerate(pieces())])
+        own[:, 0] += np.arange(INTERVALS) / INTERVALS
+        own[:, 1] += 1.0 / INTERVALS
+        beyond = np.zeros(DEGREE + 1)
+        beyond[:2] = np.sum(own[-1]), own[-1] @ np.arange(DEGREE + 1)
+        return np.vstack([own, beyond])
 
     def _at(self, x: Array, number: int) -> Array:
         places = np.column_stack([x.ravel(), np.zeros(x.size)])
@@ -223,7 +237,7 @@ class Spline(Planar):
         x, y = (side / _BEYOND * np.linspace(-1.0, 1.0, 4 * n) for side, n in zip(self._extents, _GRID, strict=True))
         plain = Spline(self.values[: len(_names(self.powers))], self.powers)
         with_it, without = (lens.mapped(grid_places(x, y))[:, 0] for lens in (self, plain))
-        size_px = self._rim_px * rms(np.linalg.norm(with_it - without, axis=0))
+        size_px = self.rim_px * rms(np.linalg.norm(with_it - without, axis=0))
         size = f"{two_digits(size_px)} px besides (rms over the picture)"
         return f"{said}; a surface of {len(NODES) // 2} nodes displaces by {size}"
 
@@ -246,7 +260,7 @@ class Spline(Planar):
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         start_weight = 1e-4  # of the roughness of a start beside its equations
-        rim = self._rim_px
+        rim = self.rim_px
         u = 2.0 * phi * np.tan(0.5 * angle) / rim
         sizes, directions = np.linalg.eigh(bending())
         rough = directions * np.sqrt(np.maximum(sizes, 0.0)) * start_weight
@@ -256,7 +270,7 @@ class Spline(Planar):
     @cached_property
     def roughness(self) -> tuple[Roughness, ...]:
         loose_surface, least_surface = 1e-3, 1e-5
-        rim, names = self._rim_px, self.names
+        rim, names = self.rim_px, self.names
         along = Roughness(names[1 : 1 + COUNT], bending(), _LOOSE * rim, _LEAST * rim)
         across = []
         for power in self.powers:
@@ -273,11 +287,12 @@ class Spline(Planar):
     # ---- its plane ---------------------------------------------------------------------------------------------------
 
     @property
-    def _rim_px(self) -> float:
+    def rim_px(self) -> float:
+        """How far the knots go; 1 where that is not set yet."""
         return self.values[0] if self.values[0] > 0.0 else 1.0
 
     def _unit(self, phi: float) -> float:
-        return self._rim_px
+        return self.rim_px
 
     @staticmethod
     def _flat(rays: Array) -> Array:
