@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import Target, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, simulate
+from ceres_cal.start import initialise
 
 NOISE = Disturbance(0.3, 0.3)
 MIRRORED: dict[str, Callable[[Array], Array]] = {
@@ -147,12 +149,19 @@ def test_what_is_seen_lies_behind() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(seed: int) -> None:
-    """Turned about another centre than the lens's, a strong lens fits no homography; another place was taken for it."""
+def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Turned about another centre than the lens's, a strong lens fits no homography; another place was taken for it.
+
+    A start that nothing stated can mend is sought no second time, but once more without the usual priors.
+    """
+    sought = Mock(wraps=initialise._start_camera)
+    monkeypatch.setattr(initialise, "_start_camera", sought)
     strong = {"camera": Camera((1280, 960), 700.0, (643.0, 475.0), Brown((-0.18, 0.05, 2e-4, -3e-4, 0.0)))}
     world = {"camera": Station("camera", overhead_pose(0.2, -0.1, 5.2, 8.0, 3.0, yaw_deg=90.0))}
     scene = field_scene(ssl_field("B"), strong, world, points=(), spacing_m=0.1)
     swapped = with_pixels(simulate(scene, NOISE, seed).observations, lambda pixels: pixels[:, ::-1].copy())
     shown = swapped.curves.pixels[:, 1] < 959.0
     text = refusal(swapped.part(np.zeros(0, bool), shown))
-    assert "mirrored" in text and "x and y are swapped" in text
+    assert "mirrored" in text and "x and y are swapped" in text and sought.call_count == 2  # it was 4

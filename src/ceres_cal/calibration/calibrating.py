@@ -197,17 +197,19 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
     little, loose = loosely(observations, free)
     if not options.closed_form_only and (little, loose) != (observations, options):
         asked = replace(task, stated=(observations, options))
-
-        def explained_first() -> Calibration:
-            start = initialise(sights, _named(free))
-            return _of_lens_asked(asked, start, replace(sights, observations=little), loose)
-
-        # quiet: there are too few observations without what is stated
-        found = attempt(explained_first)
-        # A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd off,
-        # and one of a few lines' outliers was not.
-        if isinstance(found, Calibration) and (found.conflicts or free is options):
-            return found
+        # quiet: there are too few observations without what is stated, here and after the start
+        start = attempt(partial(initialise, sights, _named(free)))
+        if isinstance(start, Start):
+            little_said = replace(sights, observations=little)
+            found = attempt(partial(_of_lens_asked, asked, start, little_said, loose))  # quiet: as for the start
+            # A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd
+            # off, and one of a few lines' outliers was not.
+            if isinstance(found, Calibration) and (found.conflicts or free is options):
+                return found
+        if free is options:  # there is no other start
+            if isinstance(start, CalibrationError):
+                raise start
+            return _of_lens_asked(task, start, sights, options)
     return _of_lens_asked(task, initialise(sights, _named(options)), sights, options)
 
 

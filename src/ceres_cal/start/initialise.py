@@ -145,10 +145,12 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
         seen = sights.take(own).about(blank)
         # What is stated may be wrong: it is asked where the views do not tell phi, or not where the camera stands.
         posed_by = partial(_start_camera, name, blank, seen, given, may_search=may_search)
-        one = attempt(partial(posed_by, ()))  # quiet: it is tried with what is stated, or fails so, too
+        one = attempt(partial(posed_by, ()))  # quiet: it is tried with what is stated, or ends with that
         own_priors = [p for p in priors if _concerns(p, name, seen)]
-        if isinstance(one, CalibrationError) or (own_priors and one.phi_from[name] == "guess"):
+        if own_priors and (isinstance(one, CalibrationError) or one.phi_from[name] == "guess"):
             one = posed_by(own_priors)
+        if isinstance(one, CalibrationError):
+            raise one
         places, there = ({int(own[n]): value for n, value in part.items()} for part in (one.places, one.open))
         parts.append(replace(one, numbers=own[one.numbers], places=places, open=there))
     return PosedSights(
