@@ -17,11 +17,15 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects.effect import AsBuilt
-from ceres_cal.observations import Prior
+from ceres_cal.observations import Prior, gather_sights
+from ceres_cal.problem import problem_of
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance, make_structure, numbers_by_kind
+from ceres_cal.robust.as_built import shifts_as_drawn
+from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.start.initialise import initialise
 
 BUILT = Options(lens="radial")
 DRAWN = replace(BUILT, as_built="as drawn")
@@ -102,6 +106,22 @@ def test_a_board_printed_longer_one_way_leaves_its_size_open() -> None:
     assert stretched.words == "it is 0.48 % longer along x than along y, and its size is known to 0.24 %"
     (pair,) = calibration.uncertainty.rig
     assert abs(pair.baseline_m - 0.12) < 2.0 * pair.baseline_sd_m < 0.001
+
+
+def test_what_may_be_as_drawn_counts_as_far_as_it_is_probable() -> None:
+    """A board that is bowed with a probability of 3 in 4: phi is as much wider as half of what the bow makes of it."""
+    _, observations = observed(Board(bow_m=1e-3), 0)
+    bowed, drawn = (replace(one, tolerances={"board": Tolerance(warp_m=2e-3)}) for one in (BUILT, DRAWN))
+    ends = []
+    for options in (bowed, replace(drawn, tolerances={})):
+        sights = gather_sights(observations)
+        start = initialise(sights, options).estimate
+        ends.append(solve_robustly(problem_of(sights, options, start), start))
+    keys, (shift,) = shifts_as_drawn([AsBuilt("board", "warp", 2e-3, 0.75)], ends[0])
+    phi = next(number for number, key in enumerate(keys) if key.quantity == "phi")
+    far = ends[0].estimate.cameras["camera"].phi - ends[1].estimate.cameras["camera"].phi
+    assert shift[phi] == pytest.approx(0.5 * far, rel=0.1)
+    assert shifts_as_drawn([AsBuilt("board", "warp", 2e-3, 1.0)], ends[0]) == ((), [])
 
 
 def test_few_numbers_are_held_by_little() -> None:

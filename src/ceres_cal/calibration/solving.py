@@ -34,7 +34,15 @@ from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
-from ceres_cal.robust.as_built import Built, require_measured, solve_as_built, solve_held, taking_part, tolerances_of
+from ceres_cal.robust.as_built import (
+    Built,
+    require_measured,
+    shifts_as_drawn,
+    solve_as_built,
+    solve_held,
+    taking_part,
+    tolerances_of,
+)
 from ceres_cal.robust.competing import Solver, Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
@@ -136,16 +144,17 @@ class Explained(Frozen):
     @property
     def shifts_at(self) -> ShiftsAt | None:
         """By which numbers scatter besides."""
-        unsteady, beside = self.unsteady, self.beside
-        if unsteady is None and beside is None:
+        beside, anywhere = self.beside, [shifts_as_drawn(self.as_built, self.end)]
+        if self.unsteady is not None:
+            anywhere.append((self.unsteady.keys, [*self.unsteady.shifts]))
+        if beside is None and not any(shifts for _, shifts in anywhere):
             return None
         here = self.problem if self.task.stated else None
 
         def shifts_at(there: Estimate, other: Problem | None) -> tuple[Sequence[Key], Sequence[Array]]:
-            keys, shifts = beside.shifts_at(there, other or here) if beside else (unsteady.keys if unsteady else (), ())
-            if unsteady is None:
-                return keys, shifts
-            return keys, [*shifts, *over(unsteady.shifts, unsteady.keys, keys)]
+            every = [*([beside.shifts_at(there, other or here)] if beside else []), *anywhere]
+            keys = tuple(dict.fromkeys(key for own, _ in every for key in own))
+            return keys, [over(shift, own, keys) for own, shifts in every for shift in shifts]
 
         return shifts_at
 
@@ -290,7 +299,7 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
         steady = unsteady.taken_off(again)
         end = solve_robustly(steady, start, None, task.progress, is_near=True)
         solved = Explained(task, steady, replace(first.start, estimate=start, is_near=True), end)
-        seen = replace(_explained(solved, steady.sights, Built()), unsteady=unsteady)
+        seen = _explained(replace(solved, unsteady=unsteady), steady.sights, Built())
     return seen
 
 
@@ -313,7 +322,7 @@ def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
         return solve_robustly(others, _start_of(others, some, first), task.scales)
 
     end, explanations = compete(first.problem, first.end, solved) if task.knows else (first.end, ())
-    seen = Explained(task, replace(first.problem, sights=drawn), first.start, end, explanations)
+    seen = replace(first, problem=replace(first.problem, sights=drawn), end=end, explanations=explanations)
     if task.before is None:
         seen = _of_targets(seen, solved, built)
     require_fits(seen.end, seen.problem)
@@ -324,14 +333,15 @@ def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
 def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
-    is_asked = problem.options.as_built == "estimate"
+    is_asked, views = problem.options.as_built == "estimate", seen.unsteady.of_views if seen.unsteady else None
     if is_asked:
-        end, problem, explanations, as_built = solve_as_built(problem, end, explanations, solved, built)
+        end, problem, explanations, as_built = solve_as_built(problem, end, explanations, solved, built, views)
     if is_asked and estimated(problem.observations):
         part, is_all = taking_part(problem, explanations), seen.task.settle is None
         beside = solve_beside_effects(problem, part, end, solves=is_all)
         problem, end = beside.problem, beside.end
-    return Explained(seen.task, problem, seen.start, end, explanations, as_built, beside).at_least
+    now = replace(seen, problem=problem, end=end, explanations=explanations, as_built=as_built, beside=beside)
+    return now.at_least
 
 
 def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, field, log_f_tail, replace
 from ceres_cal.effects.linearised import LEAST_LEFT, Linearised, inverse_roots
+from ceres_cal.problem import Equations, Estimate, unit_px
 
 
 class EffectColumns(Frozen):
@@ -409,3 +410,22 @@ def _rivals(
         and left.get((id(score.effect), score.number), 0.0) > log_level
     ]
     return tuple(sorted(near, key=lambda score: score.log_p))
+
+
+def smooth_image(equations: Equations, estimate: Estimate) -> Array:
+    """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
+    radius.
+    """
+    every = []
+    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
+    owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
+    for name in equations.sights.cameras:
+        camera = estimate.cameras[name]
+        place = (equations.pixel - camera.principal_point) / unit_px(camera)
+        x, y = place.T
+        smooth = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+        along = np.sum(place * equations.direction, axis=1)
+        radial = [np.sum(place**2, axis=1) ** power * along for power in powers]
+        columns = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
+        every.append(np.column_stack(columns) * (owner == name)[:, None])
+    return np.column_stack(every)

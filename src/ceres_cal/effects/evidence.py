@@ -343,9 +343,13 @@ class RepeatedAmounts(Frozen):
         return self.scatter(numbers, others, prior, tells, max(within, 1.0))
 
     def sizes(
-        self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior]
+        self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior], stated: Others = ()
     ) -> dict[_Name, tuple[float, float]]:
-        """Sigma and probability of each effect by name, beside those of the others that are likely."""
+        """Sigma and probability of each effect by name, beside those of the others that are likely.
+
+        Args:
+            stated: others, beside which all of them are.
+        """
         sweeps, no_change = 2, 0.1  # over the effects, each beside the others; of the logarithm of one of their sigmas
         found: dict[_Name, tuple[float, float]] = {}
         asked: dict[_Name, dict[_Name, float]] = {}
@@ -361,6 +365,6 @@ class RepeatedAmounts(Frozen):
             ):
                 found[name] = before
                 continue
-            others = [(numbers[one], sigma) for one, sigma in beside.items()]
+            others = [*stated, *((numbers[one], sigma) for one, sigma in beside.items())]
             found[name], asked[name] = self._size(own, others, priors[name]), beside
         return found

@@ -14,16 +14,25 @@ together tell, are. The posterior has them under their sigmas like any tolerance
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base import Array, DegenerateError, Frozen, Indices, field, replace, rms
-from ceres_cal.effects import AsBuilt, Explanation, Linearised, SparseColumns, Weights, make_linear_model
-from ceres_cal.effects.evidence import AS_BUILT, HEIGHTS, LIKELY, STRETCHED, RepeatedAmounts, agreement
+from ceres_cal.effects import AsBuilt, Explanation, Linearised, SparseColumns, Weights, make_linear_model, smooth_image
+from ceres_cal.effects.evidence import (
+    AS_BUILT,
+    HEIGHTS,
+    LIKELY,
+    STRETCHED,
+    Others,
+    RepeatedAmounts,
+    SizePrior,
+    agreement,
+)
 from ceres_cal.observations import Observations, Prior, Sights
-from ceres_cal.problem import Estimate, Options, Problem, gather_priors, unit_px
+from ceres_cal.problem import Estimate, Key, Options, Problem, gather_priors
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import Equations, equations_of, whole_structure
 from ceres_cal.problem.structure import EXACT, Kind, Structure, Tolerance, make_structure, numbers_by_kind, redrawn
@@ -33,6 +42,17 @@ from ceres_cal.scene.targets import Target
 
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
 _STILL = 0.5  # standard deviations by which offsets may still move: what five bows are is known to a hundredth
+
+
+class OfViews(Frozen):
+    """What displaces single views, each in its own way, and is taken off the observations.
+
+    Attributes:
+        displacement: (N + M, 2) px. columns: of a model, those of its amounts, and these with their sigmas.
+    """
+
+    displacement: Array
+    columns: Callable[[Linearised], tuple[SparseColumns, Others]]
 
 
 class Built(Frozen):
@@ -59,13 +79,20 @@ AS_DRAWN = Built()
 
 
 def solve_as_built(
-    problem: Problem, end: RobustSolution, explanations: tuple[Explanation, ...], solver: Solver, built: Built
+    problem: Problem,
+    end: RobustSolution,
+    explanations: tuple[Explanation, ...],
+    solver: Solver,
+    built: Built,
+    views: OfViews | None = None,
+    left_out: frozenset[tuple[str, Kind]] = frozenset(),
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
     """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
 
     Args:
         problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
-            drawn as `built`. solver: of some of the observations, see `compete`.
+            drawn as `built`. solver: of some of the observations, see `compete`. views: what was taken off.
+        left_out: targets and kinds that are as drawn.
     """
     observations, options, stated = problem.observations, problem.options, end.estimate.structure
 
@@ -78,7 +105,7 @@ def solve_as_built(
         structure = make_structure(observations.targets, tolerances, options.dimensions)
         return structure.carrying(there.whole, end.estimate.structure)
 
-    now = estimate_as_built(problem, _freed(end, problem, freed(built)) if built.every else end)
+    now = estimate_as_built(problem, _freed(end, problem, freed(built)) if built.every else end, left_out)
     if not now.every:
         if built.every:
             end, explanations = compete(problem, solved(now), solver)
@@ -86,7 +113,7 @@ def solve_as_built(
     before, rounds, change = now, 1, _change(now, built)
     end = solved(before)
     while change > 2.0 and rounds < _MOST_ROUNDS:  # the next one is less than half of it
-        now = estimate_as_built(problem, _freed(end, problem, freed(before)))
+        now = estimate_as_built(problem, _freed(end, problem, freed(before)), left_out)
         change = _change(now, before) if now.every else 0.0
         if change > 1.0:
             before, rounds = now, rounds + 1
@@ -95,12 +122,18 @@ def solve_as_built(
     if _change(before, built) > 1.0:
         end, explanations = compete(_held(problem, before), end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
-    problem = replace(problem, priors=gather_priors(observations, options, structure))
+    as_drawn, problem = problem, replace(problem, priors=gather_priors(observations, options, structure))
     part = taking_part(problem, explanations)
     if _is_held(every, problem):
         end = _as_measured(part, end, structure)
     else:
         end = solve_robustly(part, replace(end.estimate, structure=structure), is_near=True)
+    if views is not None:
+        every = tuple(_beside_views(every, end, stated, views))
+        if unlikely := frozenset((one.target, one.kind) for one in every if one.probability < LIKELY):
+            fewer = Built(tuple(one for one in every if one.probability >= LIKELY), structure)
+            near = compete(_held(as_drawn, fewer), solved(fewer), solver)
+            return solve_as_built(as_drawn, *near, solver, fewer, views, left_out | unlikely)
     end, structure = end.moved_to(end.estimate, problem), end.estimate.structure
     return end, problem, explanations, tuple(_measured(every, structure, observations.targets))
 
@@ -125,6 +158,50 @@ def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) ->
     """The end of the problem with targets held as they are built, judged where these are free."""
     settled = replace(end.solution, estimate=replace(end.estimate, structure=structure))
     return replace(judge_at(problem, settled.estimate), solution=settled, rounds=end.rounds)
+
+
+def _beside_views(
+    every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: OfViews
+) -> Iterator[AsBuilt]:
+    """The same as probable as they are where single views may be displaced otherwise, too.
+
+    What was taken off of these followed what was solved for with it, and would say it again: halves of a set found
+    a board of which pictures have a rolling shutter .4 % longer and .9 % shorter, each at a probability of 1.
+    """
+    most_sights = 40  # of a camera: each has numbers of its own
+    targets = end.problem.observations.targets
+    structure = whole_structure(targets, {one.target for one in every if one.kind == "heights"})
+    equations, weights = _equations(stated, end, some_sights(end.problem.sights, most_sights), views)
+    model, numbers = _drawn(equations, weights, stated, end), numbers_by_kind(structure, targets)
+    own, (of_views, sizes) = _columns(structure, equations, weights), views.columns(model)
+    repeats = RepeatedAmounts.of(model, SparseColumns.side_by_side([own, of_views], len(equations)))
+    kinds = {(one.target, one.kind): numbers[one.target, one.kind] for one in every}
+    known = [(own.size + at, sigma) for at, sigma in sizes]
+    found = repeats.sizes(kinds, _priors(kinds, targets), known)
+    for one in every:
+        yield replace(one, probability=found[one.target, one.kind][1])
+
+
+def shifts_as_drawn(every: Sequence[AsBuilt], end: RobustSolution) -> tuple[Sequence[Key], list[Array]]:
+    """Numbers, and by how much they scatter for kinds of features that may be where they are drawn, as far as that is
+    probable.
+
+    Args:
+        end: with everything solved for that is likely not where it is drawn.
+    """
+    negligible = 0.01  # probability: nothing is visibly wider
+    doubtful = [one for one in every if 1.0 - one.probability > negligible]
+    if not doubtful:
+        return (), []
+    known, structure = end.told.shared, end.estimate.structure
+    numbers = numbers_by_kind(structure, end.problem.observations.targets)
+    shifts = []
+    for one in doubtful:
+        own = numbers[one.target, one.kind]
+        at = known.columns([structure.keys[number] for number in own])
+        following = known.spread.covariance[:, at] @ np.linalg.inv(known.spread.covariance[np.ix_(at, at)])
+        shifts.append((1.0 - one.probability) ** 0.5 * following @ structure.values[own])
+    return known.keys, shifts
 
 
 def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:
@@ -258,18 +335,21 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
 _REPEATS = 2.0
 
 
-def estimate_as_built(problem: Problem, end: RobustSolution) -> Built:
+def estimate_as_built(
+    problem: Problem, end: RobustSolution, left_out: frozenset[tuple[str, Kind]] = frozenset()
+) -> Built:
     """The kinds of features that are likely not where they are drawn, of targets without a stated tolerance; and the
     whole structure with their likeliest offsets, and those of stated tolerances as they are.
 
     Args:
-        problem: of all the observations. end: of its rounds.
+        problem: of all the observations. end: of its rounds. left_out: targets and kinds that are not asked.
     """
     most_screened, most_sights = 12, 200  # of a camera: that are asked first, and that tell the sigma
     targets, tolerances = problem.observations.targets, problem.options.tolerances
     structure, dimensions = whole_structure(targets), problem.options.dimensions
     stated = make_structure(targets, tolerances, dimensions).carrying(end.estimate.structure)
-    kinds = {of: n for of, n in numbers_by_kind(structure, targets).items() if of[0] not in tolerances}
+    numbered = numbers_by_kind(structure, targets).items()
+    kinds = {of: n for of, n in numbered if of[0] not in tolerances and of not in left_out}
     if len(end.problem.sights) < 2 or not kinds:
         return Built((), structure.carrying(stated))
     sights = some_sights(end.problem.sights, most_screened)
@@ -282,8 +362,8 @@ def estimate_as_built(problem: Problem, end: RobustSolution) -> Built:
     # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved. But
     # heights, as many as points, took up what a wrong floor left of eight views of a board: they repeat by themselves.
     structure = whole_structure(targets, {target for target, kind in repeat if kind == "heights"})
-    numbered = numbers_by_kind(structure, targets)
-    kinds, as_stated = {of: numbered[of] for of in kinds if of in numbered}, structure.carrying(stated)
+    asked = numbers_by_kind(structure, targets)
+    kinds, as_stated = {of: asked[of] for of in kinds if of in asked}, structure.carrying(stated)
     equations, weights = _equations(stated, end, some_sights(end.problem.sights, most_sights))
     model = _drawn(equations, weights, stated, end)
     repeats = RepeatedAmounts.of(model, _columns(structure, equations, weights))
@@ -310,15 +390,20 @@ def some_sights(sights: Sights, most: int) -> Sights:
 # ---- columns of the structure ---------------------------------------------------------------------------------------
 
 
-def _equations(stated: Structure, end: RobustSolution, sights: Sights) -> tuple[Equations, Weights]:
-    """Of some sights, with the residuals to the drawing, offsets that were found before taken off."""
+def _equations(
+    stated: Structure, end: RobustSolution, sights: Sights, views: OfViews | None = None
+) -> tuple[Equations, Weights]:
+    """Of some sights, with the residuals to the drawing: offsets that were found before, and what displaces views, are
+    not taken off.
+    """
     estimate = end.estimate
     equations = equations_of(sights, estimate, end.residuals)
     stated_alone = stated.carrying(estimate.structure)
     before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
     solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
     weights = end.weights_of(equations)
-    return replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1)), weights
+    drawn = equations.residual - np.sum(equations.built * solved, axis=1)
+    return replace(equations, residual=drawn - equations.along(views.displacement) if views else drawn), weights
 
 
 def _columns(structure: Structure, equations: Equations, weights: Weights) -> SparseColumns:
@@ -336,25 +421,6 @@ def _drawn(equations: Equations, weights: Weights, stated: Structure, end: Robus
     return model.with_columns(smooth_image(equations, estimate))
 
 
-def smooth_image(equations: Equations, estimate: Estimate) -> Array:
-    """(E, K) smooth displacements of each camera's image, of order one at its corners: polynomials, and powers of the
-    radius.
-    """
-    every = []
-    degree, powers = 3, (0.5, 1.5, 2.0, 2.5, 3.0, 4.0)  # of smooth displacements of the image; of r^2 along the radius
-    owner = np.array([key.camera for key in equations.sights.keys])[equations.sight]
-    for name in equations.sights.cameras:
-        camera = estimate.cameras[name]
-        place = (equations.pixel - camera.principal_point) / unit_px(camera)
-        x, y = place.T
-        smooth = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
-        along = np.sum(place * equations.direction, axis=1)
-        radial = [np.sum(place**2, axis=1) ** power * along for power in powers]
-        columns = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
-        every.append(np.column_stack(columns) * (owner == name)[:, None])
-    return np.column_stack(every)
-
-
 # ---- the sigmas -----------------------------------------------------------------------------------------------------
 
 
@@ -362,11 +428,14 @@ def _likely(
     repeats: RepeatedAmounts, kinds: Mapping[tuple[str, Kind], Indices], targets: Mapping[str, Target]
 ) -> Iterator[AsBuilt]:
     """The kinds that more likely scatter than not, each beside those of the others that do."""
-    extents = {target: _longer_side_m(targets[target]) for target, _ in kinds}
-    rare = {"heights": HEIGHTS, "stretch": STRETCHED}
-    priors = {of: rare.get(of[1], AS_BUILT).times(extents[of[0]]) for of in kinds}
-    sizes = repeats.sizes(kinds, priors)
+    sizes = repeats.sizes(kinds, _priors(kinds, targets))
     for target, kind in kinds:
         sigma, probability = sizes.get((target, kind), (0.0, 0.0))
         if probability > LIKELY:
             yield AsBuilt(target, kind, sigma, probability)
+
+
+def _priors(kinds: Iterable[tuple[str, Kind]], targets: Mapping[str, Target]) -> dict[tuple[str, Kind], SizePrior]:
+    """What is expected of each."""
+    rare = {"heights": HEIGHTS, "stretch": STRETCHED}
+    return {of: rare.get(of[1], AS_BUILT).times(_longer_side_m(targets[of[0]])) for of in kinds}

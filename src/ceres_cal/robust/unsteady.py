@@ -22,14 +22,30 @@ from itertools import pairwise
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Mask, first_of, replace, two_digits
-from ceres_cal.effects import Linearised, SparseColumns, Weights, equation_weights, make_linear_model, posed
+from ceres_cal.effects import (
+    Linearised,
+    SparseColumns,
+    Weights,
+    equation_weights,
+    make_linear_model,
+    posed,
+    smooth_image,
+)
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
-from ceres_cal.effects.evidence import CENTRE_MOVES, LENS_LEAVES, LIKELY, SMOOTH_ERRORS, RepeatedAmounts, shifts_by
+from ceres_cal.effects.evidence import (
+    CENTRE_MOVES,
+    LENS_LEAVES,
+    LIKELY,
+    SMOOTH_ERRORS,
+    Others,
+    RepeatedAmounts,
+    shifts_by,
+)
 from ceres_cal.effects.table.lens import lens_changes
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Key, Problem, free_keys
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, write_equations
-from ceres_cal.robust.as_built import smooth_image
+from ceres_cal.robust.as_built import OfViews
 from ceres_cal.robust.robust import RobustSolution
 
 MOVES, ROLLING = "principal point moves", "rolling shutter"
@@ -79,6 +95,19 @@ class Unsteady(Frozen):
         points = len(problem.observations.points)
         sights = problem.sights.displaced(-self.displacement[:points], -self.displacement[points:])
         return replace(problem, sights=sights, taken_up=self.taken_up)
+
+    @property
+    def of_views(self) -> OfViews:
+        """The same where something else is asked."""
+        return OfViews(self.displacement, self._columns)
+
+    def _columns(self, model: Linearised) -> tuple[SparseColumns, Others]:
+        columns, keys = _of_views(model), model.equations.sights.keys
+        of_mode = np.tile(_OF_MODE, len(keys))
+        camera = np.repeat([key.camera if key.placement else "" for key in keys], len(_OF_MODE))
+        likely = ((name, kind, sigma) for name, one in self.sizes.items() for kind, sigma in one.items())
+        each = [(np.flatnonzero((camera == name) & (of_mode == kind)), sigma) for name, kind, sigma in likely]
+        return columns, [(numbers, sigma) for numbers, sigma in each if len(numbers)]
 
     def estimates(self, observations: Observations) -> tuple[EffectEstimate, ...]:
         """What is said of each camera."""
@@ -210,6 +239,13 @@ def _seem_displaced(equations: Equations, weights: Weights) -> bool:
     return bool(2.0 * taken > np.sum(squares)) or moves
 
 
+def _of_views(model: Linearised) -> SparseColumns:
+    """Of the coefficients of each view, one after the other."""
+    equations = model.equations
+    weighted = _modes(equations) * model.weight[:, None]
+    return SparseColumns.of_groups(model, weighted, equations.sight, len(equations.bounds) - 1)
+
+
 def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     """Those that are likely, each beside the others, where principal points move or the read-out says most; and the
     mean square of the noise beside all of them.
@@ -222,12 +258,11 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     # views of a public stereo camera, lenses predict other views worse by a tenth; at 2 to 4, in 17 of a GoPro held by
     # hand, its halves agree to 1.1 of what is stated instead of 2.0. Of fewer it may be the lens's, or the target's.
     says_most, enough_views = 1.75, 10
-    modes, views = _modes(model.equations), len(model.equations.bounds) - 1
-    of_views = SparseColumns.of_groups(model, modes * model.weight[:, None], model.equations.sight, views)
+    of_views, views = _of_views(model), len(model.equations.bounds) - 1
     together = np.zeros(len(image), dtype=np.int64)
     alike = SparseColumns.of_groups(model, image * model.weight[:, None], together, 1)
     repeated = RepeatedAmounts.of(model, SparseColumns.side_by_side([of_views, alike], len(image)))
-    if repeated.spare < modes.shape[1]:
+    if repeated.spare < len(_OF_MODE):
         return {}, 1.0
     numbers = {kind: np.flatnonzero(np.tile(kind == _OF_MODE, views)) for kind in _MODES}
     numbers = {_IMAGE: of_views.size + np.arange(alike.size), **numbers}
