@@ -194,6 +194,10 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
     A height 25 % wrong was taken up by a principal point that moves from view to view and by a board that is bent.
     """
     sights, free = gather_sights(observations), freed(observations, options)
+
+    def as_asked() -> Calibration:
+        return _of_lens_asked(task, initialise(sights, _named(options)), sights, options)
+
     little, loose = loosely(observations, free)
     if not options.closed_form_only and (little, loose) != (observations, options):
         asked = replace(task, stated=(observations, options))
@@ -202,15 +206,18 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
         if isinstance(start, Start):
             little_said = replace(sights, observations=little)
             found = attempt(partial(_of_lens_asked, asked, start, little_said, loose))  # quiet: as for the start
-            # A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd
-            # off, and one of a few lines' outliers was not.
             if isinstance(found, Calibration) and (found.conflicts or free is options):
                 return found
+            if isinstance(found, Calibration):
+                # A number that is held, and agrees, tells the rest: without it another lens was taken, and a height
+                # 10 sd off, and one of a few lines' outliers was not.
+                again = attempt(as_asked)  # quiet: from where it starts nothing agrees; what was found does
+                return again if isinstance(again, Calibration) and not again.conflicts else found
         if free is options:  # there is no other start
             if isinstance(start, CalibrationError):
                 raise start
             return _of_lens_asked(task, start, sights, options)
-    return _of_lens_asked(task, initialise(sights, _named(options)), sights, options)
+    return as_asked()
 
 
 def _of_lens_asked(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:

@@ -174,14 +174,16 @@ class Explained(Frozen):
         sights = replace(self.problem.sights, observations=observations)
         layout = make_layout(observations, options)
         problem = replace(self.problem, sights=sights, layout=layout, options=options, priors=(*every, *others))
-        part, start = taking_part(problem, self.explanations), as_held(here, options)
-        near = partial(solve_robustly, usual=self.task.scales, progress=self.task.progress, is_near=True)
-        end = solve_held(near, part, start, self.as_built)
+        part, elsewhere = taking_part(problem, self.explanations), [as_held(one, options) for one in self.start.others]
+        start, is_near = as_held(here, options), layout.size == self.problem.layout.size
+        if not is_near:  # it was moved to what is held: without that another minimum may have been the least
+            start, _ = least_of_few(part, start, elsewhere, is_whole=part is problem)
+        solver = partial(solve_robustly, usual=self.task.scales, progress=self.task.progress, is_near=is_near)
+        end = solve_held(solver, part, start, self.as_built)
         if part is not problem:
             end = replace(end, residuals=residuals(sights, end.estimate))
         phi_from = dict.fromkeys(self.start.phi_from, "fixed") if "phi" in options.fixed else self.start.phi_from
-        elsewhere = tuple(as_held(one, options) for one in self.start.others)
-        begun = replace(self.start, phi_from=phi_from, others=elsewhere)
+        begun = replace(self.start, phi_from=phi_from, others=tuple(elsewhere))
         return replace(self, problem=problem, start=begun, end=end).at_least
 
     @property

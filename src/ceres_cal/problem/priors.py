@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, InputError, field, replace, rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
-from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options, intrinsic_names
+from ceres_cal.problem.parameters import AUTO, OF_PIXELS, Estimate, Options, intrinsic_names
 from ceres_cal.problem.quantities import FINEST, intrinsic_keys, values_of
 from ceres_cal.problem.structure import Structure
 from ceres_cal.scene import Camera, Lens
@@ -202,8 +202,8 @@ def stated_priors(
 
 
 def freed(observations: Observations, options: Options) -> Options:
-    """The options with what they hold of cameras stated as closely as anything is; coefficients of lenses, which have
-    no size to be known to a share of, are free.
+    """The options with what they hold of cameras stated as closely as anything is; of coefficients, which have no size
+    to be known to a share of, to a tenth of the solver's unit.
     """
     held = {name: (value,) for name, value in options.fixed.items() if name in OF_PIXELS}
     each = list[Prior]()
@@ -211,11 +211,21 @@ def freed(observations: Observations, options: Options) -> Options:
         middle = () if options.free_principal_point else tuple(0.5 * (side - 1.0) for side in size)
         own = {**held, "principal_point": middle} if middle else held
         each += [Prior("camera", name, one, value, (FINEST,) * len(value)) for one, value in own.items()]
-    fixed = {name: value for name, value in options.fixed.items() if name == "skew"}
-    if not each and fixed == options.fixed:
+        sizes = {} if options.lens == AUTO else _loose(options.of_camera(name).blank_lens, size)
+        loose = {one: (value, sizes[one]) for one, value in options.fixed.items() if one in sizes}
+        each += [Prior("camera", name, one, (value,), (sigma,), True) for one, (value, sigma) in loose.items()]
+    if not each:
         return options
+    fixed = {name: value for name, value in options.fixed.items() if name == "skew"}
     free_aspect, priors = "aspect" in held or options.free_aspect, (*options.priors, *each)
     return replace(options, fixed=fixed, free_principal_point=True, free_aspect=free_aspect, priors=priors)
+
+
+def _loose(lens: Lens, image_size: tuple[int, int]) -> dict[str, float]:
+    """What a coefficient that is held counts as known to, until all else is explained."""
+    units = 1.0 / lens.scales(0.5 * float(np.hypot(*image_size)))
+    each = zip(lens.names, units.tolist(), strict=True)
+    return {name: USUAL_DECENTRING if name in lens.tangential else VAGUE * unit for name, unit in each}
 
 
 def loosely(observations: Observations, options: Options) -> tuple[Observations, Options]:
