@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, root_of
 from ceres_cal.problem.information import Information, Key
 
 KEYS = tuple(Key("camera", "overhead", f"k{number}", "1") for number in range(6))
@@ -72,6 +72,15 @@ def test_shifts_add_to_the_covariance(seed: int, count: int, shifts: int) -> Non
     known = drawn(seed, count)
     steps = np.random.default_rng(seed).standard_normal((shifts, count)) / np.sqrt(np.diagonal(known.matrix))
     assert close(inverse(known.widened(steps).matrix), inverse(known.matrix) + steps.T @ steps, 1e-6)
+
+
+@given(seeds, st.integers(3, 6), st.booleans())
+def test_a_root_is_one_of_a_singular_matrix_too(seed: int, count: int, singular: bool) -> None:
+    matrix = drawn(seed, count, rank=count - 2 * singular).matrix
+    unit = np.sqrt(np.diagonal(matrix))
+    scaled = matrix / unit[:, None] / unit
+    root = root_of(scaled)
+    np.testing.assert_allclose(root.T @ root, scaled, atol=1e-12)
 
 
 @given(seeds, st.integers(3, 6), st.floats(1.0, 1e6))

@@ -128,6 +128,7 @@ def test_a_plan_names_the_first_of_many_photographs() -> None:
     assert _short("ceres-cal detect field 0.jpg 1.jpg -o x") == "ceres-cal detect field 0.jpg 1.jpg -o x"
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_a_folder_of_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,7 @@ Shapes stand in the docstrings.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -169,14 +169,29 @@ def are_known(information: Array, limits: Array) -> bool:
 
 def _regular_inverses(scaled: Array) -> Array | None:
     """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
-    try:
-        inverse = np.linalg.inv(scaled)
-    except np.linalg.LinAlgError:  # quiet: eigenvalues are asked instead, and a direction that is unknown stays so
+    inverse = _unless_singular(np.linalg.inv, scaled)
+    if inverse is None:
         return None
     sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
     most = 1e8  # the inverse of an eigenvalue near to being unknown; plain inverses are good to 1e-7 there
     regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < most)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
+
+
+def root_of(matrix: Array) -> Array:
+    """(n, n) root with root^T root = matrix, which is symmetric and has no negative eigenvalue but by rounding."""
+    lower = _unless_singular(np.linalg.cholesky, matrix)
+    if lower is not None:  # in a tenth of the time
+        return lower.T
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+
+
+def _unless_singular(function: Callable[[Any], Any], matrix: Array) -> Array | None:
+    try:
+        return np.asarray(function(matrix))
+    except np.linalg.LinAlgError:  # quiet: eigenvalues are asked instead, and a direction that is unknown stays so
+        return None
 
 
 def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, known_inverses, without
+from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, known_inverses, root_of, without
 from ceres_cal.observations.sights import STRUCTURE, Owner
 
 _TURNS = ("turn_x", "turn_y", "turn_z")
@@ -166,8 +166,7 @@ class Information(Frozen):
         if not len(shifts):
             return self
         unit = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(self.matrix / unit[:, None] / unit)
-        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit
+        root = root_of(self.matrix / unit[:, None] / unit) * unit
         along, sizes, _ = np.linalg.svd(root @ shifts.T, full_matrices=False)
         left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
         return Information(self.keys, left.T @ left)

@@ -139,7 +139,7 @@ def _for_page(text: str) -> str:
     named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in named else "", text)
     text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
-    text = re.sub(r' d="[^"]+"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)  # a hundredth of a point
+    text = re.sub(r' d="[^"]+"', lambda match: re.sub(r"(?<=\.\d\d)\d+", "", match[0]), text)  # a hundredth of a point
     text = re.sub(r"#[0-9a-f]{6}\b", lambda match: _themed(match[0]), text)
     text = text.replace("xlink:href", "href")
     return re.sub(r"\n\s*", "\n", text).strip()
