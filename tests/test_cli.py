@@ -265,7 +265,6 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        ((), "which command?"),
         (("frobnicate",), "no command 'frobnicate'"),
         (("--json",), "no command '--json'"),
         (("detect",), "detect what: "),
@@ -304,6 +303,11 @@ def test_wrong_usage_is_one_line(say: Say, arguments: Sequence[object], words: s
     os.chdir(tmp_path)
     assert words in refused(say(*arguments))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_command_lists_all_of_them(say: Say) -> None:
+    said, asked = say(), say("--help")
+    assert (said.code, said.out, said.err) == (2, asked.out, "") and asked.code == 0
 
 
 def test_choices_are_those_of_the_package() -> None:

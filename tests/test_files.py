@@ -182,5 +182,24 @@ def test_convert_names_the_place() -> None:
         convert({"size": [3, 4], "a\nb": 1}, Shape, "here")
 
 
+class Shapes(msgspec.Struct, forbid_unknown_fields=True):
+    shape: dict[str, Shape]
+    sizes: list[Shape] = []
+
+
+@pytest.mark.parametrize(
+    "data, words",
+    [
+        ({"shapes": {}}, r"'shapes': did you mean 'shape'\?"),
+        ({"shape": {"a": {"sise": [3, 4]}}}, r"'sise' in shape.a: did you mean 'size'\?"),
+        ({"shape": {}, "sizes": [{"size": [3, 4], "siz": 1}]}, r"'siz' in sizes\[0\]: remove it, or correct its name"),
+        ({"shape": {}, "size": []}, r"'size': did you mean 'sizes'\?"),
+    ],
+)
+def test_a_misspelt_field_is_told_by_those_beside_it(data: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=f"^here: there is no field {words}$"):
+        convert(data, Shapes, "here")
+
+
 def test_check_header_hands_the_data_on() -> None:
     assert check_header(HEADER | {"a": 1}, "here", "ceres-cal/test", 3) == HEADER | {"a": 1}

@@ -62,6 +62,10 @@ def test_a_height_in_millimetres_is_asked_about_whatever_its_sigma(sigma: float)
         ({"priors": (phi(8.0),)}, r"phi of camera 'overhead' is 8 px.*is it in mm\?"),
         ({"priors": (phi(8.0e5),)}, "phi of camera 'overhead' is 800000 px"),
         ({"priors": (Prior("camera", "overhead", "cy", (1e6,), (5.0,)),)}, "cy of camera 'overhead' is 1e"),
+        (  # which took 24 s, and failed numerically
+            {"priors": (Prior("camera", "overhead", "principal_point", (9000.0, 240.0), (5.0, 5.0)),)},
+            "principal_point of camera 'overhead' is 9000 px, but it is at most",
+        ),
         ({"priors": (length(9000.0),)}, r"field_length_m of target 'field' is 9000 m.*drawn with 9 m; is it in mm\?"),
         ({"tolerances": {"field": Tolerance(lines_m=10.0)}}, r"tolerance lines_m of target 'field'.*is it in mm\?"),
         ({"tolerances": {"board": Tolerance(warp_m=2.0)}}, r"tolerance warp_m of target 'board'.*is it in mm\?"),

@@ -21,7 +21,7 @@ from typing import IO, Any, Literal, TypeVar, cast
 import msgspec
 
 from ceres_cal.base.errors import InputError, note
-from ceres_cal.base.words import printable
+from ceres_cal.base.words import did_you_mean, printable
 
 T = TypeVar("T")
 Units = Literal["metres, radians, pixels"]
@@ -285,14 +285,15 @@ def convert(data: Any, kind: type[T], where: str) -> T:
 def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
     """What msgspec says, with the place as a path of names, and with what a missing field means."""
     said, _, path = message.partition(" - at `$")
-    names = _path(path.rstrip("`"), message, data, kind)
+    names, there = _path(path.rstrip("`"), message, data, kind)
     place = "".join(f"[{name}]" if isinstance(name, int) else f".{name}" for name in names).lstrip(".")
     if found := re.fullmatch(r"Object missing required field `(\w+)`", said):
         meaning = _MEANING.get(found[1])
         text = f"{found[1]!r} is missing{f' ({meaning})' if meaning else ''}"
         return f"{text} in {place}" if place else text
     if found := re.fullmatch(r"Object contains unknown field `(.+)`", " ".join(said.split())):
-        return f"there is no field {found[1]!r}{f' in {place}' if place else ''}: remove it, or correct its name"
+        meant = _meant(found[1], there, kind) or ": remove it, or correct its name"
+        return f"there is no field {found[1]!r}{f' in {place}' if place else ''}{meant}"
     if found := re.fullmatch(r"Invalid enum value (.*)", said):
         must = {"units": UNITS, "pixel_origin": PIXEL_ORIGIN}.get(str(names[-1]) if names else "")
         said = f"{found[1]} cannot be read" + (f": give the file in {must!r}" if must else "")
@@ -301,8 +302,16 @@ def _in_plain_words(message: str, data: Any, kind: type[Any]) -> str:
     return f"{said}, in {place}" if place else said
 
 
-def _path(path: str, message: str, data: Any, kind: type[Any]) -> list[str | int]:
-    """The names on a path of msgspec's, which has [...] for names in a mapping: those without which all is well."""
+def _meant(name: str, there: Any, kind: type[Any]) -> str:
+    """The field that an unknown one is much like, of the structures that have most of those that stand beside it."""
+    every = msgspec.json.schema_components([kind])[1].values()
+    fields = [{*one["properties"]} for one in every if name not in one.get("properties", {name})]
+    most = max((len(one & {*there}) for one in fields), default=0)
+    return did_you_mean(name, set().union(*(one for one in fields if len(one & {*there}) == most)) - {*there})
+
+
+def _path(path: str, message: str, data: Any, kind: type[Any]) -> tuple[list[str | int], Any]:
+    """The names on a path of msgspec's, for [...] the one without which all is well, and what stands there."""
     names: list[str | int] = []
     here: Any = data
     for part in re.findall(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]", path):
@@ -312,7 +321,7 @@ def _path(path: str, message: str, data: Any, kind: type[Any]) -> list[str | int
             names.append(int(part[1]) if part[1] else part[0])
         is_there = names[-1] in here if isinstance(here, dict) else isinstance(here, list)
         here = here[names[-1]] if is_there else None
-    return names
+    return names, here
 
 
 def _is_well(data: Any, names: list[str | int], key: str, kind: type[Any], message: str) -> bool:

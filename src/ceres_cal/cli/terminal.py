@@ -293,9 +293,9 @@ def _fail(message: str, exit_code: int, as_json: bool) -> int:
 
 def _run(arguments: list[str]) -> int:
     beginning = " ".join(arguments[:-1])
-    if arguments[-1:] in (["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
+    if arguments[-1:] in ([], ["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
         print(_overview(beginning))
-        return 0
+        return 0 if arguments else InputError.exit_code
     if "--version" in arguments:
         print(", ".join(f"{name} {version}" for name, version in calibration.package_versions().items()))
         return 0
@@ -312,8 +312,6 @@ def chosen(arguments: list[str]) -> tuple[Command, list[str]]:
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
             return command, arguments[words:]
-    if not arguments:
-        raise InputError("which command? See `ceres-cal --help`")
     if arguments[0] in _BEGINNINGS:
         below = [name for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
         meant = did_you_mean(" ".join(arguments[:2]), below) if arguments[1:] else ""

@@ -374,7 +374,7 @@ def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Ran
     coefficient = 1e6
     skew = (-1.0, 1.0)  # columns that lean by 45 degrees
     aspect = (0.1, 10.0)  # anamorphic lenses and skipped rows have 0.5 to 2
-    off_centre = 10.0  # image diagonals: a picture that was cropped from one ten times as large
+    off_centre = 10.0  # half image diagonals: a picture that was cropped from one ten times as large
     # In half image diagonals: from a fisheye whose image circle takes a tenth of the picture to a telescope that shows
     # one degree. Millimetres of a lens lie below it.
     phi = (0.05, 100.0)
@@ -384,7 +384,7 @@ def _of_camera(name: str, image_size: tuple[int, int], lens: Lens | None) -> Ran
     if name == "phi":
         return Range(phi[0] * half, phi[1] * half, "px", FINEST, f"the focal length in pixels, where {image}")
     if name in ("cx", "cy"):
-        middle, reach = 0.5 * (size[int(name == "cy")] - 1.0), off_centre * 2.0 * half
+        middle, reach = 0.5 * (size[int(name == "cy")] - 1.0), off_centre * half
         return Range(middle - reach, middle + reach, "px", FINEST, image)
     if name == "aspect":
         return Range(*aspect, "", finest_ratio, "it is fy / fx, near 1")
