@@ -113,6 +113,18 @@ def test_a_number_that_contradicts_what_was_stated_is_in_conflict_wherever_it_is
     assert [one[0] for one in rows if "in conflict" in one] == ["height"]
 
 
+def test_what_holds_without_a_wrong_statement_is_shown_beside_the_bounds_with_it() -> None:
+    """Of a height in feet "869 ± 1399 px" was all that was said of phi."""
+    known, free = wrong().uncertainty, calibrate(seen(), RADIAL).uncertainty
+    for number in (("camera", "overhead", "phi"), ("station", "overhead", "height")):
+        alone, both = known.undisputed.verdict(*number), known.verdict(*number)
+        assert alone.sd == pytest.approx(free.verdict(*number).sd, rel=0.1) and alone.sd < 0.5 * both.sd
+    assert free.undisputed is free
+    text = Document(tuple(calibration_sections(quality_of(wrong(), seen()), ["seen.json"]))).text()
+    assert re.search(r"height +3\.97\d? m +5\d\smm +2\.\d+ to 4\.\d+ m", text)
+    assert "± sd of the position: without what is contradicted" in text
+
+
 def test_files_keep_conflicts(tmp_path: Path) -> None:
     wrong().save(tmp_path / "calibration.json")
     assert Calibration.load(tmp_path / "calibration.json").conflicts == wrong().conflicts

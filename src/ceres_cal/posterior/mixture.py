@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base import NORMAL_95, NORMAL_95_ONE_SIDED, Array, Frozen, Indices, cached_property, field, replace
+from ceres_cal.base import NORMAL_95, NORMAL_95_ONE_SIDED, Array, Frozen, Indices, Mask, cached_property, field, replace
 from ceres_cal.kernels import normal_cdf
 from ceres_cal.problem.information import Information, Key, over
 
@@ -102,9 +102,10 @@ class Mixture(Frozen):
     @property
     def chosen(self) -> Mixture:
         """What it is where the chosen lens is the right one."""
-        if not self.lenses:
-            return self
-        own = ~np.isin(np.arange(len(self.weights)), list(self.lenses))
+        return self.of(~np.isin(np.arange(len(self.weights)), list(self.lenses))) if self.lenses else self
+
+    def of(self, own: Mask) -> Mixture:
+        """What it is where one of these of its components (C,) is the right one; lenses are not told apart."""
         place, weights = np.cumsum(own) - 1, self.weights[own] / self.weights[own].sum()
         chains = tuple(Chain(place[chain.at], chain.roots) for chain in self.chains if own[chain.at].all())
         numbers = {"weights": weights, "steps": self.steps[own], "at": self.at[own]}

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Spread, brief, cached_property, field, replace, without
+from ceres_cal.base import Array, Frozen, InputError, Mask, Spread, brief, cached_property, field, replace, without
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import Mixture
@@ -67,6 +67,10 @@ class Posterior(Frozen):
         """What a camera and its stations may be, or everything together, but for cameras whose phi was followed."""
         found = self.mixtures.get(camera) or self.mixtures.get("")
         return found or Mixture.of_one(self.information)
+
+    def of(self, own: Mask) -> Posterior:
+        """What it is where one of these components (C,) of its one mixture is the right one."""
+        return replace(self, mixtures={"": self.mixture().of(own)})
 
     def with_alternatives(
         self, keys: Sequence[Key], shifts: Sequence[Array], weights: Sequence[float], lenses: tuple[Estimate, ...] = ()

@@ -78,6 +78,10 @@ def _word(key: Key, relative: float, is_disputed: bool) -> str:
     return "unknown" if relative > weak else CONFLICT if is_disputed else "known" if relative <= known else "weak"
 
 
+def _is_set_aside(one: Conflict, value: float) -> bool:
+    return abs(value - one.seen) < abs(value - one.stated)
+
+
 class Uncertainty(Frozen):
     """How well a calibration is known. It holds as far as the model does: see `Posterior`.
 
@@ -131,6 +135,21 @@ class Uncertainty(Frozen):
             Verdict(key, value, sigma, bottom, top, share, _word(key, share, key[1:] in disputed), by_profile, factor)
             for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
         )
+
+    @cached_property
+    def undisputed(self) -> Uncertainty:
+        """Without the answers under what was stated and is set aside: those in which it is nearer than the estimate."""
+        every = self.posterior.mixture()
+        columns, values = {key[1:]: i for i, key in enumerate(every.keys)}, values_of(self.estimate, every.keys)
+        named = [
+            (columns.get((one.owner, one.quantity, one.unit)), one) for one in self.conflicts if one.kind == "prior"
+        ]
+        stated = {i: one.stated for i, one in named if i is not None and _is_set_aside(one, float(values[i]))}
+        if not stated or self.posterior.followed:  # along a valley all of it is one answer
+            return self
+        off = every.steps[:, [*stated]]
+        nearer = np.abs(off) < np.abs(off + values[[*stated]] - [*stated.values()])
+        return Uncertainty(self.estimate, self.posterior.of(np.all(nearer, axis=1)), self.targets)
 
     def table(self) -> list[dict[str, Any]]:
         """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""

@@ -141,16 +141,23 @@ def _camera(quality: Quality, name: str) -> Section:
     units = {"phi": "px", "cx": "px", "cy": "px"}
     plain = {"aspect": 1.0, "skew": 0.0}  # of most cameras
     values = {"phi": camera.phi, "cx": cx, "cy": cy, "aspect": camera.aspect, "skew": camera.skew, **camera.lens.listed}
-    known = {one: quality.verdicts.get(("camera", name, one)) for one in values}
+    known, alone = (
+        {one: every.get(("camera", name, one)) for one in values} for every in (quality.verdicts, quality.undisputed)
+    )
     rows = tuple(
-        number_row(_named(camera, one), value, units.get(one, ""), known[one])
+        number_row(_named(camera, one), value, units.get(one, ""), known[one], alone[one])
         for one, value in values.items()
         if value != plain.get(one) or known[one] is not None
     )
     started = quality.calibration.phi_from.get(name, "")
     notes = [f"phi: {_PHI_FROM.get(started, started)}", *([camera.lens.note] if camera.lens.note else [])]
     about = f"{name}: {camera.lens.kind} lens, {width} × {height} px"
-    return _listed("camera", about, rows, notes)
+    return _listed("camera", about, rows, [*notes, *_disputed(quality)])
+
+
+def _disputed(quality: Quality, of: str = "") -> Iterator[str]:
+    if quality.uncertainty and quality.uncertainty.undisputed is not quality.uncertainty:
+        yield f"± sd{of}: without what is contradicted; the 95 % bounds reach to the answer with it"
 
 
 def _listed(title: str, about: str, rows: Iterable[_Row], notes: Sequence[str] = ()) -> Section:
@@ -168,14 +175,15 @@ def _named(camera: Camera, quantity: str) -> str:
     return words.get(quantity, quantity)
 
 
-def number_row(name: str, value: float, unit: str, verdict: Verdict | None) -> _Row:
-    """A number; without a verdict it was held, or nothing was minimised."""
+def number_row(name: str, value: float, unit: str, verdict: Verdict | None, undisputed: Verdict | None = None) -> _Row:
+    """A number; without a verdict it was held, or nothing was minimised. `undisputed`: without what is contradicted."""
     space = f" {unit}" if unit else ""
     if verdict is None:
         return name, f"{value:.10g}{space}", "", "", "", "not free"
     plain = verdict.key.kind == "camera" and not unit
-    shown = f"{at_precision(value, verdict.sd)}{space}"
-    sds = (_width(sd, unit, plain) for sd in (verdict.sd, verdict.sd / verdict.factor))
+    own_sd = (undisputed or verdict).sd
+    shown = f"{at_precision(value, own_sd)}{space}"
+    sds = (_width(sd, unit, plain) for sd in (own_sd, verdict.sd / verdict.factor))
     by = " (by its profile)" if verdict.by_profile and verdict.verdict != "known" else ""
     return name, shown, *sds, bounds(verdict, unit), verdict.verdict + by
 
@@ -208,10 +216,12 @@ def _station(quality: Quality, name: str) -> Section:
     if name in anchored_stations(quality.observations):
         table = Table(("", "value"), (("pose", _ANCHORED),), f"Station {title}", stacked=True)
         return Section("station", [title, _ANCHORED], data, (table,))
-    known = [quality.verdicts.get(("station", name, word)) for word in ("x", "y", "height")]
-    places = zip(("position x", "position y", "height"), camera.position.tolist(), known, strict=True)
-    rows = [number_row(word, value, "m", verdict) for word, value, verdict in places]
-    return replace(_listed("station", title, [*rows, *_angles(quality, name, camera)]), data=data)
+    keys = [("station", name, word) for word in ("x", "y", "height")]
+    places = zip(("position x", "position y", "height"), camera.position.tolist(), keys, strict=True)
+    every, alone = quality.verdicts, quality.undisputed
+    rows = [number_row(word, value, "m", every.get(key), alone.get(key)) for word, value, key in places]
+    angles = _angles(quality, name, camera)
+    return replace(_listed("station", title, [*rows, *angles], [*_disputed(quality, " of the position")]), data=data)
 
 
 def _angles(quality: Quality, name: str, camera: Camera) -> Iterator[_Row]:

@@ -99,6 +99,11 @@ def _steps(step: JointStep | None, keys: Sequence[Key]) -> Array:
     return np.array([moves.get(key, 0.0) for key in keys])
 
 
+def _by_number(known: Uncertainty | None) -> dict[tuple[str, str, str], Verdict]:
+    """Verdicts by kind, owner and quantity."""
+    return {} if known is None else {one.key[:3]: one for one in known.verdicts}
+
+
 Seam = tuple[tuple[str, str], tuple[FieldMap, ...], "Disagreement"]
 """What two stations disagree about: who they are, predicted at HEIGHTS_M, and measured in what both observed."""
 
@@ -140,9 +145,12 @@ class Quality(Frozen):
     @cached_property
     def verdicts(self) -> dict[tuple[str, str, str], Verdict]:
         """By kind, owner and quantity; what was held is not there."""
-        if self.uncertainty is None:
-            return {}
-        return {verdict.key[:3]: verdict for verdict in self.uncertainty.verdicts}
+        return _by_number(self.uncertainty)
+
+    @cached_property
+    def undisputed(self) -> dict[tuple[str, str, str], Verdict]:
+        """The same without what was stated and is contradicted."""
+        return _by_number(self.uncertainty and self.uncertainty.undisputed)
 
     @cached_property
     def fields(self) -> tuple[Target, ...]:
