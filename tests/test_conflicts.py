@@ -207,6 +207,10 @@ def test_nothing_takes_up_what_is_held_wrong_of_a_lens(lens: str, quantity: str,
     assert calibration.options.fixed == {quantity: held} and calibration.options.free_aspect is None
 
 
+def test_how_far_a_lens_reaches_is_no_statement() -> None:
+    assert not calibrate(sample(), Options(lens="spline", fixed={"rim": 900.0})).conflicts
+
+
 def test_a_right_coefficient_that_is_held_tells_what_does_not_belong() -> None:
     """Solved for without it, a few lines kept an outlier, and phi was 37 px farther off."""
     scene = field_scene(

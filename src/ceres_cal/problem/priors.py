@@ -216,7 +216,8 @@ def freed(observations: Observations, options: Options) -> Options:
         each += [Prior("camera", name, one, (value,), (sigma,), True) for one, (value, sigma) in loose.items()]
     if not each:
         return options
-    fixed = {name: value for name, value in options.fixed.items() if name == "skew"}
+    loosened = {one.quantity for one in each}
+    fixed = {name: value for name, value in options.fixed.items() if name not in loosened}
     free_aspect, priors = "aspect" in held or options.free_aspect, (*options.priors, *each)
     return replace(options, fixed=fixed, free_principal_point=True, free_aspect=free_aspect, priors=priors)
 
@@ -224,8 +225,9 @@ def freed(observations: Observations, options: Options) -> Options:
 def _loose(lens: Lens, image_size: tuple[int, int]) -> dict[str, float]:
     """What a coefficient that is held counts as known to, until all else is explained."""
     units = 1.0 / lens.scales(0.5 * float(np.hypot(*image_size)))
-    each = zip(lens.names, units.tolist(), strict=True)
-    return {name: USUAL_DECENTRING if name in lens.tangential else VAGUE * unit for name, unit in each}
+    own = {name: VAGUE * unit for name, unit in zip(lens.names, units.tolist(), strict=True)}
+    own |= dict.fromkeys(lens.tangential, USUAL_DECENTRING)
+    return {name: sigma for name, sigma in own.items() if name not in lens.set_at_start}
 
 
 def loosely(observations: Observations, options: Options) -> tuple[Observations, Options]:
