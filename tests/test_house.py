@@ -34,6 +34,7 @@ FLOORS = {
     "report": 11,
     "functions": 12,
     "cli": 13,
+    "__main__": 14,
 }
 
 # Library: who may import it, at the top or inside a function.

@@ -155,3 +155,10 @@ def until(holds: Callable[[], bool]) -> None:
     while not holds():
         assert time.monotonic() < ends
         time.sleep(0.02)
+
+
+def test_the_package_is_a_program() -> None:
+    asked = [sys.executable, "-m", "ceres_cal", "tragets"]
+    done = subprocess.run(asked, capture_output=True, text=True, env=ENVIRONMENT, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.strip() == "ceres-cal: there is no command 'tragets': did you mean 'targets'?"
