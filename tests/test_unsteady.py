@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.diagnostics import diagnose
+from ceres_cal.effects.evidence import RepeatedAmounts
 from ceres_cal.observations import Observations
 from ceres_cal.robust.unsteady import MOVES, ROLLING
 from ceres_cal.scene.targets import checkerboard
@@ -95,6 +97,19 @@ def test_what_is_taken_off_says_nothing_of_the_board() -> None:
     bent = Board(views=VIEWS, points_m=2e-4, bow_m=1e-3, heights_m=3e-4)
     for seed in (10, 13):
         assert "stretch" not in {one.kind for one in calibrate(rolling(seed, 30.0, bent)).as_built}  # 5 of 16 before
+
+
+def test_too_few_equations_beside_the_views_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small boards leave none once each view has numbers of its own: what was found of the board stays as likely."""
+    asked = RepeatedAmounts.sizes
+
+    def sizes(repeated: RepeatedAmounts, numbers: Any, priors: Any, stated: Any = ()) -> Any:
+        return {} if stated else asked(repeated, numbers, priors)
+
+    monkeypatch.setattr(RepeatedAmounts, "sizes", sizes)
+    calibration = calibrate(rolling(1, 30.0, Board(views=VIEWS, points_m=2e-4, bow_m=1e-3)))
+    assert {one.kind for one in calibration.effects} & {MOVES, ROLLING}
+    assert {one.kind for one in calibration.as_built} >= {"points", "warp"}
 
 
 def test_pictures_of_two_cameras_are_no_stabilised_one(real_data: Path) -> None:

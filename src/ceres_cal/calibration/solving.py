@@ -35,6 +35,7 @@ from ceres_cal.problem.quantities import difference, moved
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import (
+    AS_DRAWN,
     Built,
     require_measured,
     shifts_as_drawn,
@@ -223,7 +224,7 @@ def solved_from(task: Task, start: Start, problem: Problem) -> Calibration:
     Raises:
         CalibrationError: see `calibrate`.
     """
-    return known_of(explained(task, start, problem, Built()))
+    return known_of(explained(task, start, problem, AS_DRAWN))
 
 
 def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
@@ -301,7 +302,7 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
         steady = unsteady.taken_off(again)
         end = solve_robustly(steady, start, None, task.progress, is_near=True)
         solved = Explained(task, steady, replace(first.start, estimate=start, is_near=True), end)
-        seen = _explained(replace(solved, unsteady=unsteady), steady.sights, Built())
+        seen = _explained(replace(solved, unsteady=unsteady), steady.sights, AS_DRAWN)
     return seen
 
 

@@ -178,8 +178,8 @@ def _beside_views(
     kinds = {(one.target, one.kind): numbers[one.target, one.kind] for one in every}
     known = [(own.size + at, sigma) for at, sigma in sizes]
     found = repeats.sizes(kinds, _priors(kinds, targets), known)
-    for one in every:
-        yield replace(one, probability=found[one.target, one.kind][1])
+    for one in every:  # as it was where the views' own numbers leave too few equations to tell
+        yield replace(one, probability=found.get((one.target, one.kind), (0.0, one.probability))[1])
 
 
 def shifts_as_drawn(every: Sequence[AsBuilt], end: RobustSolution) -> tuple[Sequence[Key], list[Array]]:
