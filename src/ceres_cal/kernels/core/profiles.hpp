@@ -12,7 +12,7 @@ namespace ceres_cal {
 // The normal distribution and its density by cubics between the places of a table: right to 1e-9, in SIMD registers.
 class NormalTable {
   public:
-    NormalTable() {
+    NormalTable() noexcept {
         for (int k = 0; k < COUNT; ++k) {
             const double x = k / PER_UNIT - END;
             high_[k] = 0.5 * std::erfc(-x / std::sqrt(2.0));

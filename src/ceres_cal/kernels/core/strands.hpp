@@ -36,21 +36,21 @@ class Strands {
     // to do with.
     void add(int first, int last, const double* values) {
         const int own = POSE * numbers_;
-        std::vector<double> weights(static_cast<size_t>(shares_ * size_));
+        std::vector<double> weights(static_cast<size_t>(shares_) * size_);
+        double* const weight = weights.data();
         for (int a = 0; a < shares_; ++a)
             for (int m = 0; m < size_; ++m) {
                 const double variance = 1.0 - share_[a] * (1.0 - values[m]);
-                weights[static_cast<size_t>(size_ * a + m)] = 1.0 / variance;
+                weight[size_ * a + m] = 1.0 / variance;
                 logs_[a] += (last - first) * std::log(variance);
             }
         const auto spread = [&](const std::vector<double>& products, int count, double* to, int64_t apart) {
             for (int a = 0; a < shares_; ++a)
                 for (int m = 0; m < size_; ++m)
-                    add_times(count, weights[static_cast<size_t>(size_ * a + m)], products.data() + count * m,
-                              to + apart * a);
+                    add_times(count, weight[size_ * a + m], products.data() + count * m, to + apart * a);
         };
         for (int s = first; s < last; ++s) {  // strands of a group follow one another, or are added one by one
-            if (s == first || group_[s] != group_[s - 1]) poses_.assign(static_cast<size_t>(size_ * own), 0.0);
+            if (s == first || group_[s] != group_[s - 1]) poses_.assign(static_cast<size_t>(size_) * own, 0.0);
             for (int m = 0; m < size_; ++m) {
                 const double* x = rows_ + (static_cast<int64_t>(m) * strands_ + s) * numbers_;
                 for (int j = 0; j < POSE; ++j) add_times(numbers_, x[j], x, poses_.data() + own * m + numbers_ * j);
@@ -82,7 +82,8 @@ class Strands {
     int eliminate_one(const double* placed, double& log, double* left) {
         constexpr double NOTHING = 1e-9;
         double normal[POSE * POSE] = {}, upper[POSE * POSE];
-        coupling_.assign(static_cast<size_t>(POSE * rest_), 0.0);
+        coupling_.assign(static_cast<size_t>(rest_) * POSE, 0.0);
+        double* const coupling = coupling_.data();
         int taken = 0;
         for (int j = 0; j < POSE; ++j) {
             normal[(POSE + 1) * j] = 1.0;
@@ -90,7 +91,7 @@ class Strands {
             ++taken;
             for (int i = 0; i <= j; ++i)
                 if (placed[(numbers_ + 1) * i] > NOTHING) normal[POSE * j + i] = placed[numbers_ * j + i];
-            std::copy_n(placed + numbers_ * j + POSE, rest_, coupling_.data() + rest_ * j);
+            std::copy_n(placed + numbers_ * j + POSE, rest_, coupling + rest_ * j);
         }
         if (taken == 0) return 0;
         cholesky(POSE, normal, POSE, upper);
@@ -99,8 +100,7 @@ class Strands {
         for (int j = 0; j < POSE; ++j) {
             if (upper[(POSE + 1) * j] > 0.0) log += 2.0 * std::log(upper[(POSE + 1) * j]);
             for (int i = 0; i < rest_; ++i)
-                add_times(rest_, -coupling_[static_cast<size_t>(rest_ * j + i)], solved_.data() + rest_ * j,
-                          left + rest_ * i);
+                add_times(rest_, -coupling[rest_ * j + i], solved_.data() + rest_ * j, left + rest_ * i);
         }
         return taken;
     }
