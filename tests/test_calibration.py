@@ -172,8 +172,8 @@ def test_stations_by_name() -> None:
     assert list(three.stations) == ["first", "second", "third"] and list(three.cameras) == ["overhead"]
     with pytest.raises(InputError, match=r"which station\? Name one of first, second, third"):
         three.station()
-    with pytest.raises(InputError, match=r"there is no station .fifth.: did you mean .first."):
-        three.station("fifth")
+    with pytest.raises(InputError, match=r"there is no station .frist.: did you mean .first."):
+        three.station("frist")
 
 
 def test_placements_by_name() -> None:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ceres_cal.base.words import two_digits
+from ceres_cal.base.words import did_you_mean, two_digits
 
 
 @pytest.mark.parametrize(
@@ -19,3 +19,22 @@ from ceres_cal.base.words import two_digits
 )
 def test_two_digits(value: float, text: str) -> None:
     assert two_digits(value) == text
+
+
+@pytest.mark.parametrize(
+    "typed, known, meant",
+    [
+        ("--force", ["--tolerance", "--once", "--before", "--report"], ""),
+        ("--verbose", ["--version", "--report"], ""),
+        ("--tol", ["--terms", "--tolerance"], "--tolerance"),
+        ("--output-dir", ["--options", "--output"], "--output"),
+        ("circle", ["center_circle_radius", "center_circle"], "center_circle"),
+        ("no", ["no-browser"], ""),
+        ("Sise", ["sizes", "Size"], "Size"),
+        ("heigth", ["weight", "height"], "height"),
+    ],
+)
+def test_a_name_is_suggested_where_one_letter_in_four_is_wrong_or_it_is_begun(
+    typed: str, known: list[str], meant: str
+) -> None:
+    assert did_you_mean(typed, known) == (f": did you mean {meant!r}?" if meant else "")

@@ -6,6 +6,7 @@ The heights above the floor that matter: where a robot's cover and the ball are 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 
@@ -107,11 +108,18 @@ def first_of(names: Sequence[str], most: int = 3) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The end of a message, ": did you mean ...", where a known name is much like this one; else nothing."""
+    """The end of a message, ": did you mean ...", where a known name is much like this one; else nothing.
+
+    One that it begins, or a word of, or that begins it; else one of the same letters, but for one in four: "sise" is
+    "size", and "force" is not "tolerance". Dashes before options are no letters.
+    """
     from difflib import get_close_matches
 
-    every = {one.lower(): one for one in known}
-    near = get_close_matches(str(name).lower(), every, 1)
+    typed, enough = str(name).lower().lstrip("-"), 3  # fewer letters begin a word of too many names
+    every = {one.lower().lstrip("-"): one for one in known}
+    whole = re.compile(rf"(?<![a-z0-9]){re.escape(typed)}")
+    begun = [one for one in every if len(typed) >= enough <= len(one) and (whole.search(one) or typed.startswith(one))]
+    near = get_close_matches(typed, every, 1, 0.75) or sorted(begun, key=lambda one: abs(len(one) - len(typed)))
     return f": did you mean {every[near[0]]!r}?" if near else ""
 
 
