@@ -47,7 +47,7 @@ _ROUNDING = 1e-6  # of the brightest pixel: in a picture of one grey every contr
 _BLUR = 0.8  # sharpness times the standard deviation of a Gaussian blur: tanh then has its slope
 
 # Places in a row of what the kernel has fitted.
-_SHARP, _CONTRAST, _LEFT, _FITTED = 4, 8, 11, 14
+_ANGLES, _SHARP, _CONTRAST, _LEFT, _FITTED = slice(2, 4), 4, 8, 11, 14
 
 
 class Saddles(Frozen):
@@ -94,14 +94,14 @@ def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH
     corner, level = _around(image, grid)
     seen, discs, first = grid - corner, (reach, wanted), (_ROUGH * reach, wanted)
     smooth = _smoothed(level)
-    fitted = _fit_grid(smooth, seen, seen, first, curved=False)  # where the edges bend is known only after it
+    fitted = _fit_grid(smooth, seen, seen, first)
     shrink = _shrink(fitted, grid, reach)
     start = _started(fitted, seen, wanted)
     if shrink > 1:
         smooth = _smoothed(_shrunk(level, shrink))
-        start, seen = ((places + 0.5) / shrink - 0.5 for places in (start, seen))
-        start = _started(_fit_grid(smooth, start, seen, discs, curved=False), seen, wanted)
-    fitted = _fit_grid(smooth, start, seen, discs, curved=True)
+        places, seen = ((places + 0.5) / shrink - 0.5 for places in (start[..., :2], seen))
+        start = _started(_fit_grid(smooth, places, seen, discs), seen, wanted)
+    fitted = _fit_grid(smooth, start, seen, discs)
     contrast = fitted[..., _CONTRAST]
     misfit = fitted[..., _LEFT] / np.maximum(np.abs(contrast), 1e-9)
     return Saddles((fitted[..., :2] + 0.5) * shrink - 0.5 + corner, contrast, misfit)
@@ -138,8 +138,10 @@ def is_begun_dark(contrast: Array) -> bool:
 
 
 def _started(fitted: Array, seen: Array, wanted: Mask) -> Array:
-    """Where the next fit begins: what was not wanted is where it was seen."""
-    return np.where(wanted[..., None], fitted[..., :2], seen)
+    """What the next fit begins with, (rows, columns, _LEFT): what was not wanted is where it was seen."""
+    start = np.where(wanted[..., None], fitted[..., :_LEFT], np.nan)
+    start[~wanted, :2] = seen[~wanted]
+    return start
 
 
 def _shrink(fitted: Array, grid: Array, reach: float) -> int:
@@ -158,21 +160,27 @@ def _shrunk(level: AnyArray, factor: int) -> AnyArray:
     return cv2.resize(level[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _fit_grid(smooth: AnyArray, start: Array, seen: Array, discs: tuple[float, Mask], curved: bool) -> Array:
-    """What one fit from `start` has found, (rows, columns, _FITTED); NaN where a corner got lost on its way from where
-    it was `seen`. `discs`: their reach, and which corners are wanted.
+def _fit_grid(smooth: AnyArray, start: Array, seen: Array, discs: tuple[float, Mask]) -> Array:
+    """What one fit has found, (rows, columns, _FITTED); NaN where a corner got lost on its way from where it was
+    `seen`. `start`: places, from which it is fitted roughly and where the edges bend is not known yet, or what such a
+    fit has found. `discs`: their reach, and which corners are wanted.
     """
     reach, wanted = discs
-    (along_row, row_bend), (along_column, column_bend), distance = _distances(start)
-    known = wanted & np.isfinite(distance) & np.isfinite(start).all(axis=-1)
+    (along_row, row_bend), (along_column, column_bend), distance = _distances(start[..., :2])
+    known = wanted & np.isfinite(distance) & np.isfinite(start[..., :2]).all(axis=-1)
     fitted = np.full((*distance.shape, _FITTED), np.nan)
     if not np.any(known):
         return fitted
-    angles = [np.arctan2(along[known, 1], along[known, 0]) for along in (along_row, along_column)]
-    bends = [bend[known] * curved for bend in (row_bend, column_bend)]
-    radius = np.clip(reach * distance[known], *_RADIUS_PX)
-    params = np.empty((len(radius), _FITTED))
-    kernels.fit_saddles(smooth, np.column_stack([start[known], *angles, *bends, radius]), params)
+    begun = np.full((np.count_nonzero(known), _FITTED), np.nan)
+    begun[:, : start.shape[-1]] = start[known]
+    if start.shape[-1] == _LEFT:
+        begun[:, _LEFT:-1] = np.column_stack([row_bend[known], column_bend[known]])
+    else:
+        along = np.stack([along_row[known], along_column[known]], axis=1)
+        begun[:, _ANGLES], begun[:, _LEFT:-1] = np.arctan2(along[..., 1], along[..., 0]), 0.0
+    begun[:, -1] = np.clip(reach * distance[known], *_RADIUS_PX)
+    params = np.empty_like(begun)
+    kernels.fit_saddles(smooth, begun, params)
     moved = np.linalg.norm(params[:, :2] - seen[known], axis=1)
     fitted[known] = np.where((moved < _LOST * distance[known])[:, None], params, np.nan)
     return fitted

@@ -249,8 +249,9 @@ def fit_saddles(levels: Array32, starts: Array, fitted: Array) -> None:
     """The saddle of `detect.saddles` around each of N corners, least squares over the pixels of a disc.
 
     Args:
-        levels: (height, width) grey levels. starts: (N, 7) x, y, the angles of both edges, their bends (1 / px), and
-            the disc's radius, px.
+        levels: (height, width) grey levels. starts: (N, 14) the model's eleven numbers, of which those after x, y and
+            the angles of both edges are NaN where it is fitted roughly first; then the edges' bends (1 / px), and the
+            disc's radius, px.
         fitted: (N, 14), filled: the model's eleven numbers, the root mean square of what they leave, and the standard
             deviations of x and y for one of 1 in each pixel; NaN where a disc's middle is not in the picture.
     """

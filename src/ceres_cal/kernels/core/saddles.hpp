@@ -19,8 +19,8 @@ struct Picture {
 inline double smooth_step(double x) {
     constexpr double END = 10.0;
     const double y = 0.125 * std::max(-END, std::min(x, END)), y2 = y * y;
-    double p = y * (10395.0 + y2 * (1260.0 + y2 * 21.0)) / 10395.0;
-    double q = (10395.0 + y2 * (4725.0 + y2 * (210.0 + y2))) / 10395.0;
+    double p = y * (10395.0 + y2 * (1260.0 + y2 * 21.0));
+    double q = 10395.0 + y2 * (4725.0 + y2 * (210.0 + y2));
     for (int k = 0; k < 3; ++k) {
         const double twice = 2.0 * p * q;
         q = p * p + q * q, p = twice;
@@ -30,35 +30,22 @@ inline double smooth_step(double x) {
 
 class Saddles {
   public:
-    // Numbers of a start: x, y, the angles and bends of both edges, the disc's radius. Of a fit: see SIZE's places,
-    // then the root mean square of what is left, and the standard deviations of x and y where noise in a pixel has one
-    // of 1.
-    static constexpr int START = 7, SIZE = 11, FITTED = SIZE + 3;
+    // Numbers of a start: see SIZE's places, those after the angles NaN where they are not known; then the bends of both
+    // edges and the disc's radius. Of a fit: the same places, then the root mean square of what is left, and the
+    // standard deviations of x and y where noise in a pixel has one of 1.
+    static constexpr int SIZE = 11, START = SIZE + 3, FITTED = SIZE + 3;
 
     explicit Saddles(const Picture& picture) : picture_(picture) {}
 
-    // Levenberg and Marquardt's steps until one hardly moves the corner.
+    // Where light and sharpness are not known every other pixel each way tells them first.
     void fit(const double* start, double* fitted) {
-        constexpr int STEPS = 20;
-        constexpr double SETTLED_PX = 1e-3, BLUNTEST = 0.05, SHARPEST = 3.0, DIFFUSE = 0.7;
+        constexpr double LARGE_PX = 8.0, ROUGH_PX = 2e-2, SETTLED_PX = 1e-3;
         std::fill_n(fitted, FITTED, NO_CORNER);
-        if (!cut(start)) return;
-        double now[SIZE] = {start[0], start[1], start[2], start[3], DIFFUSE}, trial[SIZE], step[SIZE];
-        double cost = guess(now), damping = 1e-3;
-        for (int round = 0; round < STEPS; ++round) {
-            solve(damping, step);
-            for (int k = 0; k < SIZE; ++k) trial[k] = now[k] + step[k];
-            trial[SHARP] = std::max(BLUNTEST, std::min(trial[SHARP], SHARPEST));
-            normal_.swap(kept_);
-            const double found = add_up(trial);
-            if (found < cost) {
-                std::copy_n(trial, SIZE, now);
-                cost = found, damping = std::max(0.1 * damping, 1e-9);
-            } else {
-                normal_.swap(kept_), damping *= 10.0;
-            }
-            if (std::abs(step[X]) < SETTLED_PX && std::abs(step[Y]) < SETTLED_PX) break;
-        }
+        double now[SIZE];
+        std::copy_n(start, SIZE, now);
+        if (std::isnan(now[SHARP]) && start[SIZE + 2] > LARGE_PX && cut(start, 2)) settle(ROUGH_PX, now);
+        if (!cut(start, 1)) return;
+        const double cost = settle(SETTLED_PX, now);
         std::copy_n(now, SIZE, fitted);
         fitted[SIZE] = std::sqrt(cost / static_cast<double>(level_.size()));
         double covariance[SIZE][2] = {{1.0, 0.0}, {0.0, 1.0}};
@@ -72,9 +59,9 @@ class Saddles {
     static constexpr int STRIDE = SIZE + 4;
     static constexpr double FARTHEST_PX = 1e3, NO_CORNER = std::numeric_limits<double>::quiet_NaN();
 
-    // The pixels of the disc; false where its middle is not in the picture.
-    bool cut(const double* start) {
-        const double radius = start[6];
+    // The pixels of the disc, each `every`-th of a row and a column; false where its middle is not in the picture.
+    bool cut(const double* start, int64_t every) {
+        const double radius = start[SIZE + 2];
         const auto is_in = [](double place, int64_t size) {
             return place > -0.5 && place < static_cast<double>(size) - 0.5;
         };
@@ -85,20 +72,48 @@ class Saddles {
                       half = std::llrint(std::ceil(radius));
         x_.clear(), y_.clear(), level_.clear();
         for (int64_t y = std::max<int64_t>(middle_y - half, 0); y <= std::min(middle_y + half, picture_.height - 1);
-             ++y)
+             y += every)
             for (int64_t x = std::max<int64_t>(middle_x - half, 0); x <= std::min(middle_x + half, picture_.width - 1);
-                 ++x) {
+                 x += every) {
                 const double dx = static_cast<double>(x) - start[0], dy = static_cast<double>(y) - start[1];
                 if (dx * dx + dy * dy > radius * radius) continue;
                 x_.push_back(static_cast<double>(x)), y_.push_back(static_cast<double>(y));
                 level_.push_back(picture_.levels[picture_.width * y + x]);
             }
-        std::copy_n(start + 4, 2, bend_);
+        std::copy_n(start + SIZE, 2, bend_);
         return true;
+    }
+
+    // Levenberg and Marquardt's steps until one hardly moves the corner: of that one the cost is foretold.
+    double settle(double settled_px, double* now) {
+        constexpr int STEPS = 20;
+        constexpr double BLUNTEST = 0.05, SHARPEST = 3.0;
+        double trial[SIZE], step[SIZE], cost = std::isnan(now[SHARP]) ? guess(now) : add_up(now), damping = 1e-3;
+        for (int round = 0; round < STEPS; ++round) {
+            solve(damping, step);
+            for (int k = 0; k < SIZE; ++k) trial[k] = now[k] + step[k];
+            trial[SHARP] = std::max(BLUNTEST, std::min(trial[SHARP], SHARPEST));
+            if (std::abs(step[X]) < settled_px && std::abs(step[Y]) < settled_px) {
+                for (int k = 0; k < SIZE; ++k) cost -= step[k] * at(LEFT, k);
+                std::copy_n(trial, SIZE, now);
+                break;
+            }
+            normal_.swap(kept_);
+            const double found = add_up(trial);
+            if (found < cost) {
+                std::copy_n(trial, SIZE, now);
+                cost = found, damping = std::max(0.1 * damping, 1e-9);
+            } else {
+                normal_.swap(kept_), damping *= 10.0;
+            }
+        }
+        return std::max(cost, 0.0);
     }
 
     // Mean and contrast of the disc, and the equations there.
     double guess(double* now) {
+        constexpr double DIFFUSE = 0.7;
+        now[SHARP] = DIFFUSE, std::fill(now + MEAN, now + SIZE, 0.0);
         add_up(now);
         const double count = at(MEAN, MEAN), shape = at(CONTRAST, MEAN);
         now[MEAN] = at(LEFT, MEAN) / count;
