@@ -848,7 +848,8 @@ def test_a_saddle_is_found_again(
 
 def test_the_scatter_of_saddles_is_what_noise_makes_of_them() -> None:
     numbers, rng = np.array([20.3, 19.8, 0.3, 1.8, 0.7, 120.0, 0.0, 0.0, 60.0, 0.0, 0.0]), np.random.default_rng(4)
-    picture, start = saddle_levels(numbers, np.zeros(2), (40, 40)), saddle_start(20.0, 20.0, 0.3, 1.8, np.zeros(2), 12.0)
+    picture, bends = saddle_levels(numbers, np.zeros(2), (40, 40)), np.zeros(2)
+    start = saddle_start(20.0, 20.0, 0.3, 1.8, bends, 12.0)
     found = np.empty((300, 14))
     for own in found:
         kernels.fit_saddles((picture + rng.standard_normal(picture.shape)).astype(np.float32), start, own[None])
