@@ -30,8 +30,8 @@ inline double smooth_step(double x) {
 
 class Saddles {
   public:
-    // Numbers of a start: see SIZE's places, those after the angles NaN where they are not known; then the bends of both
-    // edges and the disc's radius. Of a fit: the same places, then the root mean square of what is left, and the
+    // Numbers of a start: see SIZE's places, those after the angles NaN where they are not known; then the bends of
+    // both edges and the disc's radius. Of a fit: the same places, then the root mean square of what is left, and the
     // standard deviations of x and y where noise in a pixel has one of 1.
     static constexpr int SIZE = 11, START = SIZE + 3, FITTED = SIZE + 3;
 
