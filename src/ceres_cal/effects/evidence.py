@@ -353,6 +353,8 @@ class RepeatedAmounts(Frozen):
         sweeps, no_change = 2, 0.1  # over the effects, each beside the others; of the logarithm of one of their sigmas
         found: dict[_Name, tuple[float, float]] = {}
         asked: dict[_Name, dict[_Name, float]] = {}
+        score, information = self._beside(np.arange(len(self.score)), stated)
+        where = replace(self, score=score, information=information)
         each = sorted(numbers.items(), key=lambda one: len(one[1]))  # what takes longest is asked when others are known
         for name, own in each * sweeps if self.spare >= _FEWEST else ():
             before = found.pop(name, None)  # the last one looked at stands last
@@ -365,6 +367,6 @@ class RepeatedAmounts(Frozen):
             ):
                 found[name] = before
                 continue
-            others = [*stated, *((numbers[one], sigma) for one, sigma in beside.items())]
-            found[name], asked[name] = self._size(own, others, priors[name]), beside
+            others = [(numbers[one], sigma) for one, sigma in beside.items()]
+            found[name], asked[name] = where._size(own, others, priors[name]), beside
         return found

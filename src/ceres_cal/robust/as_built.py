@@ -94,7 +94,7 @@ def solve_as_built(
             drawn as `built`. solver: of some of the observations, see `compete`. views: what was taken off.
         left_out: targets and kinds that are as drawn.
     """
-    observations, options, stated = problem.observations, problem.options, end.estimate.structure
+    observations, options, stated, first = problem.observations, problem.options, end.estimate.structure, end
 
     def solved(there: Built) -> RobustSolution:
         held = taking_part(_held(problem, there), explanations)
@@ -119,21 +119,20 @@ def solve_as_built(
             before, rounds = now, rounds + 1
             end = solved(before)
     every, structure = before.every, freed(before)
+    as_built = replace(problem, priors=gather_priors(observations, options, structure))
+    if views is not None:
+        there = _as_measured(taking_part(as_built, explanations), end, structure)
+        every = tuple(_beside_views(every, there, stated, views))
+        if unlikely := frozenset((one.target, one.kind) for one in every if one.probability < LIKELY):
+            return solve_as_built(problem, first, explanations, solver, built, views, left_out | unlikely)
     if _change(before, built) > 1.0:
         end, explanations = compete(_held(problem, before), end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
-    as_drawn, problem = problem, replace(problem, priors=gather_priors(observations, options, structure))
-    part = taking_part(problem, explanations)
+    part, problem = taking_part(as_built, explanations), as_built
     if _is_held(every, problem):
         end = _as_measured(part, end, structure)
     else:
         end = solve_robustly(part, replace(end.estimate, structure=structure), is_near=True)
-    if views is not None:
-        every = tuple(_beside_views(every, end, stated, views))
-        if unlikely := frozenset((one.target, one.kind) for one in every if one.probability < LIKELY):
-            fewer = Built(tuple(one for one in every if one.probability >= LIKELY), structure)
-            near = compete(_held(as_drawn, fewer), solved(fewer), solver)
-            return solve_as_built(as_drawn, *near, solver, fewer, views, left_out | unlikely)
     end, structure = end.moved_to(end.estimate, problem), end.estimate.structure
     return end, problem, explanations, tuple(_measured(every, structure, observations.targets))
 
