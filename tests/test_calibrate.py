@@ -642,6 +642,14 @@ def test_views_without_observations_change_nothing() -> None:
     assert list(found.stations) == [station] and found.placements.keys() == base.placements.keys()
 
 
+def test_a_field_that_no_view_shows_changes_nothing() -> None:
+    """The file of a field and boards, its views of the field left out."""
+    simulation = observed("brown/boards")
+    targets = {**simulation.observations.targets, "field": ssl_field("B")}
+    found = calibrate(replace(simulation.observations, targets=targets), options_for(simulation.scene))
+    assert found.station() == solved("brown/boards").station()
+
+
 @pytest.mark.parametrize("pixels", ["one place", "random"])
 def test_pixels_that_mean_nothing_give_no_camera(pixels: str) -> None:
     observations = observed("radial-2-3/corners").observations

@@ -150,6 +150,7 @@ def test_phi_is_guessed_for_the_camera_that_needs_it_only() -> None:
         ("principal_point", (700.0, 420.0), (700.0, 420.0)),
         ("cx", (700.0,), (700.0, 479.5)),
         ("cy", (420.0,), (639.5, 420.0)),
+        ("cx", (8000.0,), (640.0, 480.0)),  # about what was stated nothing fits
     ],
 )
 def test_the_principal_point_starts_at_its_prior(

@@ -57,7 +57,8 @@ def initialise(sights: Sights, options: Options) -> Start:
 
     A camera over a field alone, of whose principal point nothing is stated, may show a part of a sensor: where a start
     from the picture's middle leaves much, those from its quarters are tried, too, where a homography holds: about a
-    right quarter one does, about a wrong one a search only takes its time. Boards tell it by themselves.
+    right quarter one does, about a wrong one a search only takes its time. Boards tell it by themselves. Where one is
+    stated about which a start leaves much, the middle is tried.
 
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
@@ -67,13 +68,15 @@ def initialise(sights: Sights, options: Options) -> Start:
     observations = sights.observations
     start, places = _initialised(sights, options)
     for name, size in observations.cameras.items():
-        own = sights.numbers(camera=name)
-        stated = [one.quantity for one in (*observations.priors, *options.priors) if one.name == name]
-        known = {"principal_point", "cx", "cy"} & {*stated, *options.fixed}
-        if known or any(sights.keys[number].placement is not None for number in own):
+        every = sights.numbers(camera=name)
+        own = np.array([number for number in every.tolist() if number in places], dtype=np.int64)
+        point = {"principal_point", "cx", "cy"}
+        is_stated = any(one.name == name and one.quantity in point for one in (*observations.priors, *options.priors))
+        if point & {*options.fixed} or not len(own) or (len(own) < len(every) and not is_stated):
             continue
         least, given = better * _left(sights, own, start, places), options
-        for x, y in product((0.5 - share, 0.5 + share), repeat=2) if least > better * least_sigmas else ():
+        shares = (0.5,) if is_stated else (0.5 - share, 0.5 + share)
+        for x, y in product(shares, repeat=2) if least > better * least_sigmas else ():
             there = Prior("camera", name, "principal_point", (x * size[0], y * size[1]), (1.0, 1.0))
             moved = replace(given, priors=(*given.priors, there))
             other = attempt(partial(_initialised, sights, moved, may_search=False))  # quiet: it is one of five

@@ -269,7 +269,7 @@ def _extent(places: Array) -> tuple[Array, float]:
 
 
 def _has_floor(observations: Observations) -> bool:
-    return any(not target.movable for target in observations.targets.values())
+    return any(not observations.targets[view.target].movable for view in observations.shown_views)
 
 
 def _reach_m(columns: EffectColumns, number: int, case: Case) -> float:
