@@ -28,12 +28,13 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.arguments import length, parse_length
 from ceres_cal.cli.command import COMMANDS, Command
+from ceres_cal.cli.files import read_target, spelled_target
 from ceres_cal.cli.terminal import ProgressBar, coloured, in_colour
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import LOSSES, Options
 from ceres_cal.scene.lens import LENSES
-from ceres_cal.scene.targets import TARGET_KINDS, ssl_field
+from ceres_cal.scene.targets import TARGET_KINDS, checkerboard, ssl_field
 from ceres_cal.simulate import scene_names
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -885,6 +886,11 @@ def test_targets_lists_features_with_their_places(say: Say) -> None:
     assert {name: tuple(place) for name, place in data["points"].items()} == field.points
     assert data["arcs"]["CenterCircle"]["radius_m"] == 0.5
     assert data["segments"]["TopTouchLine"]["from"] == [-6.0, 4.5, 0.0]
+
+
+def test_a_chessboard_is_named_alike_wherever_a_target_is() -> None:
+    board = checkerboard(9, 6, 0.025)
+    assert read_target("9x6x25mm", "board") == spelled_target("9x6x2.5cm", "TARGET") == board
 
 
 def test_targets_of_a_file(say: Say, tmp_path: Path) -> None:

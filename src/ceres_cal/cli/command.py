@@ -14,6 +14,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
@@ -21,6 +22,7 @@ from ceres_cal.base import Frozen, InputError, LazyTable, cached_property, did_y
 from ceres_cal.report.document import Document
 
 _T = TypeVar("_T")
+_GIVEN = "given"  # what was typed of options so far
 _FORM = "option "  # before the names of a format's options: theirs may be those of the command's own arguments
 REQUIRED: Any = MISSING
 """The default of an option that must be given."""
@@ -57,9 +59,11 @@ def switch(help: str, default: bool | None = False, **about: Any) -> Any:
     return option(help, default=default, **about)
 
 
-def argument(metavar: str, help: str | Callable[[], str], default: Any = REQUIRED) -> Any:
-    """A field that is typed without a name before it."""
-    return field(default=default, metadata={"help": help, "metavar": metavar})
+def argument(
+    metavar: str, help: str | Callable[[], str], default: Any = REQUIRED, *, read: Callable[[str], Any] | None = None
+) -> Any:
+    """A field that is typed without a name before it: files, where `read` says nothing else."""
+    return field(default=default, metadata={"help": help, "metavar": metavar, "read": read})
 
 
 def options_of(forms: Callable[[], Iterable[Any]]) -> Any:
@@ -96,7 +100,8 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Arguments]) -> None:
         about = one.metadata
         if "forms" in about:
             for name, helps in _of_forms(about["forms"]()).items():
-                parser.add_argument(flag(name), dest=_FORM + name, metavar="VALUE", help=_escaped("; ".join(helps)))
+                how: dict[str, Any] = {"metavar": "VALUE", "help": _escaped("; ".join(helps))}
+                parser.add_argument(flag(name), dest=_FORM + name, action=_Once, **how)
             continue
         place: Any = parser
         if title := about.get("group"):
@@ -145,8 +150,9 @@ def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, An
     how: dict[str, Any] = {"help": _help(one), "metavar": about["metavar"]}
     if get_origin(item) is Literal:
         how |= {"choices": get_args(item), "metavar": None}
-    elif (read := about.get("read") or item) is not str:
-        how["type"] = read
+    else:
+        is_file = item is str and "flags" not in about
+        how["type"] = about.get("read") or (_file if is_file else _path if item is Path else item)
     if "flags" not in about:
         if get_origin(kind) is tuple:
             how["nargs"] = "+" if one.default is MISSING else "*"
@@ -161,8 +167,29 @@ def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, An
     if one.default is MISSING:
         how |= {"required": True, "default": None}
     if about["repeatable"]:
-        how |= {"action": "append", "default": None if one.default is MISSING else list(one.default)}
-    return names, how
+        return names, {**how, "action": "append", "default": None if one.default is MISSING else list(one.default)}
+    return names, {**how, "action": _Once}
+
+
+class _Once(argparse.Action):
+    """Stores what an option is given; of two values the first would be lost without a word."""
+
+    def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: str | None = None) -> None:
+        before = vars(given).setdefault(_GIVEN, {})
+        if before.setdefault(self.dest, value) != value:
+            raise argparse.ArgumentError(self, f"it is given twice, {before[self.dest]} and {value}: leave one out")
+        setattr(given, self.dest, value)
+
+
+def _file(text: str) -> str:
+    """The type of an argument that names files; no name, such as of a variable that is not set, is no folder."""
+    if text in ("", "-"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no file: give its name (./- where that is -)")
+    return text
+
+
+def _path(text: str) -> Path:
+    return Path(_file(text))
 
 
 def _item(kind: Any) -> Any:

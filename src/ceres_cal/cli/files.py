@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -26,11 +27,21 @@ T = TypeVar("T")
 
 
 def spelled_target(text: str, where: str) -> scene.Target | None:
-    """The target that somebody spelled out as `{"kind": ...}`; None for anything else, such as a name or a file."""
+    """The target that somebody spelled out, as a chessboard such as 9x6x25mm or as `{"kind": ...}`; None for anything
+    else, such as a name or a file.
+    """
+    if re.fullmatch(r"\d+x\d+x.+", text):
+        return scene.checkerboard(*parse_board(text))
     if not text.lstrip().startswith("{"):
         return None
-
     return scene.target_from_spec(base.parse_json(text.encode(), where), where)
+
+
+def require_file_of_targets(text: str, names: Iterable[str]) -> Path:
+    """The file that a target is to be read from; InputError, which says how targets are named, where there is none."""
+    if Path(text).suffix or Path(text).exists():
+        return Path(text)
+    raise InputError(f"{no_such('target', text, names)} (or a board such as 9x6x25mm, or a file)")
 
 
 def read_target(text: str, name: str) -> scene.Target:
@@ -39,9 +50,7 @@ def read_target(text: str, name: str) -> scene.Target:
         return spelled
     if (known := scene.target_named(text)) is not None:
         return known
-    if not Path(text).exists():
-        raise InputError(f"--target: {no_such('target', text, scene.targets_by_name())} (or a file)")
-    content = json_object(Path(text))
+    content = json_object(require_file_of_targets(text, scene.targets_by_name()))
     named = content.get("targets")
     spec = named.get(name) if isinstance(named, dict) else content
     if not isinstance(spec, dict):

@@ -17,7 +17,7 @@ from ceres_cal.report.document import Document, Section
 
 
 def _rows_argument(rows: str, example: str) -> Any:
-    return argument(rows, f"such as {example}; - reads lines of these from standard input", ())
+    return argument(rows, f"such as {example}; - reads lines of these from standard input", (), read=str)
 
 
 class PlacesArguments(Arguments):

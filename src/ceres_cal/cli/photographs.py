@@ -153,8 +153,9 @@ class BoardArguments(QuietArguments, DetectArguments):
     columns: int | None = option("inner corners, or circles, along a row of the board", "N")
     rows: int | None = option("inner corners, or circles, along a column of it", "N")
     target: str | None = option(
-        "in place of these and of the sizes: a board, or markers of known place, spelled out "
-        "('{\"kind\": \"markers\", ...}': `ceres-cal targets`), or a JSON file with it or with a target named 'board'",
+        "in place of these and of the sizes: a board such as 9x6x25mm, or one of another kind or markers of known "
+        'place, spelled out (\'{"kind": "markers", ...}\': `ceres-cal targets`), or a JSON file with it or with a '
+        "target named 'board'",
         "TARGET",
     )
     square: float | None = option("side of a square in metres, or such as 25mm", "M", read=length("m"))

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 from ceres_cal import base, observations, report, scene
-from ceres_cal.base import InputError, no_such
-from ceres_cal.cli.arguments import output_option, parse_board
+from ceres_cal.base import InputError
+from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import argument, command, option
-from ceres_cal.cli.files import require_output, save, spelled_target
+from ceres_cal.cli.files import require_file_of_targets, require_output, save, spelled_target
 from ceres_cal.report.document import Document, Section
-
-_BOARD = re.compile(r"\d+x\d+x.+")
 
 
 def _help() -> str:
@@ -82,12 +79,7 @@ def _targets(wanted: str) -> dict[str, scene.Target]:
     by_name = scene.targets_by_name()
     if wanted in by_name:
         return {wanted: by_name[wanted]}
-    if _BOARD.fullmatch(wanted):
-        return {"board": scene.checkerboard(*parse_board(wanted))}
-    if wanted.endswith((".json", ".npz")) or Path(wanted).exists():
-        return _targets_in(Path(wanted))
-    names = (*scene.TARGET_KINDS, *by_name)
-    raise InputError(f"{no_such('target', wanted, names)} (or a board such as 9x6x25mm, or a file of observations)")
+    return _targets_in(require_file_of_targets(wanted, (*scene.TARGET_KINDS, *by_name)))
 
 
 def _targets_in(path: Path) -> dict[str, scene.Target]:

@@ -258,7 +258,10 @@ def require_findable(
             raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
     painted = tuple(n for n, curve in target.curves.items() if curve.width_m > 0.0 and (curves is None or n in curves))
     if not painted:
-        raise InputError("the target has no painted curve: a line to be found needs a width")
+        raise InputError(
+            "the target has no painted curve: a line to be found needs a width; boards are found by `detect board`, or "
+            "`run --board 9x6x25mm`"
+        )
     if target.reach_m > _FIELD_M:
         raise InputError(f"the field reaches {target.reach_m:.0f} m from its origin: give its dimensions in metres")
     for prior in lengths:
