@@ -795,6 +795,8 @@ def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatc
     for arguments in (("-",), ("--file", "-")):
         monkeypatch.setattr(sys, "stdin", io.StringIO(table.removeprefix("\ufeff")))
         assert say("locate", calibrated, *arguments) == straight
+    (tmp_path / "rows.csv").write_text("x;y\n640;480\n-1,5;2\n")  # of a spreadsheet where decimals have a comma
+    assert say("locate", calibrated, "--file", tmp_path / "rows.csv") == straight
 
 
 @pytest.mark.parametrize(
@@ -803,7 +805,8 @@ def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatc
         ((), "nothing was given"),
         (("640",), "argument '640': give 2 numbers"),
         (("1,2,3",), "give 2 numbers with commas between, not 3"),
-        (("1;2",), "'1;2' is not a number"),
+        (("1:2",), "'1:2' is not a number: write it as -0.15 is"),
+        (("1,5;\u22122",), "'\u22122' is not a number"),
         (("1,nan",), "'nan' is not a finite number"),
         (("1,2", "--file", "rows.csv"), "not both"),
         (("--file", "rows.csv"), "rows.csv, line 2: 'two' is not a number"),

@@ -124,7 +124,7 @@ def opened(path: str | Path) -> Iterator[IO[bytes]]:
         with os.fdopen(handle, "rb") as stream:
             mode = os.fstat(handle).st_mode
             if stat.S_ISDIR(mode):
-                raise InputError(f"{path}: cannot be read: Is a directory")
+                raise InputError(f"{path}: cannot be read: it is a folder: name a file in it")
             if not stat.S_ISREG(mode):
                 raise InputError(f"{path}: cannot be read: it is a pipe or a device: save its content to a file first")
             yield stream
@@ -256,7 +256,8 @@ def check_header(data: Any, where: str, format_name: str, version: int) -> dict[
             "were two arguments exchanged?"
         )
     if stated != format_name:
-        raise InputError(f'{where}: "format" must be "{format_name}", not {_clipped(stated)}')
+        meant = f": give {_HOLDING[format_name]} of ceres-cal" if format_name in _HOLDING else ""
+        raise InputError(f'{where}: "format" must be "{format_name}", not {_clipped(stated)}{meant}')
     if data.get("version") != version:
         raise InputError(
             f"{where}: version {_clipped(data.get('version'))} is not known here, only {version}: update ceres-cal"

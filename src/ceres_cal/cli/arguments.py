@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -84,7 +83,7 @@ def height_option(what: str, default_mm: float | None = None, **about: Any) -> A
 
 def timeout_option() -> Any:
     """The option --timeout S."""
-    return option("give up after so many seconds; default: never", "S", read=number("--timeout"))
+    return option("give up after so many seconds; default: never", "S")
 
 
 def frames_option() -> Any:
@@ -114,7 +113,7 @@ def parse_number(text: str, where: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise InputError(f"{where}: {text.strip()!r} is not a number") from None
+        raise InputError(f"{where}: {text.strip()!r} is not a number: write it as -0.15 is") from None
     if not abs(value) < float("inf"):
         raise InputError(f"{where}: {text.strip()!r} is not a finite number")
     return value
@@ -148,11 +147,6 @@ def length(unit: str) -> Callable[[str], float]:
             raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
 
     return parse
-
-
-def number(where: str) -> Callable[[str], float]:
-    """The type of an argument that is a finite number; `where`: its name."""
-    return partial(parse_number, where=where)
 
 
 def whole(least: int, most: float = float("inf")) -> Callable[[str], int]:

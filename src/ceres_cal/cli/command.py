@@ -14,6 +14,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
+from functools import partial
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
@@ -152,7 +153,7 @@ def _settings(one: Field[Any], kind: Any) -> tuple[tuple[str, ...], dict[str, An
         how |= {"choices": get_args(item), "metavar": None}
     else:
         is_file = item is str and "flags" not in about
-        how["type"] = about.get("read") or (_file if is_file else _path if item is Path else item)
+        how["type"] = about.get("read") or (_file if is_file else _READ.get(item, item))
     if "flags" not in about:
         if get_origin(kind) is tuple:
             how["nargs"] = "+" if one.default is MISSING else "*"
@@ -175,9 +176,9 @@ class _Once(argparse.Action):
     """Stores what an option is given; of two values the first would be lost without a word."""
 
     def __call__(self, _: Any, given: argparse.Namespace, value: Any, option: str | None = None) -> None:
-        before = vars(given).setdefault(_GIVEN, {})
-        if before.setdefault(self.dest, value) != value:
-            raise argparse.ArgumentError(self, f"it is given twice, {before[self.dest]} and {value}: leave one out")
+        before = vars(given).setdefault(_GIVEN, {}).setdefault(self.dest, value)
+        if before != value:
+            raise argparse.ArgumentError(self, f"it is given twice, {before} and {value}: leave one out")
         setattr(given, self.dest, value)
 
 
@@ -188,8 +189,22 @@ def _file(text: str) -> str:
     return text
 
 
-def _path(text: str) -> Path:
-    return Path(_file(text))
+def _finite(kind: type[int] | type[float], text: str) -> float:
+    """The type of an argument that is a number of a kind."""
+    try:
+        value = kind(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a {'whole' if kind is int else 'finite'} number")
+    return value
+
+
+_READ: dict[Any, Callable[[str], Any]] = {
+    Path: lambda text: Path(_file(text)),
+    int: partial(_finite, int),
+    float: partial(_finite, float),
+}
 
 
 def _item(kind: Any) -> Any:

@@ -25,9 +25,7 @@ def _run(
     new_data: bool = switch("the observations are others than those it was made from"),
     held_out: bool = switch("say, too, which lens predicts held-out parts best, as `calibrate` does"),
     strict: bool = switch("exit with 1 for any finding, also one that does no harm"),
-    false_alarms: float = option(
-        "probability of any finding where nothing is wrong", "P", 0.01, read=arguments.number("--false-alarms")
-    ),
+    false_alarms: float = option("probability of any finding where nothing is wrong", "P", 0.01),
 ) -> Document:
     files.require_outputs(args, [calibration, *observations])
     files.require_output(output, [], "the table is", ".csv", ".json", ".npz")

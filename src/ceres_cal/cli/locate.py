@@ -106,12 +106,14 @@ def _lines(lines: Iterable[str], where: str) -> Iterator[tuple[str, str]]:
     """The lines that hold numbers: not the empty ones, not comments (#), and not a header of names."""
     for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].strip()
-        is_header = number == 1 and all(part.strip().isidentifier() for part in text.split(","))
+        is_header = number == 1 and all(part.strip().isidentifier() for part in re.split("[,;\t]", text))
         if text and not is_header:
             yield f"{where}, line {number}", text
 
 
 def _numbers(text: str, sizes: tuple[int, ...], where: str) -> list[float]:
+    if ";" in text:  # as spreadsheets write where decimals have a comma
+        text = text.replace(",", ".").replace(";", ",")
     row = [parse_number(part, where) for part in (text.split(",") if "," in text else text.split())]
     if len(row) not in sizes:
         raise InputError(f"{where}: give {' or '.join(map(str, sizes))} numbers with commas between, not {len(row)}")

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 from ceres_cal import base, detect, scene
 from ceres_cal.base import InputError, image_files, images_and_videos, plural
 from ceres_cal.cli import arguments
-from ceres_cal.cli.arguments import frames_option, length, number, parse_length, parse_lengths
+from ceres_cal.cli.arguments import frames_option, length, parse_length, parse_lengths
 from ceres_cal.cli.command import REQUIRED, Arguments, QuietArguments, argument, command, flag, option, switch
 from ceres_cal.cli.files import read_target, require_different, require_observations_output, require_output, save
 from ceres_cal.cli.terminal import ProgressBar
@@ -168,7 +168,6 @@ class BoardArguments(QuietArguments, DetectArguments):
     gap: float | None = option(
         "with --april-grid: between tags, over their side (tagSpacing)",
         "SHARE",
-        read=number("--gap"),
         beside=("april_grid",),
     )
     circles: float | None = option(

@@ -56,14 +56,12 @@ class UndistortArguments(QuietArguments):
     phi: float | None = option(
         "its focal length instead; the camera's own keeps the scale",
         "PX",
-        read=arguments.number("--phi"),
         group=_STRAIGHT,
         alone="scale",
     )
     angle: float | None = option(
         "widest angle of view; default: 150 with --whole, else as far as detail goes",
         "DEG",
-        read=arguments.number("--angle"),
         group=_STRAIGHT,
     )
     top_view: bool = switch("the field from straight above, to scale", group=_TOP)
@@ -102,13 +100,13 @@ def _run(args: UndistortArguments) -> Document:
     outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
     calibration = read_calibration(args.calibration)
     make, facts, words = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
-    args.output.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
     written: list[dict[str, Any]] = []
     about = args.output / f"{kind}.json"
     with ProgressBar(args.silent) as bar:
         for number, (path, output) in enumerate(outputs.items(), start=1):
             picture, own, line = make(path)
+            args.output.mkdir(parents=True, exist_ok=True)
             _write(output, picture)
             lines.append(f"{output}: {line}")
             written.append({"image": str(path), "output": str(output), **own})
