@@ -111,7 +111,10 @@ def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    for path, reason in ((tmp_path / "none.json", "no such file"), (tmp_path, "cannot be read: it is a folder")):
+    for path, reason in (
+        (tmp_path / "none.json", "no such file"),
+        (tmp_path, "cannot be read: it is a folder: name a file in it"),
+    ):
         with pytest.raises(InputError) as raised:
             read_bytes(path)
         assert refused(raised, path) == f"{path}: {reason}"

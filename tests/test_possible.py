@@ -14,10 +14,10 @@ from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.parameters import Station as Placed
@@ -48,7 +48,7 @@ def with_pixels(observations: Observations, change: Callable[[Array], Array]) ->
 
 
 def refusal(observations: Observations, options: Options | None = None) -> str:
-    with pytest.raises(SolutionError) as refused:
+    with pytest.raises((SolutionError, InputError)) as refused:
         calibrate(observations, options)
     return str(refused.value)
 
@@ -154,7 +154,7 @@ def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
 ) -> None:
     """Turned about another centre than the lens's, a strong lens fits no homography; another place was taken for it.
 
-    A start that nothing stated can mend is sought no second time, but once more without the usual priors.
+    A start that nothing stated can mend is sought no second time, whatever is stated.
     """
     sought = Mock(wraps=initialise._start_camera)
     monkeypatch.setattr(initialise, "_start_camera", sought)
@@ -163,5 +163,6 @@ def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
     scene = field_scene(ssl_field("B"), strong, world, points=(), spacing_m=0.1)
     swapped = with_pixels(simulate(scene, NOISE, seed).observations, lambda pixels: pixels[:, ::-1].copy())
     shown = swapped.curves.pixels[:, 1] < 959.0
-    text = refusal(swapped.part(np.zeros(0, bool), shown))
-    assert "mirrored" in text and "x and y are swapped" in text and sought.call_count == 2  # it was 4
+    stated = Options(priors=(Prior("station", "camera", "height_m", (5.2,), (0.02,)),))  # it was sought 43 times
+    text = refusal(swapped.part(np.zeros(0, bool), shown), stated)
+    assert "mirrored" in text and "x and y are swapped" in text and sought.call_count == 1

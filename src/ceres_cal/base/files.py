@@ -122,14 +122,13 @@ def opened(path: str | Path) -> Iterator[IO[bytes]]:
         # Opening a pipe would wait for its writer, but for O_NONBLOCK, which regular files ignore.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(handle, "rb") as stream:
-            mode = os.fstat(handle).st_mode
-            if stat.S_ISDIR(mode):
-                raise InputError(f"{path}: cannot be read: it is a folder: name a file in it")
-            if not stat.S_ISREG(mode):
+            if not stat.S_ISREG(os.fstat(handle).st_mode):
                 raise InputError(f"{path}: cannot be read: it is a pipe or a device: save its content to a file first")
             yield stream
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: cannot be read: it is a folder: name a file in it") from None
     except TypeError:
         raise InputError(f"path must be a path, not {type(path).__name__}") from None
     except (OSError, ValueError) as error:
@@ -250,14 +249,13 @@ def _require_finite(value: Any, place: str, where: str) -> None:
 def check_header(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
     """The same data once its "format" and "version" are known to be ours; InputError naming `where` otherwise."""
     stated = data.get("format") if isinstance(data, dict) else None
+    meant = _HOLDING.get(format_name, format_name)
     if isinstance(stated, str) and stated in _HOLDING and stated != format_name:
         raise InputError(
-            f"{where}: it holds {_HOLDING[stated]}, where {_HOLDING.get(format_name, format_name)} must be given: "
-            "were two arguments exchanged?"
+            f"{where}: it holds {_HOLDING[stated]}, where {meant} must be given: were two arguments exchanged?"
         )
     if stated != format_name:
-        meant = f": give {_HOLDING[format_name]} of ceres-cal" if format_name in _HOLDING else ""
-        raise InputError(f'{where}: "format" must be "{format_name}", not {_clipped(stated)}{meant}')
+        raise InputError(f'{where}: "format" must be "{format_name}", not {_clipped(stated)}: give {meant}')
     if data.get("version") != version:
         raise InputError(
             f"{where}: version {_clipped(data.get('version'))} is not known here, only {version}: update ceres-cal"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ceres_cal.base import at_most, checked, counted, for_small_matrices, meanwhile, numerical, replace
-from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError, attempt, or_none
+from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError, SolutionError, attempt, or_none
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
@@ -68,7 +68,7 @@ def calibrate(
         DegenerateError: the observations cannot determine the unknowns; the message names the frame or the numbers.
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image, or in a corner
-            of one that is far larger.
+            of one that is far larger; a mirrored picture.
     """
     options = options or Options()
     require_possible_numbers(observations, options)
@@ -213,10 +213,10 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
                 # 10 sd off, and one of a few lines' outliers was not.
                 again = attempt(as_asked)  # quiet: from where it starts nothing agrees; what was found does
                 return again if isinstance(again, Calibration) and not again.conflicts else found
-        if free is options:  # there is no other start
-            if isinstance(start, CalibrationError):
-                raise start
-            return _of_lens_asked(task, start, sights, options)
+            if free is options:
+                return _of_lens_asked(task, start, sights, options)
+        elif free is options or isinstance(start, InputError):
+            raise start  # there is no other
     return as_asked()
 
 

@@ -20,7 +20,7 @@ _T = TypeVar("_T")
 PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
 FACING_EXAMPLE = "LeftGoalLine=top"
 _ESTIMATE_EXAMPLE = "length,width"
-_PLACES = {"FILE": "file ", "DIR": "folder "}
+_PLACES = {"FILE": "file ", "DIR": "folder ", "FOLDER": "folder "}
 Loss = Literal["trivial", "huber", "soft_l1", "cauchy", "tukey"]
 _LENGTH = re.compile(rf"\s*(.*?)\s*({'|'.join(IN_A_METRE)})\s*")
 
@@ -53,9 +53,9 @@ def output_option(what: str, default: Any = REQUIRED, metavar: str = "FILE") -> 
 def prior_option(metavar: str = "OWNER.NAME=VALUE:SIGMA", what: str = "", group: str = "") -> Any:
     """The option --prior of observations' cameras and stations."""
     every = (
-        "what is known beforehand: height_m or position_m of a station, phi, principal_point, aspect or a "
-        f"coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left out where there is "
-        "only one)"
+        "what is known beforehand: height_m or position_m of a station; phi (the focal length, px), principal_point, "
+        f"aspect (fy / fx) or a coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left "
+        "out where there is only one)"
     )
     return option(what or every, metavar, repeatable=True, group=group)
 

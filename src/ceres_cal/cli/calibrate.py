@@ -37,82 +37,93 @@ class CalibrateArguments(arguments.ReportArguments):
     """What is to be solved for and how; what is named as in `Options` goes there as it is."""
 
     observations: tuple[str, ...] = argument(
-        "OBS", "files of observations (.json or .npz, or one folder .columns), taken together"
+        "OBS", "files of observations (.json, .npz, or one folder .columns); several are taken together"
     )
     output: Path | None = arguments.output_option("the calibration", None)
     lens: str | None = option(
-        "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), spline (no formula), ...: `--lens ?` "
-        "names all; default: auto, the simplest of all with a formula that predicts views as well as any other",
+        "lens model: radial (a polynomial of the radius), brown (OpenCV's), kannala-brandt (OpenCV's fisheye), spline "
+        "(no formula), ...: `--lens ?` names all; default: auto, the simplest with a formula that predicts held-out "
+        "views as well as any other",
         "KIND",
         read=_lens_kind,
         group=_CAMERA,
     )
     powers: str | None = option(
-        "of a lens that leaves the choice; of one that is named default: 2,3, the paper's, of "
-        "spline then more as the residuals ask for",
+        "powers of the radius in the radial and spline lenses; default: chosen with --lens auto, else 2,3, to which "
+        "spline adds more where the residuals require it",
         "2,3",
         group=_CAMERA,
     )
     terms: str = option(
-        "terms that a lens may have besides: rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, "
-        "tangential (p1, p2) of kannala-brandt, surface (nodes over the picture) of spline",
+        "further terms of the lens: rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, "
+        "p2) of kannala-brandt, surface (displacements on a grid over the picture) of spline",
         "NAME,...",
         "",
         group=_CAMERA,
     )
     fix: tuple[str, ...] = option(
-        "hold phi, aspect, cx, cy, skew or a coefficient, such as k3=0", "NAME=VALUE", repeatable=True, group=_CAMERA
+        "hold phi (the focal length in px), aspect (fy / fx), cx, cy (the principal point in px), skew or a "
+        "coefficient of the lens at a value, such as k3=0",
+        "NAME=VALUE",
+        repeatable=True,
+        group=_CAMERA,
     )
     free_aspect: bool | None = switch(
-        "fy / fx may be anything (default: near 1, or what the observations clearly say; `--fix aspect=1` holds it)",
+        "let fy / fx be anything (default: near 1, or what the observations clearly say; `--fix aspect=1` holds it)",
         default=None,
         group=_CAMERA,
     )
-    free_skew: bool = switch("let the pixels' columns lean against their rows", group=_CAMERA)
+    free_skew: bool = switch("solve for skew, by which columns of pixels are not perpendicular to rows", group=_CAMERA)
     usual_camera: bool = switch(
-        "nothing is assumed to be usual: no phi, no principal point near the middle, no little decentring; "
-        "pixels are square",
+        "do not assume that the camera is a usual one: any focal length, any principal point, any decentring of the "
+        "lens; pixels are still taken to be square",
         default=True,
         flags=("--no-usual-camera",),
         group=_CAMERA,
     )
     free_principal_point: bool = switch(
-        "hold it at the image's centre", default=True, flags=("--hold-principal-point",), group=_CAMERA
+        "hold the principal point at the image's centre", default=True, flags=("--hold-principal-point",), group=_CAMERA
     )
     tolerance: tuple[str, ...] = option(
-        "solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
-        "(a sigma in metres, or such as 10mm)",
+        "solve for a target as it was built, with a standard deviation in metres, or such as 10mm: field.lines_m=0.01, "
+        "field.points_m=0.005 or board.warp_m=0.002",
         "SPEC",
         repeatable=True,
         group=_CAMERA,
     )
     as_drawn: bool = switch(
-        "take targets without a tolerance as drawn, and floors as flat and square. Default: corners, bows and lines "
-        "whose residuals repeat over the views are solved for; one floor in five is 2 mm of 9 m off",
+        "take targets without a tolerance as drawn, and floors as flat and square. Default: corners, lines and bows of "
+        "boards whose residuals repeat over the views are solved for, and one floor in five is assumed to be off by "
+        "2 mm over 9 m",
         group=_CAMERA,
     )
-    as_built: bool = switch("the contrary of --as-drawn, which is the default", group=_CAMERA)
+    as_built: bool = switch("solve for targets as they were built: the default", group=_CAMERA)
     prior: tuple[str, ...] = arguments.prior_option(group=_CAMERA)
     estimate: tuple[str, ...] = arguments.estimate_option(group=_CAMERA)
     mend_labels: bool = switch(
-        "give features that were seen under the name of another their own, and calibrate again; else they are named",
+        "where features were observed under the name of another feature, correct the names and calibrate again; "
+        "default: say which they are",
         group=_SOLVE,
     )
-    loss: arguments.Loss = option(default="huber", group=_SOLVE)
-    loss_scale: float = option("where the loss starts to bend", "SIGMA", 2.5, group=_SOLVE)
-    reject_sigma: float = option("observations farther off are taken out and listed", "SIGMA", 5.0, group=_SOLVE)
+    loss: arguments.Loss = option("robust loss", default="huber", group=_SOLVE)
+    loss_scale: float = option(
+        "residual, in standard deviations, from which an observation counts less", "SIGMA", 2.5, group=_SOLVE
+    )
+    reject_sigma: float = option(
+        "observations that are more standard deviations off are taken out and listed", "SIGMA", 5.0, group=_SOLVE
+    )
     noise_scale: Literal["estimate", "stated"] = option(
         "estimate the noise of points and of curves from their residuals (default), or keep the stated sigmas",
         default="estimate",
         group=_SOLVE,
     )
     closed_form_only: bool = switch(
-        "stop at the paper's own method: a baseline to compare with, not a calibration", group=_SOLVE
+        "stop at the closed forms of R. Rojas's paper: a baseline to compare with, not a calibration", group=_SOLVE
     )
-    max_iterations: int = option("of each solve", "N", 100, group=_SOLVE)
-    threads: int = option("default: the solver chooses", "N", 0, group=_SOLVE)
+    max_iterations: int = option("most iterations of each solve", "N", 100, group=_SOLVE)
+    threads: int = option("how many threads; default: the solver chooses", "N", 0, group=_SOLVE)
     scheduler: str | None = option(
-        "of Dask, whose workers keep the observations, such as tcp://host:8786", "ADDRESS", group=_SOLVE
+        "a Dask scheduler, whose workers keep the observations, such as tcp://host:8786", "ADDRESS", group=_SOLVE
     )
 
 

@@ -191,12 +191,13 @@ def _file(text: str) -> str:
 
 def _finite(kind: type[int] | type[float], text: str) -> float:
     """The type of an argument that is a number of a kind."""
+    otherwise = argparse.ArgumentTypeError(f"{text!r} is not a {'whole' if kind is int else 'finite'} number")
     try:
         value = kind(text)
     except ValueError:
-        value = float("nan")
+        raise otherwise from None
     if not abs(value) < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a {'whole' if kind is int else 'finite'} number")
+        raise otherwise
     return value
 
 
@@ -229,11 +230,11 @@ def _escaped(text: str) -> str:
 
 def _of_forms(forms: Iterable[Any]) -> Mapping[str, list[str]]:
     """Every option of some formats, with what it means to each of them."""
-    every: dict[str, list[str]] = {}
+    every: dict[str, dict[str, list[str]]] = {}
     for form in forms:
         for name, (_, text) in form.options.items():
-            every.setdefault(name, []).append(f"{form.name}: {text}")
-    return every
+            every.setdefault(name, {}).setdefault(text, []).append(form.name)
+    return {name: [f"{', '.join(names)}: {text}" for text, names in of.items()] for name, of in every.items()}
 
 
 class Parser(argparse.ArgumentParser):

@@ -116,6 +116,7 @@ def _score(
         "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
         "trivial the rms is the one that other programs state",
         "SIGMA",
+        read=float,
     ),
 ) -> Document:
     files.require_different(observations)
@@ -241,7 +242,9 @@ def _compare(
     station: str | None = arguments.station_option("only this one; default: all that both have"),
     picture: Path | None = option("draw the map there (of one station)", "SVG"),
     over_image: bool = switch("intrinsics, over the image in px; default where there is no field"),
-    without_turn: bool = switch("the same without the turn that brings them nearest to each other"),
+    without_turn: bool = switch(
+        "likewise, but take out the turn that brings both nearest: another principal point looks much like it"
+    ),
 ) -> Document:
     files.require_output(picture, [a, b], "pictures are", ".svg")
     first, second = files.read_calibration(a), files.read_calibration(b)
@@ -327,14 +330,14 @@ class RefitArguments(InputArguments, arguments.ReportArguments):
 
     output: Path | None = arguments.output_option("the new calibration", None)
     what: Literal["auto", "pose", "pose-only", "zoom", "iris", "everything"] = option(
-        "what is free: auto: as pose, or as zoom or iris where the observations say so (default); pose: poses, the "
-        "intrinsics under what is known of them, and refused where something else has changed; pose-only: poses, the "
-        "intrinsics held; zoom: phi, too: nothing is known of it any more; iris: the lens's coefficients, too; "
-        "everything: all intrinsics, too",
+        "what has changed and is solved for. pose: the poses; the intrinsics stay within what is known of them, and "
+        "where anything else has changed it is refused. pose-only: the poses; the intrinsics are held. zoom: also phi, "
+        "the focal length. iris: also the coefficients of the lens. everything: all intrinsics. auto (default): as "
+        "pose, or as zoom or iris where the observations say so",
         default="auto",
     )
     moved: tuple[str, ...] = option(
-        "only this one moved (repeatable); default: all observed", "STATION", repeatable=True
+        "only this station moved (repeatable); default: all that were observed", "STATION", repeatable=True
     )
     hold_others: bool = switch("hold stations that did not move, and their cameras, exactly")
     labels: Literal["check", "as-given", "turned"] = option(

@@ -54,7 +54,7 @@ class UndistortArguments(QuietArguments):
         "size of the straight image, px; default: the photograph's", "WxH", read=_size, group=_STRAIGHT, alone="scale"
     )
     phi: float | None = option(
-        "its focal length instead; the camera's own keeps the scale",
+        "focal length of the straight image in px, instead of its size; the camera's own keeps the scale",
         "PX",
         group=_STRAIGHT,
         alone="scale",

@@ -12,7 +12,8 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, Frozen, Indices, Pose, attempt, field, median, numerical, replace
+from ceres_cal.base import Array, Frozen, Indices, Pose, field, median, numerical, replace
+from ceres_cal.base.errors import CalibrationError, InputError, attempt
 from ceres_cal.observations import Prior, SightKey, Sights
 from ceres_cal.problem import ANY_PHI, PHI_RANGE, Estimate, Options, Station, unit_px
 from ceres_cal.scene.camera import Camera
@@ -137,7 +138,7 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
     """Every camera with the sights that pose it, each camera by itself.
 
     Raises:
-        SolutionError: see `placed`.
+        InputError, SolutionError: see `placed`.
     """
     priors = (*sights.observations.priors, *options.priors)
     parts: list[PosedSights] = []
@@ -150,6 +151,8 @@ def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -
         posed_by = partial(_start_camera, name, blank, seen, given, may_search=may_search)
         one = attempt(partial(posed_by, ()))  # quiet: it is tried with what is stated, or ends with that
         own_priors = [p for p in priors if _concerns(p, name, seen)]
+        if isinstance(one, InputError):  # a mirrored picture, whatever is stated
+            raise one
         if own_priors and (isinstance(one, CalibrationError) or one.phi_from[name] == "guess"):
             one = posed_by(own_priors)
         if isinstance(one, CalibrationError):

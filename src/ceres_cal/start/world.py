@@ -9,7 +9,7 @@ from collections.abc import Container, Iterable, Mapping
 
 import numpy as np
 
-from ceres_cal.base import DegenerateError, Frozen, Pose, Poses, SolutionError, chained, inverted, replace
+from ceres_cal.base import DegenerateError, Frozen, InputError, Pose, Poses, SolutionError, chained, inverted, replace
 from ceres_cal.base.arrays import Array, Indices, distinct, evenly
 from ceres_cal.observations import Prior, Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
@@ -83,7 +83,8 @@ def placed(
         may_search: whether a camera is searched for where what is proposed does not hold.
 
     Raises:
-        SolutionError: only a mirrored picture of the floor holds, or nothing does and none is searched for.
+        InputError: only a mirrored picture of the floor holds.
+        SolutionError: nothing holds, and none is searched for.
     """
     bend_sd = 0.15  # of a lens of which nothing is known, at the image's corner: more is a fisheye's, which lines tell
     lines = _lines_of(sight, profile, known, _rows_of(sight))
@@ -109,7 +110,7 @@ def placed(
     if not holds(lines, found):
         mirrored, _, other = best((-1.0, 1.0))
         if holds(mirrored, other) and other.costs[0] + _ALIKE < found.costs[0]:
-            raise SolutionError(
+            raise InputError(
                 f"station {sight.keys[0].station!r}: what it sees of the floor is a mirrored picture: x and y are "
                 "swapped, or y points upwards, or left and right are exchanged in the labels: correct the observations"
             )
