@@ -6,6 +6,8 @@ does not look like paint of that width, or does not go on as its neighbours do, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -129,7 +131,7 @@ def _responses(
     count = int(reach_px / _SEARCH_STEP_PX)
     beyond = int(np.ceil((np.max(half_px) + band_px + 1.0) / _SEARCH_STEP_PX)) + 1
     steps = np.arange(-count - beyond, count + beyond + 1.0) * _SEARCH_STEP_PX
-    light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
+    light = _along_normals(grey, course, steps, (-2.0, 0.0, 2.0))
     # Between steps, not of them: a mean must lie as far to one side of its place as to the other.
     total = np.cumsum(np.pad(0.5 * (light[:, 1:] + light[:, :-1]), ((0, 0), (1, 0))), axis=1)
     own, rows = sliding_window_view(total, 2 * count + 1, axis=1), np.arange(len(total))
@@ -156,13 +158,15 @@ def _is_peak(response: Array) -> Mask:
     return np.asarray((response >= higher[:, :-2]) & (response >= higher[:, 2:]))
 
 
-def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float) -> Array:
-    tangents = np.column_stack([course.normals[:, 1], -course.normals[:, 0]])
-    start = course.pixels + shift_px * tangents
-    x = start[:, 0, None] + steps * course.normals[:, 0, None]
-    y = start[:, 1, None] + steps * course.normals[:, 1, None]
-    flags, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-    return np.asarray(cv2.remap(grey, x.astype(np.float32), y.astype(np.float32), flags, borderMode=border), float)
+def _along_normals(grey: Array32, course: Course, steps: Array, shifts_px: Sequence[float]) -> Array:
+    """(N, S) light at steps (S,) px along the normals, the mean of places shifted so along the line."""
+    nx, ny = course.normals.T[..., None]
+    x, y = course.pixels[:, 0, None] + steps * nx, course.pixels[:, 1, None] + steps * ny
+    flags, border, light = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE, np.zeros(x.shape)
+    for shift in shifts_px:
+        there = (x + shift * ny).astype(np.float32), (y - shift * nx).astype(np.float32)
+        light += cv2.remap(grey, *there, flags, borderMode=border)
+    return light / len(shifts_px)
 
 
 def measure(

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from ceres_cal.base import AnyArray, Array, Array32, Indices, Mask, Rows
-from ceres_cal.detect.images import negative
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6
@@ -76,12 +75,23 @@ def drawn(strokes: Strokes, image_size: tuple[int, int]) -> Mask:
 
 def find_strokes(grey: Array32) -> Strokes:
     """Every stroke of a photograph, of paint up to some 12 px wide, each at the scale at which it is brightest."""
-    by_scale = []
-    for scale in _SCALES:
-        plane = cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
-        strokes = _strokes(*_ridge_points(np.asarray(plane, np.float32)))
+    return _of_scales(_reliefs(grey))
+
+
+def _reliefs(grey: Array32) -> list[tuple[Array32, ...]]:
+    """Of a photograph at each scale."""
+    shares = (1.0 / scale for scale in _SCALES)
+    planes = (cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) for share in shares)
+    return [_relief(np.asarray(plane, np.float32)) for plane in planes]
+
+
+def _of_scales(reliefs: list[tuple[Array32, ...]]) -> Strokes:
+    """See `find_strokes`."""
+    by_scale, (height, width) = [], reliefs[0][0].shape
+    size = (width, height)
+    for scale, relief in zip(_SCALES, reliefs, strict=True):
+        strokes = _strokes(*_ridge_points(relief))
         by_scale.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
-    size = (int(grey.shape[1]), int(grey.shape[0]))
     fine, coarse = by_scale
     fine = fine.take(_COARSER * fine.strength >= _strength_beside(fine, coarse, size))
     coarse = coarse.take(coarse.strength > _COARSER * _strength_beside(coarse, fine, size))
@@ -94,12 +104,14 @@ def strokes_of_signs(grey: Array32) -> tuple[Strokes, Strokes]:
     On fields with light lines dark ones came to 0.92 of their length at most, mostly to 0.2, but on one with dark seams
     to more; on two with dark lines to 6 and 14.
     """
-    return find_strokes(grey), find_strokes(negative(grey))
+    bright = _reliefs(grey)
+    dark = [tuple(-planes[k] for k in (0, 1, 2, 3, 5, 4, 7, 6)) for planes in bright]  # the upper eigenvalue is lower
+    return _of_scales(bright), _of_scales(dark)
 
 
 def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:
     """Those of the narrowest paint that are lines of their own: stripes of sun are wide, or run beside each other."""
-    strokes = _strokes(*_ridge_points(grey))
+    strokes = _strokes(*_ridge_points(_relief(grey)))
     return strokes.take(alone(strokes, reach_px) > _OWN)
 
 
@@ -115,19 +127,23 @@ def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, in
     return np.asarray(np.median(plane[y, x], axis=0), float)
 
 
-def _ridge_points(grey: Array32) -> tuple[Array, Array, Indices]:
-    """Points on ridges: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
+def _relief(grey: Array32) -> tuple[Array32, ...]:
+    """A plane that is smoothed a little, what `_bends` makes of it, and the eigenvalues where it is smoothed more."""
     soft = _smoothed(grey, _SIGMA_PX)
-    xx, yy, xy, bend = _bends(soft)
+    return soft, *_bends(soft), *_bends(_smoothed(grey, 2.0 * _SIGMA_PX))[3:]
+
+
+def _ridge_points(relief: tuple[Array32, ...]) -> tuple[Array, Array, Indices]:
+    """Points on ridges: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
+    soft, xx, yy, xy, bend, _, wider, _ = relief
     strength = np.maximum(-bend, 0.0)
     usual = float(np.median(strength[::3, ::3]))
-    wider = np.maximum(-_bends(_smoothed(grey, 2.0 * _SIGMA_PX))[3], 0.0)
     # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
     size = (_NEARBY_PX, _NEARBY_PX)
     nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
     nearby = cv2.boxFilter(np.minimum(strength, 2.0 * _NOISE * nearby), cv2.CV_32F, size, normalize=True)
     limit = np.maximum(_NOISE_NEARBY * nearby, max(_NOISE * usual, 1e-3))
-    ridge = (strength > limit) & (wider < _WIDEST * strength)
+    ridge = (strength > limit) & (-wider < _WIDEST * strength)
     ridge[:_BORDER_PX] = ridge[-_BORDER_PX:] = ridge[:, :_BORDER_PX] = ridge[:, -_BORDER_PX:] = False
     rows, columns = np.nonzero(ridge)
     a, b, c = xx[rows, columns], xy[rows, columns], bend[rows, columns]
@@ -137,7 +153,7 @@ def _ridge_points(grey: Array32) -> tuple[Array, Array, Indices]:
     gy = 0.5 * (soft[rows + 1, columns] - soft[rows - 1, columns])
     step = -(gx * nx + gy * ny) / c
     top = np.maximum(np.abs(step * nx), np.abs(step * ny)) <= 0.6
-    mask = np.zeros(grey.shape, np.uint8)
+    mask = np.zeros(soft.shape, np.uint8)
     mask[rows[top], columns[top]] = 1
     joined = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX)))
     _, labels = cv2.connectedComponents(joined, connectivity=8)
@@ -145,12 +161,12 @@ def _ridge_points(grey: Array32) -> tuple[Array, Array, Indices]:
     return pixels, -c[top], labels[rows[top], columns[top]].astype(np.int64)
 
 
-def _bends(soft: Array32) -> tuple[Array32, Array32, Array32, Array32]:
-    """Second derivatives by x, by y and by both, and the lower one of their eigenvalues."""
+def _bends(soft: Array32) -> tuple[Array32, ...]:
+    """Second derivatives by x, by y and by both, and both of their eigenvalues, the lower one first."""
     orders = ((2, 0), (0, 2), (1, 1))
     xx, yy, xy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in orders)
-    lower = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
-    return _single(xx), _single(yy), _single(xy), _single(lower)
+    middle, apart = 0.5 * (xx + yy), np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    return tuple(map(_single, (xx, yy, xy, middle - apart, middle + apart)))
 
 
 def _smoothed(grey: Array32, sigma_px: float) -> Array32:

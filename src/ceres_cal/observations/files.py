@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -331,7 +330,9 @@ def write_folder(path: Path, header: Any, columns: Mapping[str, Columns]) -> Non
                 _write(beside / f"{kind}_{name}.npy", array)
         beside.rename(path)
     except OSError as error:
-        shutil.rmtree(beside, ignore_errors=True)
+        from shutil import rmtree
+
+        rmtree(beside, ignore_errors=True)
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 

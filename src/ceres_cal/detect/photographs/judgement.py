@@ -118,8 +118,9 @@ def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = Fal
             inside &= np.all((parallel.middle > low) & (parallel.middle < high), axis=1)
     if not np.any(inside) or not len(course):
         return 0.0
-    away = np.linalg.norm(strokes.ends[inside].mean(axis=1)[:, None] - course.pixels, axis=2)
-    on_it, strength = np.min(away, axis=1) < _NEAR_PX, strokes.strength[inside]
+    middle, line = strokes.ends[inside].mean(axis=1), course.pixels
+    squares = np.sum(middle**2, axis=1) + np.min(np.sum(line**2, axis=1) - 2.0 * middle @ line.T, axis=1)
+    on_it, strength = squares < _NEAR_PX**2, strokes.strength[inside]
     if not np.any(on_it):
         return 0.0
     strong = strength > _AS_STRONG * np.median(strength[on_it])
