@@ -107,6 +107,7 @@ ON_THE_COMMAND_LINE = [
     ("calibrate OBS --lens radial --lens brown", "argument --lens: it is given twice, radial and brown: leave one out"),
     ("calibrate ''", "argument OBS: '' is no file"),
     ("calibrate OBS --threads 1.5", "argument --threads: '1.5' is not a whole number"),
+    ("publish CAL --geometry OBS --once", "observations.json: not a SSL_WrapperPacket"),
     ("listen -o OUT.json --seconds nan", "argument --seconds: 'nan' is not a finite number"),
     ("calibrate OBS -o -", "argument -o/--output: '-' is no file: give its name (./- where that is -)"),
     ("calibrate OBS --lens radail", "did you mean 'radial'?"),

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ceres_cal import base, formats, scene
+from ceres_cal import formats, scene
 from ceres_cal.base import InputError, replace
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
 from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch
@@ -181,8 +181,7 @@ def _publish(
         "refuse what the message would get wrong by more on the field", "MM", read=length("mm")
     ),
 ) -> Document:
-    before = None if geometry is None else base.read_bytes(geometry)
-    packet, exported = formats.ssl_packet(read_calibration(calibration), station or None, camera_id, before)
+    packet, exported = formats.ssl_packet(read_calibration(calibration), station or None, camera_id, geometry)
     exported.require_loss_mm(max_loss_mm)
     sent = formats.publish(packet, _group(args), 1 if once else None)
     words = f"{exported.words}, {len(packet)} bytes, {sent} times to {args.address}:{args.port}"

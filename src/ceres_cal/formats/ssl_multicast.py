@@ -129,7 +129,7 @@ def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
 
 
 def ssl_packet(
-    calibration: Calibration, stations: Sequence[str] | None = None, camera_id: str = "", before: bytes | None = None
+    calibration: Calibration, stations: Sequence[str] | None = None, camera_id: str = "", before: Path | None = None
 ) -> tuple[bytes, Exported]:
     """The wrapper packet of a calibration, and what it gets wrong.
 
@@ -137,13 +137,15 @@ def ssl_packet(
         before: a geometry.yml or a packet with the field and other cameras; by default the calibration's field.
 
     Raises:
-        InputError: no such station, no field, or camera ids that do not fit.
+        InputError: no such station, no field, or camera ids that do not fit; naming the file, no geometry in it.
     """
     names = tuple(calibration.stations if stations is None else stations)
     for name in names:
         calibration.station(name)
     request = ExportRequest(calibration, names, "")
-    data, exported = geometry_of(request, camera_id, {} if before is None else read_geometry(before))
+    with naming(before):
+        shown = {} if before is None else read_geometry(read_bytes(before))
+    data, exported = geometry_of(request, camera_id, shown)
     return wrapped(data), exported
 
 
