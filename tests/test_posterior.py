@@ -18,6 +18,7 @@ from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import STRUCTURE, gather_sights
+from ceres_cal.posterior.assess import to_best
 from ceres_cal.posterior.posterior import make_posterior
 from ceres_cal.problem.bundle import packed, solve
 from ceres_cal.problem.costs import CachedCost, PriorCost, Run, SightCost
@@ -203,6 +204,21 @@ def test_a_step_of_a_pose_near_half_a_turn() -> None:
     step = np.array([0.01, -0.02, 0.03, 2e-3, 1e-3, -1e-3])
     keys = pose_keys("station", "overhead")
     assert difference(moved(here, keys, step), here, keys) == pytest.approx(step, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["radial-2-3/corners", "radial-2-3/lines"])
+def test_where_errors_go_together_the_best_lies_nearer_to_what_is_stated(name: str) -> None:
+    """Solved for with observations that count as much less, everything moves by as much as was said."""
+    whole, found = problem(name)
+    scales = 0.3, 3.0  # px
+    short, wide = (replace(whole, weighting=Weighting(one, one, "trivial", 3.0)) for one in scales)
+    here, best = (solve(one, found).estimate for one in (short, wide))
+    says, says_less = (information(one, here) for one in (short, wide))
+    keys = says.shared.keys
+    moved_by, said = difference(best, here, keys), to_best(says_less.shared, says)
+    sd = says_less.shared.spread.sd
+    assert np.max(np.abs(moved_by) / sd) > 0.2  # 0.49 and 0.45
+    assert said / sd == pytest.approx(moved_by / sd, abs=0.02)  # 0.004 measured
 
 
 # ---- in a calibration -----------------------------------------------------------------------------------------------

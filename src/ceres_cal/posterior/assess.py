@@ -61,13 +61,15 @@ def assess(
     """
 
     def known(there: Estimate, says: ReducedInformation) -> Posterior:
-        by_scatter = make_posterior(says, degrees_of_freedom, scatter_at(there, says))
-        if shifts_at is None:
-            return by_scatter
-        by_model = by_scatter.by_model or by_scatter.information
-        return replace(by_scatter.widened(*shifts_at(there, None)), by_model=by_model)
+        known = make_posterior(says, degrees_of_freedom, scatter_at(there, says))
+        if shifts_at is not None:
+            by_model = known.by_model or known.information
+            known = replace(known.widened(*shifts_at(there, None)), by_model=by_model)
+        return known
 
     posterior = known(estimate, reduced)
+    if posterior.by_model is not None:  # and the estimate is the best by the model alone
+        posterior = posterior.widened(posterior.keys, [to_best(posterior.information, reduced)])
     width = posterior.half_width
     valleys: dict[str, tuple[Node, ...]] = {}
     astray = problem  # with phi held of the cameras that went astray, while others are looked at
@@ -86,6 +88,18 @@ def assess(
     mixtures = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
     posterior = replace(posterior, mixtures=mixtures)
     return estimate, _with_bends(posterior, problem, estimate) if bends else posterior
+
+
+def to_best(known: Information, says: ReducedInformation) -> Array:
+    """(K,) how far the best estimate lies from the one that was found, where what is known is wider than the model says.
+
+    It weighs observations against priors as if errors were independent. With A what the observations say by the model,
+    g how the priors pull, and P what these say, the observations alone have their best at A^-1 g from the estimate. As
+    they say A' at the end, all of it has its best at (A' + P)^-1 (A' A^-1 - 1) g.
+    """
+    priors = says.priors.less(says.built)
+    alone, wider = says.shared.less(priors), known.less(priors)
+    return np.asarray(known.inverse @ (wider.matrix @ (alone.inverse @ says.pull) - says.pull))
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:

@@ -76,6 +76,11 @@ class GaussianPrior(Frozen):
             return len(self.information.root)
         return sum(key.quantity == "aspect" for key in self.keys)
 
+    @property
+    def is_of_target(self) -> bool:
+        """Whether it says alone how far targets may be from their drawings."""
+        return all(key.kind == "structure" for key in self.keys)
+
     def is_of(self, camera: str) -> bool:
         """Whether it speaks of one camera's intrinsics alone."""
         return all(key[:2] == ("camera", camera) for key in self.keys)

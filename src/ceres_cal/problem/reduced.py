@@ -53,6 +53,7 @@ class ReducedInformation(Frozen):
         stated: that part of the priors which somebody stated, or an earlier calibration found. built: that part of them
             which says how far targets may be from their drawings: a scatter that equations have in common.
         eliminated: the private placements, by station.
+        pull: (K,) by how much all priors but those of targets pull there: half the slope of their squares.
         point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
     """
 
@@ -61,6 +62,7 @@ class ReducedInformation(Frozen):
     priors: Information
     stated: Information
     built: Information
+    pull: Array
     eliminated: tuple[Eliminated, ...]
     point_leverage: float
     curve_leverage: float
@@ -164,15 +166,18 @@ class _InformationSums:
             for key, kinds in self._problem.elsewhere.normals(self._problem, self._estimate).items():
                 self._add(key, self._estimate.pose_stack([key])[0], kinds)
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
-        priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
-        known = Information.nothing(self._keys).beside_all(priors)
-        every = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
-        of_targets = [all(key.kind == "structure" for key in prior.keys) for prior in every]
-        each = list(zip(every, of_targets, strict=True))
+        priors, pull = self._problem.priors_at(self._estimate), np.zeros(len(self._keys))
+        known = Information.nothing(self._keys).beside_all(prior.information for prior in priors)
+        for prior in [one for one in priors if not one.is_of_target]:
+            pull[known.columns(prior.keys)] += prior.information.matrix @ prior.offsets(self._estimate)
+        given = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
+        of_targets = [prior.is_of_target for prior in given]
+        each = list(zip(given, of_targets, strict=True))
         stated, built = (
             Information.nothing().beside_all(one.information for one, own in each if own == of) for of in (False, True)
         )
-        return ReducedInformation(points, curves, known, stated, built, tuple(eliminated), *self._leverages.tolist())
+        every = points, curves, known, stated, built, pull, tuple(eliminated)
+        return ReducedInformation(*every, *self._leverages.tolist())
 
     def _owned(self, kind: str, name: str) -> Indices:
         return self._columns.get((kind, name), np.empty(0, dtype=np.int64))
