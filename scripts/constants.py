@@ -132,7 +132,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.mixture", "_FLAT", "verdicts"),
     *_of("posterior.uncertainty", "_LEARNT", "verdicts"),
     *_of("posterior.bent", "BENDING", "verdicts"),
-    *_of("effects.strands", "_LOUD _MATTERS", "verdicts"),
+    *_of("effects.strands", "LOUD _MATTERS", "verdicts"),
     *_of("robust.noise", "_TAIL", "calibrate"),
     *_of("problem.priors", "_USUAL_ASPECT USUAL_DECENTRING", "calibrate", "verdicts"),
     *_of("robust.as_built", "_UNMEASURED", "calibrate"),

@@ -429,3 +429,16 @@ def smooth_image(equations: Equations, estimate: Estimate) -> Array:
         columns = [*(equations.direction[:, axis] * one for one in smooth for axis in range(2)), *radial]
         every.append(np.column_stack(columns) * (owner == name)[:, None])
     return np.column_stack(every)
+
+
+def smooth_view(equations: Equations) -> tuple[Array, Array]:
+    """(E, 2) x and y from -1 to 1 over what is seen of each sight, and (E, 2, 5) smooth displacements of it along both
+    axes of the image: polynomials of these but for the constant, which is the pose's.
+    """
+    starts, third = equations.bounds[:-1], 1.0 / 3.0  # the mean of x^2
+    low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
+    half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
+    place = (equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]
+    x, y = place.T
+    each = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
+    return place, equations.direction[:, :, None] * each[:, None, :]

@@ -1,6 +1,7 @@
 """What the residuals say of the errors' dependence, as one covariance of everything shared (a sandwich).
 
-First what goes together within a view, then whether views scatter as that says (`effects/groups.py`). In
+First what goes together within a view, and what displaces its rows as they are read out one after the other (a rolling
+shutter), then whether views scatter as that says (`effects/groups.py`). In
 directions in which the model knows everything shared to one (root root^T its covariance) the observations, of
 information A, have a score of covariance C = M - P with P the priors: with S = root^T A and B = S root they say
 A + S^T (C^-1 - B^-1) S instead of A. Priors are as certain as they were; what nothing tells stays unknown.
@@ -17,16 +18,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, replace, student_95, two_digits
-from ceres_cal.effects.evidence import DEPENDENCE
+from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, replace, student_95, two_digits
+from ceres_cal.effects.columns import SparseColumns, smooth_image, smooth_view
+from ceres_cal.effects.evidence import DEPENDENCE, LENS_LEAVES, LIKELY, READ_OUT, SMOOTH_ERRORS, RepeatedAmounts
 from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
 from ceres_cal.effects.linearised import Linearised
 from ceres_cal.effects.strands import (
+    LOUD,
     Strand,
     StrandFamily,
     decays,
@@ -199,7 +202,6 @@ def _root_of(rising: Callable[[float], float], low: float, high: float) -> float
 # Share of the largest variance of a score: what is below is rounding. Of a direction that priors alone know it was
 # 3e-10, and rounding of that made a standard deviation four times too large. Nothing changes up to a thousandfold.
 _DETERMINED = 1e-9
-_LIKELY = 0.5  # probability from which on a cause is named
 _OVER = {"points": "errors are correlated between a target's points", "curves": "errors are correlated along lines"}
 
 
@@ -211,19 +213,24 @@ class Dependence(Frozen, eq=True):
             None where there are too few, or one sees what lasts over all of them.
         private: factor on the variance of placements by their own observations.
         inverse_freedom: 1 / degrees of freedom of all that, beside the noise scale's; of cameras the most.
+        read_out_px: standard deviation of what displaces the uppermost row of a view that is seen, and the lowest the
+            other way, as they are not read out at once; 0 where that is not likely.
     """
 
     correlations: tuple[Correlation, ...] = ()
     between: GroupScatter | None = None
     private: float = 1.0
     inverse_freedom: float = 0.0
+    read_out_px: float = 0.0
 
     @property
     def causes(self) -> tuple[str, ...]:
         """What is likely, in words."""
-        likely = [one for one in self.correlations if one.probability > _LIKELY]
+        likely = [one for one in self.correlations if one.probability > LIKELY]
         causes = [_OVER[one.kind] + _reach(one) for one in likely]
-        if self.between is not None and self.between.probability > _LIKELY:
+        if self.read_out_px > 0.0:
+            causes.append(f"views move by {two_digits(self.read_out_px)} px while rows are read out (rolling shutter)")
+        if self.between is not None and self.between.probability > LIKELY:
             factor = two_digits(self.between.variance**0.5)
             causes.append(f"views scatter {factor} times as far as what is within them says")
         return tuple(causes)
@@ -293,18 +300,22 @@ def measure_scatter(
         model = sampled(problem, there, estimate, reduced, most_views)
         if model is None or not model.root.shape[1]:
             return None
-        scatter = _measured(problem, model, reduced)
+        scatter = _measured(problem, model, reduced, estimate)
         if not scatter.dependence.causes or len(model.equations) == problem.sights.equations:
             break
     return scatter
 
 
-def _measured(problem: Problem, model: Linearised, reduced: ReducedInformation) -> Scatter:
+def _measured(problem: Problem, model: Linearised, reduced: ReducedInformation, estimate: Estimate) -> Scatter:
     """By the equations of some views."""
     group = views_or_placements(model.equations)
     prior = model.root.T @ reduced.priors.over(reduced.shared.keys).matrix @ model.root
     groups = GroupNormals.of(model, group, prior)
     scores, dependence = correlated(model, group, groups.normal)
+    read_out = _ReadOut.of(model, estimate)
+    if read_out is not None:
+        np.add.at(scores, group[model.equations.bounds[:-1]], read_out.scores)
+        dependence = read_out.beside(dependence)
     if len(groups.counts) < FEWEST_GROUPS:
         scores += _stated_together(model, group, problem.weighting.scales)
     whole = _whole(groups, scores)
@@ -315,6 +326,69 @@ def _measured(problem: Problem, model: Linearised, reduced: ReducedInformation) 
         inverse = dependence.inverse_freedom + between.probability / between.degrees_of_freedom
         dependence = replace(dependence, between=between, inverse_freedom=inverse)
     return Scatter(model.root, whole, dependence)
+
+
+class _ReadOut(Frozen):
+    """What moves while the rows of a view are read out one after the other: by so much its lowest row is displaced.
+
+    A pose follows nearly all of a shear or stretch, so that what is left of it tells little: beside the shared numbers,
+    which take it up, it displaces all. What more turns and zooms is among the smooth errors of a view.
+
+    Attributes:
+        sigma_px, probability: of either direction. scores: (S, P, P) what it adds to the covariance of each sight's.
+    """
+
+    sigma_px: float
+    probability: float
+    scores: Array
+
+    @classmethod
+    def of(cls, model: Linearised, estimate: Estimate) -> _ReadOut | None:
+        """Of views of boards; None where they are few, or do not seem to be displaced."""
+        fewest, enough = 5, 20  # views that tell anything, and that are asked how large it is
+        equations = model.equations
+        boards = np.flatnonzero([key.placement is not None for key in equations.sights.keys])
+        if len(boards) < fewest:
+            return None
+        polynomials = smooth_view(equations)[1]
+        rows = np.where(model.used[:, None], model.beyond_private(polynomials[:, :, 1] * model.weight[:, None]), 0.0)
+        whole = np.column_stack([rows, model.shared, model.left_over])
+        products = np.array(
+            [rows[own].T @ whole[own] for own in map(slice, equations.bounds[:-1], equations.bounds[1:])]
+        )
+        told, common, score = products[:, :, :2], products[:, :, 2:-1], products[:, :, -1]
+        z2 = np.einsum("si,sij,sj->s", score, np.linalg.pinv(told, hermitian=True), score)[boards]
+        if np.sum(z2 - 2.0) <= LOUD * np.sqrt(4.0 * len(boards)):
+            return None
+        sigma, probability = _sizes_of_views(model, estimate, polynomials, boards[evenly(len(boards), enough)])
+        there = np.isin(np.arange(len(common)), boards)[:, None, None]
+        return cls(sigma, probability, probability * sigma**2 * there * (np.swapaxes(common, 1, 2) @ common))
+
+    def beside(self, dependence: Dependence) -> Dependence:
+        """With what errors have in common besides."""
+        inverse = dependence.inverse_freedom + self.probability / (2.0 * len(self.scores))
+        likely_px = self.sigma_px if self.probability > LIKELY else 0.0
+        return replace(dependence, inverse_freedom=inverse, read_out_px=likely_px)
+
+
+def _sizes_of_views(model: Linearised, estimate: Estimate, polynomials: Array, views: Indices) -> tuple[float, float]:
+    """Sigma and probability of the read-out of some sights, beside smooth displacements of each, and of all alike."""
+    tells = 1e-4  # share of the largest: of directions that tell anything beside the poses
+    equations, count = model.equations, len(views)
+    number = np.full(len(equations.bounds) - 1, -1)
+    number[views] = np.arange(count)
+    group, image = number[equations.sight], smooth_image(equations, estimate)
+    each = (image, polynomials[:, :, 1], polynomials.reshape(len(image), -1))
+    owners = ((np.zeros_like(group), 1), (group, count), (group, count))
+    parts = [
+        SparseColumns.of_groups(model, own * model.weight[:, None], *of) for own, of in zip(each, owners, strict=True)
+    ]
+    firsts = np.cumsum([0, *(part.size for part in parts)]).tolist()
+    names = ("alike", "read-out", "smooth")
+    repeated = RepeatedAmounts.of(model, SparseColumns.side_by_side(parts, len(equations)))
+    numbers = {name: np.arange(*ends) for name, ends in zip(names, pairwise(firsts), strict=True)}
+    priors = dict(zip(names, (LENS_LEAVES, READ_OUT, SMOOTH_ERRORS), strict=True))
+    return repeated.scatters(numbers, priors, tells)["read-out"]
 
 
 def _stated_together(model: Linearised, group: Indices, scales: tuple[float, float]) -> Array:

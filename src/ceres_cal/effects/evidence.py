@@ -95,6 +95,8 @@ AS_STATED = SizePrior(0.0, (1.0,))
 """Of what is stated with the observations, in the standard deviation that is stated: it is there, and as large."""
 SMOOTH_ERRORS = SizePrior(0.8, tuple(np.geomspace(0.01, 3.0, 14).tolist()))
 """Of what displaces a view smoothly, in px; as rare as errors that go together, see DEPENDENCE."""
+READ_OUT = SizePrior(0.8, tuple(np.geomspace(0.01, 30.0, 18).tolist()))
+"""Of how far a hand moves what is seen while rows are read out, in px: further than anything else displaces a view."""
 LENS_LEAVES = SizePrior(0.8, tuple(np.geomspace(0.01, 1.0, 11).tolist()))
 """Of what displaces all views alike, in px at the corners: a lens that the data chose leaves no more."""
 CENTRE_MOVES = SizePrior(0.9, tuple(np.geomspace(0.5, 60.0, 14).tolist()))
@@ -328,6 +330,21 @@ class RepeatedAmounts(Frozen):
         effects = replace(effects, freedom=self.spare + len(effects.size))
         sigma, probability = effects.scatter_under(prior.times(1.0 / np.sqrt(self.noise)))
         return float(sigma * np.sqrt(self.noise)), probability
+
+    def scatters(
+        self, numbers: Mapping[_Name, Indices], priors: Mapping[_Name, SizePrior], tells: float
+    ) -> dict[_Name, tuple[float, float]]:
+        """Sigma and probability of amounts that each view has by itself, by name, beside those of the others that are
+        likely.
+        """
+        sweeps = 2
+        found: dict[_Name, tuple[float, float]] = {}
+        for name in [*numbers] * sweeps:
+            others = [
+                (numbers[other], size) for other, (size, likely) in found.items() if likely > LIKELY and other != name
+            ]
+            found[name] = self.scatter(numbers[name], others, priors[name], tells)
+        return found
 
     def _size(self, numbers: Indices, others: Others, prior: SizePrior) -> tuple[float, float]:
         """The same where what goes together within a sight counts as noise; as it was beforehand where too few sights

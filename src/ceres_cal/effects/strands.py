@@ -294,7 +294,7 @@ ASIDE = 20.0
 """Times the longest strand: the length of what moves it as a whole."""
 # The likelihood is asked from so many standard deviations of a score test on (one in five of white noise), if the
 # correlation that is likely by it would widen the variance of what is shared by so much.
-_LOUD, _MATTERS = 0.85, 0.08
+LOUD, _MATTERS = 0.85, 0.08
 
 
 def is_loud(family: StrandFamily) -> bool:
@@ -312,9 +312,9 @@ def is_loud(family: StrandFamily) -> bool:
         total = float(np.sum(together * agreement))
         widening = total / squares * float(np.sum(together * shared) / np.sum(sums[6:-1]))
         least = 0.2 * squares
-        if widening <= _MATTERS or total <= _LOUD * np.sqrt(least):
+        if widening <= _MATTERS or total <= LOUD * np.sqrt(least):
             continue
-        if total > _LOUD * np.sqrt(max(_variance(family, together, squares), least)):
+        if total > LOUD * np.sqrt(max(_variance(family, together, squares), least)):
             return True
     return False
 

@@ -61,15 +61,16 @@ def assess(
     """
 
     def known(there: Estimate, says: ReducedInformation) -> Posterior:
-        known = make_posterior(says, degrees_of_freedom, scatter_at(there, says))
-        if shifts_at is not None:
-            by_model = known.by_model or known.information
-            known = replace(known.widened(*shifts_at(there, None)), by_model=by_model)
-        return known
+        by_scatter = make_posterior(says, degrees_of_freedom, scatter_at(there, says))
+        by_model = by_scatter.by_model or by_scatter.information
+        keys, shifts = ((), ()) if shifts_at is None else shifts_at(there, None)
+        known = by_scatter.widened(keys, shifts)
+        if there is found and by_scatter.by_model is not None:  # the best by the model alone
+            known = known.widened(known.keys, [to_best(by_scatter.information, says)])
+        return known if known is by_scatter else replace(known, by_model=by_model)
 
+    found = estimate
     posterior = known(estimate, reduced)
-    if posterior.by_model is not None:  # and the estimate is the best by the model alone
-        posterior = posterior.widened(posterior.keys, [to_best(posterior.information, reduced)])
     width = posterior.half_width
     valleys: dict[str, tuple[Node, ...]] = {}
     astray = problem  # with phi held of the cameras that went astray, while others are looked at
@@ -91,7 +92,7 @@ def assess(
 
 
 def to_best(known: Information, says: ReducedInformation) -> Array:
-    """(K,) how far the best estimate lies from the one that was found, where what is known is wider than the model says.
+    """(K,) how far the best estimate lies from the one found, where observations scatter more than the model says.
 
     It weighs observations against priors as if errors were independent. With A what the observations say by the model,
     g how the priors pull, and P what these say, the observations alone have their best at A^-1 g from the estimate. As

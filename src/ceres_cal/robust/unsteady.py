@@ -30,6 +30,7 @@ from ceres_cal.effects import (
     make_linear_model,
     posed,
     smooth_image,
+    smooth_view,
 )
 from ceres_cal.effects.effect import Amount, Case, EffectEstimate
 from ceres_cal.effects.evidence import (
@@ -204,20 +205,14 @@ def _equations(
 
 def _modes(equations: Equations, *, smooth: bool = True) -> Array:
     """(E, 18) px per px of each coefficient of a view: the principal point's x and y; a turn and a shift of the pose
-    that grow from row to row; polynomials along both axes of the image but for the constant, which is the pose's, where
-    `smooth` asks for them. x and y are from -1 to 1 over what is seen of the view.
+    that grow from row to row; polynomials along both axes of the image, where `smooth` asks for them.
     """
-    starts = equations.bounds[:-1]
-    low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
-    half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
-    x, y = ((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]).T
-    read_out = equations.pose * y[:, None]
-    read_out /= np.sqrt(np.maximum(np.einsum("ei,ei->i", read_out, read_out) / len(y), 1e-300))
+    place, polynomials = smooth_view(equations)
+    read_out = equations.pose * place[:, 1:]
+    read_out /= np.sqrt(np.maximum(np.einsum("ei,ei->i", read_out, read_out) / len(place), 1e-300))
     modes = [equations.intrinsics[:, _CENTRE], read_out]
     if smooth:
-        third = 1.0 / 3.0  # the mean of x^2
-        each = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
-        modes += [each * equations.direction[:, axis, None] for axis in range(2)]
+        modes.append(polynomials.reshape(len(place), -1))
     return np.hstack(modes)
 
 
@@ -253,7 +248,6 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     Args:
         model: of some views. image: (E, I) smooth displacements that all views have alike.
     """
-    sweeps = 2
     # Squares by the read-out over those by everything else, and views, from which on it is taken off. At 1.5, in 15
     # views of a public stereo camera, lenses predict other views worse by a tenth; at 2 to 4, in 17 of a GoPro held by
     # hand, its halves agree to 1.1 of what is stated instead of 2.0. Of fewer it may be the lens's, or the target's.
@@ -266,14 +260,9 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
         return {}, 1.0
     numbers = {kind: np.flatnonzero(np.tile(kind == _OF_MODE, views)) for kind in _MODES}
     numbers = {_IMAGE: of_views.size + np.arange(alike.size), **numbers}
-    found: dict[str, float] = {}
-    for kind in [*numbers] * sweeps:
-        found.pop(kind, None)
-        others = [(numbers[other], sigma) for other, sigma in found.items()]
-        prior = LENS_LEAVES if kind == _IMAGE else _MODES[kind][1]
-        sigma, probability = repeated.scatter(numbers[kind], others, prior, _TOLD)
-        if probability > LIKELY:
-            found[kind] = sigma
+    priors = {_IMAGE: LENS_LEAVES, **{kind: prior for kind, (_, prior) in _MODES.items()}}
+    each = repeated.scatters(numbers, priors, _TOLD)
+    found = {kind: sigma for kind, (sigma, probability) in each.items() if probability > LIKELY}
     squares = {
         kind: sigma**2 * np.trace(repeated.information[np.ix_(*2 * [numbers[kind]])]) for kind, sigma in found.items()
     }
