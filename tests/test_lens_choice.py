@@ -104,18 +104,37 @@ def test_a_lens_that_no_formula_has_in_one_view_of_a_floor() -> None:
     assert np.sqrt(np.mean(off**2)) < 1e-3  # 0.4 mm, of 1.3 stated
 
 
-def test_what_longer_lenses_leave_open_straight_from_above_is_stated() -> None:
-    """One coefficient predicts a floor as well as four, which the lens has, and would know phi three times as well."""
+def _straight_from_above() -> tuple[Camera, Observations]:
     camera = Camera((780, 580), 430.0, (391.0, 287.0), KannalaBrandt((-0.02, 0.003, -0.002, 0.0004)))
     station = Station("c", overhead_pose(0.1, -0.3, 4.2, 1.0, -1.0, 2.0))
     scene = field_scene(ssl_field("B"), {"c": camera}, {"s": station}, spacing_m=0.15)
-    observations = simulate(scene, Disturbance(0.05, 0.05), 0).observations
+    return camera, simulate(scene, Disturbance(0.05, 0.05), 0).observations
+
+
+def test_what_longer_lenses_leave_open_straight_from_above_is_stated() -> None:
+    """One coefficient predicts a floor as well as four, which the lens has, and would know phi three times as well."""
+    camera, observations = _straight_from_above()
     calibration = calibrate(observations)
     assert calibration.options.coefficients == ("k1", "p1", "p2")
     alone = calibrate(observations, calibration.options)
     stated, sd = (one.uncertainty.posterior.sd_of("camera", "c", "phi") for one in (calibration, alone))
     off = abs(calibration.cameras["c"].phi - camera.phi)
     assert stated > 2.5 * sd and off < 2.0 * stated
+
+
+def test_another_lens_leaves_phi_no_more_open_than_its_cost_allows() -> None:
+    """Normal equations may lead much farther along a bent valley: half of phi, where the cost rises by thousands."""
+    _, observations = _straight_from_above()
+    among = choose_lens(observations, Options(), initialise(gather_sights(observations), papers(Options()))).among
+    assert among is not None
+    other = next(one for one in among.tried if one.extends(among.chosen, 1.75))
+    near, phi = among.seen.solved_near(other).estimate, Key("camera", "c", "phi", "px")
+    least = among.seen.solved_near(other, there=near).cost
+    for most in (1.0, 4.0):
+        ends = Comparison._ends(among.seen, other, near, {phi: 0.4 * near.cameras["c"].phi}, most)
+        rises = [2.0 * (among.seen.solved_near(other, there=end).cost - least) for end in ends]
+        assert len(rises) == 2 and max(rises) < 1.1 * most
+        assert min(rises) > 0.05 * most
 
 
 @pytest.mark.parametrize("mix", ["boards", "lines-arcs", "field-boards"])
@@ -395,7 +414,7 @@ def test_a_lens_of_boards_near_its_best_is_where_a_solve_ends() -> None:
         assert normals is not None
         at = np.array([i for i, key in enumerate(normals.keys) if key.quantity not in names])
         keys = [normals.keys[i] for i in at]
-        off = values_of(among.seen.solved_near(one), keys) - values_of(one.estimate, keys)
+        off = values_of(among.seen.solved_near(one).estimate, keys) - values_of(one.estimate, keys)
         assert off @ (normals.normal.sum(axis=0) + normals.known)[np.ix_(at, at)] @ off < 0.1**2
 
 

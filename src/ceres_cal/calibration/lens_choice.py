@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import CalibrationError, DegenerateError, Frozen, Mask, attempt, or_none, replace
+from ceres_cal.base import NORMAL_95, CalibrationError, DegenerateError, Frozen, Mask, attempt, or_none, replace
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
@@ -31,7 +31,7 @@ from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem import Estimate, Key, Options, moved
+from ceres_cal.problem import Estimate, Key, Options, Solution, moved
 from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
@@ -128,6 +128,8 @@ class Comparison(Frozen):
             return found
         here, own = posterior.mixture(), self.chosen.along_phi(posterior.stated)
         known = dict(zip(here.keys, np.sqrt(here.variances[0]).tolist(), strict=True))
+        factors = dict(zip(posterior.keys, posterior.factors.tolist(), strict=True))
+        rise = max(((NORMAL_95 * factors[phi]) ** 2 for phi in own if phi in known), default=0.0)  # of a cost, at 95 %
         for one in asked:
             steps = self._open_phi(one.along_phi(posterior.stated), own, known, one.of.estimate)
             if steps and one in longer:
@@ -140,7 +142,7 @@ class Comparison(Frozen):
 
         def solved(one: Candidate, *, as_promised: bool = False) -> Estimate:
             is_there = one.is_near and seen is self.seen
-            return one.estimate if is_there else seen.solved_near(one, as_promised=as_promised)
+            return one.estimate if is_there else seen.solved_near(one, as_promised=as_promised).estimate
 
         near = attempt(partial(solved, self.chosen))  # reads: "other lenses could not be compared, ..."
         if isinstance(near, CalibrationError):
@@ -152,7 +154,7 @@ class Comparison(Frozen):
             if isinstance(near, CalibrationError):
                 left -= weight
                 continue
-            ends = self._ends(seen, one, near, steps)
+            ends = self._ends(seen, one, near, steps, rise)
             weights = (weight / len(ends),) * len(ends)
             found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
         # What they say by chance is less by as much as there are more observations than took part.
@@ -180,15 +182,27 @@ class Comparison(Frozen):
         return steps
 
     @staticmethod
-    def _ends(seen: InlierRows, one: Candidate, near: Estimate, steps: dict[Key, float]) -> Sequence[Estimate]:
-        """Another lens so far to either side; where there are no steps itself."""
+    def _ends(
+        seen: InlierRows, one: Candidate, near: Estimate, steps: dict[Key, float], most: float
+    ) -> Sequence[Estimate]:
+        """Another lens so far to either side, but no farther than where twice its cost has risen by so much; where
+        there are no steps itself.
 
-        def end(side: float) -> Estimate:
-            start = moved(near, list(steps), side * np.array(list(steps.values())))
-            return seen.solved_near(one, as_promised=True, there=start)
+        In a bent valley normal equations of elsewhere led to ends at which that had risen by 195.
+        """
+
+        def end(side: float, least: float, tries: int = 4) -> Solution:
+            there = moved(near, list(steps), side * np.array(list(steps.values())))
+            found = seen.solved_near(one, as_promised=True, there=there)
+            rise = 2.0 * (found.cost - least)
+            return found if rise <= most or not tries else end(side * (most / rise) ** 0.5, least, tries - 1)
+
+        def both() -> Sequence[Estimate]:
+            least = end(0.0, np.inf).cost
+            return [end(side, least).estimate for side in (-1.0, 1.0)]
 
         # quiet: where it ends in another minimum, its middle counts alone
-        ends = attempt(lambda: [end(-1.0), end(1.0)]) if steps else [near]
+        ends = attempt(both) if steps else [near]
         return [near] if isinstance(ends, CalibrationError) else ends
 
     @property

@@ -78,7 +78,7 @@ def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask], scale
     # Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
     explained = 3.0
     farthest = seen.options.reject_sigma
-    points, curves = seen.in_sigmas(seen.solved_near(other), scales)
+    points, curves = seen.in_sigmas(seen.solved_near(other).estimate, scales)
     count = 0
     for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
         count += equations * int(np.count_nonzero(own & (off < explained)))

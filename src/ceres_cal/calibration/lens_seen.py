@@ -15,7 +15,18 @@ from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
-from ceres_cal.problem import Estimate, Information, Key, Options, Problem, moved, problem_of, solve, values_of
+from ceres_cal.problem import (
+    Estimate,
+    Information,
+    Key,
+    Options,
+    Problem,
+    Solution,
+    moved,
+    problem_of,
+    solve,
+    values_of,
+)
 from ceres_cal.problem.parameters import as_held
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.as_built import Built
@@ -315,7 +326,7 @@ class InlierRows(Frozen):
 
     def solved_near(
         self, candidate: Candidate, *, as_promised: bool = False, there: Estimate | None = None
-    ) -> Estimate:
+    ) -> Solution:
         """Where a lens is at its best, solved for from where the normal equations have it.
 
         Args:
@@ -338,7 +349,7 @@ class InlierRows(Frozen):
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
         if as_promised and 2.0 * solution.cost > self._kept(candidate):
             raise DegenerateError("is not at its best where normal equations have it")
-        return solution.estimate
+        return solution
 
     def _kept(self, candidate: Candidate) -> float:
         """Squares up to which a lens is the one that was compared: exact observations leave less than noise would."""
