@@ -329,6 +329,24 @@ def test_a_mirrored_grid_is_turned_over(truth: Array) -> None:
     assert np.array_equal(right_handed(grid.transpose(1, 0, 2)), grid.transpose(1, 0, 2)[:, ::-1])
 
 
+def test_a_board_that_looks_alike_turned_is_named_as_it_is_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether OpenCV begins at its upper end or at the other, as in one of 35 pictures of a public set."""
+    square, margin = 40, 60
+    dark = np.add.outer(np.arange(6), np.arange(8)) % 2 == 0
+    drawn = np.pad(np.kron(np.where(dark, 30, 220), np.ones((square, square))), margin, constant_values=220)
+    path = write(tmp_path / "a.png", cv2.GaussianBlur(drawn.astype(np.uint8), (0, 0), 1.0))
+    found = boards._found_fast(read_grey(path), 7, 5)
+    assert found is not None
+    for step in (1, -1):
+        monkeypatch.setattr(boards, "_found_fast", lambda *_, named=found[::step, ::step]: named)
+        points = detect_boards([path], checkerboard(7, 5, 0.04)).observations.points
+        assert points.feature is not None
+        first, last = (points.pixels[points.feature == feature][0] for feature in (0, 34))
+        assert np.all(first < last - square)
+
+
 def test_pictures_side_by_side_are_measured_as_one_by_one(tmp_path: Path, picture: Array) -> None:
     images = [write(tmp_path / f"{seed}.png", photograph(picture, seed=seed)) for seed in range(5)]
     with at_most(3):

@@ -76,7 +76,8 @@ def detect_boards(
     equal stems apart) unless the target is the world, as markers on the floor are. Corners are named so that the
     labelling is never mirrored: a board's x along columns, y along rows and z away from the camera. Which end of a
     plain chessboard is "0,0" is settled where its picture says so, by columns + rows being odd: then the square between
-    "0,0" and "1,1" is dark; otherwise the board may be named as if turned, which the placement takes up.
+    "0,0" and "1,1" is dark; otherwise x goes to the right of the picture rather than to the left. Of one turned by a
+    right angle the name may be the other one, which the placement takes up, but not how a board is bent.
 
     `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. What an
     unflat board and an unmodelled lens add to it is up to ten times that in real sets, and only the solve can tell.
@@ -206,8 +207,17 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
         return f"no chessboard of {columns} x {rows} inner corners found"
     seen, saddles = max(found, key=lambda one: np.count_nonzero(np.isfinite(one[1].contrast)))
     grid = saddles.grid if corner_fit == "saddle" else _subpixel(levels, seen)
-    turned = (columns + rows) % 2 == 1 and not is_begun_dark(saddles.contrast)
+    is_told = (columns + rows) % 2 == 1
+    turned = not (is_begun_dark(saddles.contrast) if is_told else _is_upright(grid))
     return _enough(grid[::-1, ::-1] if turned else grid)
+
+
+def _is_upright(grid: Array) -> bool:
+    """Whether x goes to the right and y down rather than the other way: of boards that look alike when they are turned,
+    one that is not as flat as drawn is the same in all views only where all name its corners alike.
+    """
+    along_row, along_column = (np.mean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))
+    return bool(along_row[0] + along_column[1] > 0.0)
 
 
 def _as_whole(image: Image, seen: Array | None) -> list[tuple[Array, Saddles]]:
