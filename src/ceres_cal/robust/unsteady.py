@@ -2,7 +2,8 @@
 
 A stabilised lens or sensor is shifted against the hand's motion, by some pixels in each picture; and what a hand moves
 is sheared while rows are read out one after the other (a rolling shutter). In each view of a board the principal point,
-and the motion while it is read out, are random effects with sigmas that all views of a camera share; so are smooth
+and the motion while it is read out, are random effects with sigmas that all views of a camera share: a shift of the
+picture, which is nearly all of it, and turns, which a pose hides less. So are smooth
 displacements of each view besides, and those that all views have alike, which are the lens's. The evidence of each is
 taken beside the others (`effects.evidence`): by itself the principal point of any camera seems to move where views err
 smoothly. Where it does, or where the read-out says more of what is left than everything else, best linear unbiased
@@ -37,6 +38,7 @@ from ceres_cal.effects.evidence import (
     CENTRE_MOVES,
     LENS_LEAVES,
     LIKELY,
+    READ_OUT,
     SMOOTH_ERRORS,
     Others,
     RepeatedAmounts,
@@ -62,8 +64,13 @@ _ROLLING_WORDS = (
     "far off. Hold both still"
 )
 # What a view's coefficients are, in their order, how many, and what is expected of them; those of all views come last.
-_CENTRE_OF_VIEW, _READ_OUT = "principal point", "read-out"
-_MODES = {_CENTRE_OF_VIEW: (2, CENTRE_MOVES), _READ_OUT: (6, SMOOTH_ERRORS), "smooth": (10, SMOOTH_ERRORS)}
+_CENTRE_OF_VIEW, _READ_OUT, _TURNS = "principal point", "read-out", "read-out, turns"
+_MODES = {
+    _CENTRE_OF_VIEW: (2, CENTRE_MOVES),
+    _READ_OUT: (2, READ_OUT),
+    _TURNS: (6, SMOOTH_ERRORS),
+    "smooth": (10, SMOOTH_ERRORS),
+}
 _IMAGE = "image"
 _OF_MODE = np.repeat(list(_MODES), [count for count, _ in _MODES.values()])
 _CENTRE = [2, 3]  # places of the principal point in the intrinsics vector
@@ -204,13 +211,14 @@ def _equations(
 
 
 def _modes(equations: Equations, *, smooth: bool = True) -> Array:
-    """(E, 18) px per px of each coefficient of a view: the principal point's x and y; a turn and a shift of the pose
-    that grow from row to row; polynomials along both axes of the image, where `smooth` asks for them.
+    """(E, 20) px per px of each coefficient of a view: the principal point's x and y; a shift of the picture, and a
+    turn and a shift of the pose, that grow from row to row; polynomials along both axes of the image, where `smooth`
+    asks for them.
     """
     place, polynomials = smooth_view(equations)
-    read_out = equations.pose * place[:, 1:]
-    read_out /= np.sqrt(np.maximum(np.einsum("ei,ei->i", read_out, read_out) / len(place), 1e-300))
-    modes = [equations.intrinsics[:, _CENTRE], read_out]
+    turns = equations.pose * place[:, 1:]
+    turns /= np.sqrt(np.maximum(np.einsum("ei,ei->i", turns, turns) / len(place), 1e-300))
+    modes = [equations.intrinsics[:, _CENTRE], polynomials[:, :, 1], turns]
     if smooth:
         modes.append(polynomials.reshape(len(place), -1))
     return np.hstack(modes)
@@ -266,8 +274,9 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     squares = {
         kind: sigma**2 * np.trace(repeated.information[np.ix_(*2 * [numbers[kind]])]) for kind, sigma in found.items()
     }
-    by_others = repeated.rest + sum(own for kind, own in squares.items() if kind not in (_IMAGE, _READ_OUT))
-    rolling = views >= enough_views and squares.get(_READ_OUT, 0.0) > says_most * by_others
+    read_out = squares.get(_READ_OUT, 0.0) + squares.get(_TURNS, 0.0)
+    by_others = repeated.rest + sum(squares.values()) - squares.get(_IMAGE, 0.0) - read_out
+    rolling = views >= enough_views and read_out > says_most * by_others
     return (found if rolling or _centre_moves(found) else {}), repeated.noise
 
 
@@ -309,7 +318,7 @@ def _predicted(
 
 
 def _of_sight(sizes: Sizes) -> Array:
-    """(18,) the sigma of each coefficient."""
+    """(20,) the sigma of each coefficient."""
     return np.array([sizes.get(kind, _NONE_PX) for kind in _OF_MODE.tolist()])
 
 
