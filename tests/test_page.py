@@ -385,7 +385,7 @@ def png_of(width: int, height: int) -> bytes:
         (["huge.png"], "huge.png: an image of 40000 x 25000 px: would take 3000 MB"),
         (["a.jpg", "small.png"], "small.png: not an image that OpenCV can read"),
         (["none.jpg"], "none.jpg: no such file"),
-        (["a.jpg", "--target", "ssl-z"], "--target: there is no target 'ssl-z'"),
+        (["a.jpg", "--target", "ssl-z"], "there is no target 'ssl-z'"),
         (["a.jpg", "--board", "9"], "board '9'"),
         (["calibration.json"], "calibration.json: a calibration holds no picture: name a photograph, too"),
         (["a.jpg", "more/a.jpg"], "a.jpg: two photographs have this name"),

@@ -344,10 +344,12 @@ class _ReadOut(Frozen):
 
     @classmethod
     def of(cls, model: Linearised, estimate: Estimate) -> _ReadOut | None:
-        """Of views of boards; None where they are few, or do not seem to be displaced."""
+        """Of views of boards that one camera alone sees, for what contradicts another one may be of another moment;
+        None where they are few, or do not seem to be displaced.
+        """
         fewest, enough = 5, 20  # views that tell anything, and that are asked how large it is
         equations = model.equations
-        boards = np.flatnonzero([key.placement is not None for key in equations.sights.keys])
+        boards = np.flatnonzero(np.maximum.reduceat(model.of_private, equations.bounds[:-1]))
         if len(boards) < fewest:
             return None
         polynomials = smooth_view(equations)[1]
