@@ -79,7 +79,7 @@ def accuracy_sections(quality: Quality, seams: Sequence[Seam]) -> Iterator[Secti
     yield Section("rig", [*map(_rig_line, pairs[:most_pairs]), *more])
     yield Section("located", [f"{name}: {_sd_at_heights(every)}" for name, every in maps.items()])
     yield _seams(seams)
-    yield Section("widened", [uncertainty.widening] if uncertainty.widening else [])
+    yield Section("widened", wrapped(uncertainty.widening or ""))
     yield from _unknown(uncertainty)
     known = {
         "numbers": [{**vars(one), "key": one.key._asdict()} for one in uncertainty.verdicts],

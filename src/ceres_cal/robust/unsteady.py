@@ -3,12 +3,12 @@
 A stabilised lens or sensor is shifted against the hand's motion, by some pixels in each picture; and what a hand moves
 is sheared while rows are read out one after the other (a rolling shutter). In each view of a board the principal point,
 and the motion while it is read out, are random effects with sigmas that all views of a camera share: a shift of the
-picture, which is nearly all of it, and turns, which a pose hides less. So are smooth
-displacements of each view besides, and those that all views have alike, which are the lens's. The evidence of each is
-taken beside the others (`effects.evidence`): by itself the principal point of any camera seems to move where views err
-smoothly. Where it does, or where the read-out says more of what is left than everything else, best linear unbiased
-predictions are taken off the observations, and everything else is solved for again (Henderson, Biometrics 31, 1975).
-What they leave open goes into the covariance of the shared numbers.
+picture, which is nearly all of it, and turns, which a pose hides less. So are smooth displacements of each view
+besides, and those that all views have alike, which are the lens's. The evidence of each is taken beside the others
+(`effects.evidence`): by itself the principal point of any camera seems to move where views err smoothly. Where it does,
+or where the read-out says more of what is left than everything else, best linear unbiased predictions are taken off the
+observations, and everything else is solved for again (Henderson, Biometrics 31, 1975). What they leave open goes into
+the covariance of the shared numbers.
 
 Smooth displacements, and a read-out that says less, are not taken off. They are found in nearly all public photographs
 of boards; but without them lenses predict other views worse.
