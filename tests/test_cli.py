@@ -286,7 +286,7 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
         (("calibrate", SAMPLE, "--powers", "1,2"), "powers of the radial lens"),
         (("calibrate", SAMPLE, "--fix", "k3=0"), "cannot fix 'k3'"),
         (("calibrate", SAMPLE, "--loss-scale", "0"), "loss_scale must be 0.001 to 1e+09 sigmas"),
-        (("calibrate", SAMPLE, "--max-iterations", "0"), "max_iterations must be above 0"),
+        (("calibrate", SAMPLE, "--max-iterations", "0"), "no whole number from 1 on"),
         (("locate", "nowhere.json", "1,2"), "nowhere.json: no such file"),
         (("locate", SAMPLE, "1,2"), "it holds observations, where a calibration must be given"),
         (("simulate",), "name a scene and a folder"),

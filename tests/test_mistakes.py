@@ -11,6 +11,7 @@ import pytest
 
 import ceres_cal as cc
 from ceres_cal.cli import main
+from ceres_cal.cli.command import COMMANDS, Parser
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data/ssl_field/observations.json"
@@ -106,7 +107,15 @@ ON_THE_COMMAND_LINE = [
     ("calibrate OBS --force", "unrecognized arguments: --force: see `ceres-cal calibrate --help`"),
     ("calibrate OBS --lens radial --lens brown", "argument --lens: it is given twice, radial and brown: leave one out"),
     ("calibrate ''", "argument OBS: '' is no file"),
-    ("calibrate OBS --threads 1.5", "argument --threads: '1.5' is not a whole number"),
+    ("calibrate OBS --threads -1", "argument --threads: '-1' is no whole number from 0 on"),
+    ("calibrate OBS --max-iterations 0", "argument --max-iterations: '0' is no whole number from 1 on"),
+    ("publish CAL --port 0", "argument --port: '0' is no whole number from 1 to 65535"),
+    ("detect board PHOTO -o OUT.json --board 9x6x25mm", "--board 9x6x25mm: here it is --target"),
+    ("detect board PHOTO -o OUT.json --columns 1.5", "argument --columns: '1.5' is not a whole number"),
+    ("run PHOTOS --columns 9 -o OUT", "--columns 9: here it is --board"),
+    ("export CAL --format opencv --to opencv -o OUT", "--format opencv: here it is --to"),
+    ("batch nowhere.json -o OUT", "nowhere.json: no such file"),
+    ("batch README -o OUT", "README.md: a plan is a folder, or a table in .jsonl, .csv or .toml"),
     ("publish CAL --geometry OBS --once", "observations.json: not a SSL_WrapperPacket"),
     ("listen -o OUT.json --seconds nan", "argument --seconds: 'nan' is not a finite number"),
     ("calibrate OBS -o -", "argument -o/--output: '-' is no file: give its name (./- where that is -)"),
@@ -197,6 +206,16 @@ def test_on_the_command_line(capsys: pytest.CaptureFixture[str], names: dict[str
     code = main([names.get(word, word) for word in shlex.split(typed)])
     out, err = capsys.readouterr()
     assert code == 2 and out == "" and err.count("\n") == 1 and said in err, err
+
+
+def test_options_elsewhere_are_those_of_other_commands() -> None:
+    parsers = {name: Parser(add_help=False) for name in COMMANDS}
+    for name, parser in parsers.items():
+        COMMANDS[name].fill(parser)
+    for name, parser in parsers.items():
+        for option, own in parser.elsewhere.items():
+            owners = [one for one, other in parsers.items() if option in other._option_string_actions]
+            assert own in parser._option_string_actions and owners and name not in owners, (name, option)
 
 
 def test_thirty_of_each() -> None:

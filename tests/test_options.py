@@ -1,6 +1,5 @@
 """Options of commands: a parser made of a dataclass, and the dataclass filled."""
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -99,7 +98,7 @@ def test_wrong_usage(arguments: Sequence[str], words: str) -> None:
 
 
 def test_the_help_says_the_default_and_what_may_be_repeated() -> None:
-    parser = argparse.ArgumentParser()
+    parser = Parser()
     add_options(parser, Every)
     said = parser.format_help()
     for words in (
@@ -121,7 +120,7 @@ def test_the_help_says_the_default_and_what_may_be_repeated() -> None:
 def test_every_argument_of_a_command_is_described_where_it_is_defined(name: str) -> None:
     kind = COMMANDS[name].arguments
     assert issubclass(kind, Arguments) and issubclass(kind, Frozen)
-    parser = argparse.ArgumentParser()
+    parser = Parser()
     add_options(parser, kind)
     helps = {action.dest: action.help for action in parser._actions}
     assert all(helps[one.name] or one.metadata["metavar"] for one in fields(kind) if "forms" not in one.metadata)

@@ -190,3 +190,15 @@ def test_a_folder_without_images_names_those_of_its_cameras(tmp_path: Path, caps
     shutil.copy(PHOTOGRAPH, tmp_path / "left")
     assert main(["detect", "field", str(tmp_path), "--target", "ssl-b", "--auto", "-o", str(tmp_path / "x.json")]) == 2
     assert "there are no images in this folder, but in its left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["bad.png", "bad.avi"])
+def test_no_folder_is_left_where_nothing_could_be_read(tmp_path: Path, name: str) -> None:
+    bad = tmp_path / name
+    bad.write_bytes(b"no picture")
+    for kind in (("run", "--board", "9x6x25mm"), ("detect", "board", "--target", "9x6x25mm")):
+        out = tmp_path / ("out/deep" if kind[0] == "run" else "x.json")
+        assert main([*kind, str(bad), "-o", str(out)]) == 2
+        assert list(tmp_path.iterdir()) == [bad]
+    assert main(["run", str(bad), "--board", "9x6x25mm", "-o", str(tmp_path)]) == 2  # a folder that was there stays
+    assert list(tmp_path.iterdir()) == [bad]

@@ -29,10 +29,9 @@ def _run(
     good_enough_mm: float | None = option(
         "the worst error that will do; nothing is advised where it is reached", "MM", read=arguments.length("mm")
     ),
-    board: tuple[int, int, float] | None = option(
+    board: tuple[int, int, float] | None = arguments.board_option(
         "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
         "calibration's own, or that one",
-        "COLUMNSxROWSxMM",
         read=arguments.parse_board,
     ),
 ) -> Document:

@@ -40,9 +40,9 @@ def camera_option(what: str = "name of the camera", default: str | None = "camer
     return option(what, "NAME", default, read=name)
 
 
-def jobs_option(what: str, default: int, **about: Any) -> Any:
-    """The option --jobs: how many processes; 0 is one a core."""
-    return option(f"{what} at a time; default: {default or 'one a core'}", "N", default, read=whole(0), **about)
+def board_option(what: str, **about: Any) -> Any:
+    """The option --board of a chessboard."""
+    return option(what, "COLUMNSxROWSxMM", elsewhere=("columns", "rows", "square"), **about)
 
 
 def output_option(what: str, default: Any = REQUIRED, metavar: str = "FILE") -> Any:
@@ -57,7 +57,7 @@ def prior_option(metavar: str = "OWNER.NAME=VALUE:SIGMA", what: str = "", group:
         f"aspect (fy / fx) or a coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left "
         "out where there is only one)"
     )
-    return option(what or every, metavar, repeatable=True, group=group)
+    return option(what or every, metavar, repeatable=True, group=group, elsewhere=("height_mm",))
 
 
 def estimate_option(**about: Any) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 
 from ceres_cal import base, cli, report
 from ceres_cal.base import DASH, InputError, counted, mm, plural, printable
-from ceres_cal.cli.arguments import jobs_option, output_option
+from ceres_cal.cli.arguments import output_option, whole
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
 from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile
 
@@ -47,8 +47,8 @@ def _run(
         metavar="DIR",
     ),
     options: str = option("arguments that every calibrate job gets besides", "'...'", ""),
-    jobs: int = jobs_option("jobs", 0),
-    reports: bool = switch("a report of each calibrate and refit, too"),
+    jobs: int = option("jobs at a time; default: 0, one a core", "N", 0, read=whole(0), elsewhere=("threads",)),
+    reports: bool = switch("a report of each calibrate and refit, too", elsewhere=("report",)),
 ) -> Document:
     planned = plan_jobs(plan, output, options, reports=reports)
     base.make_folder(output)

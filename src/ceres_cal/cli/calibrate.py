@@ -120,8 +120,15 @@ class CalibrateArguments(arguments.ReportArguments):
     closed_form_only: bool = switch(
         "stop at the closed forms of R. Rojas's paper: a baseline to compare with, not a calibration", group=_SOLVE
     )
-    max_iterations: int = option("most iterations of each solve", "N", 100, group=_SOLVE)
-    threads: int = option("how many threads; default: the solver chooses", "N", 0, group=_SOLVE)
+    max_iterations: int = option("most iterations of each solve", "N", 100, read=arguments.whole(1), group=_SOLVE)
+    threads: int = option(
+        "most threads; default: 0, where the solver chooses",
+        "N",
+        0,
+        read=arguments.whole(0),
+        group=_SOLVE,
+        elsewhere=("jobs",),
+    )
     scheduler: str | None = option(
         "a Dask scheduler, whose workers keep the observations, such as tcp://host:8786", "ADDRESS", group=_SOLVE
     )

@@ -40,6 +40,7 @@ def option(
     group: str = "",
     alone: str = "",
     beside: tuple[str, ...] = (),
+    elsewhere: tuple[str, ...] = (),
 ) -> Any:
     """A field that is an option, --like-this where its name is like_this.
 
@@ -48,10 +49,10 @@ def option(
         flags: how it is typed, where otherwise. read: a value from its text, where its type does not say it.
         repeatable: whether it may be given again and again; the field is a tuple.
         group: title in the help. alone: of options of the same word one may be given. beside: names of options of which
-            one has to be given, too.
+            one has to be given, too. elsewhere: names of options of other commands that are for the same.
     """
     given = {"flags": flags, "read": read, "repeatable": repeatable, "group": group, "alone": alone}
-    about = {"help": help, "metavar": metavar, "beside": beside, **given}
+    about = {"help": help, "metavar": metavar, "beside": beside, "elsewhere": elsewhere, **given}
     return field(default=() if repeatable and default is None else default, metadata=about)
 
 
@@ -93,7 +94,7 @@ class QuietArguments(Arguments):
         return self.quiet or self.json
 
 
-def add_options(parser: argparse.ArgumentParser, kind: type[Arguments]) -> None:
+def add_options(parser: Parser, kind: type[Arguments]) -> None:
     """Add everything that a command takes to a parser."""
     types, places = get_type_hints(kind), {"": parser}
     common = {one.name for one in fields(QuietArguments)}
@@ -111,6 +112,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type[Arguments]) -> None:
             place = places.get(word) or places.setdefault(word, place.add_mutually_exclusive_group())
         names, how = _settings(one, types[one.name])
         place.add_argument(*names, **how)
+        parser.elsewhere |= {flag(other): names[-1] for other in about.get("elsewhere", ())}
 
 
 def filled(kind: type[_T], given: argparse.Namespace) -> _T:
@@ -243,11 +245,14 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # argparse's own from Python 3.14 on
+        self.elsewhere: dict[str, str] = {}  # an option of other commands: the one of this command that is for the same
 
     def error(self, message: str) -> NoReturn:
         meant = ""
         if wrong := re.match(r"unrecognized arguments: (-[\w-]+)", message):
-            meant = _of_others(wrong[1]) or did_you_mean(wrong[1], self._option_string_actions)
+            own = self.elsewhere.get(wrong[1])
+            meant = f": here it is {own}" if own else _of_others(wrong[1])
+            meant = meant or did_you_mean(wrong[1], self._option_string_actions)
         elif wrong := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
             meant = did_you_mean(wrong[1], re.findall(r"[\w.-]+", wrong[2]))
         raise InputError(f"{message}{meant or f': see `{self.prog} --help`'}")
@@ -313,7 +318,7 @@ class Command(Frozen, eq=True):
             "formatter_class": argparse.RawDescriptionHelpFormatter,
         }
 
-    def fill(self, parser: argparse.ArgumentParser) -> None:
+    def fill(self, parser: Parser) -> None:
         """Add all of its arguments to a parser."""
         add_options(parser, self.arguments)
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")

@@ -163,6 +163,19 @@ def require_folder(path: Path) -> None:
         raise InputError(f"{path}: is a file: name a folder")
 
 
+@contextmanager
+def folder_of_results(folder: Path) -> Iterator[None]:
+    """A folder, made where it is missing, that what fails leaves behind only where something was written into it."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    base.make_folder(folder)
+    try:
+        yield
+    finally:
+        for one in missing:
+            if not any(one.iterdir()):
+                one.rmdir()
+
+
 def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> None:
     """`require_output` of a file of observations."""
     require_output(path, inputs, "observations are", ".json", ".npz")

@@ -10,7 +10,7 @@ from typing import Any
 
 from ceres_cal import formats, scene
 from ceres_cal.base import InputError, replace
-from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
+from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length, whole
 from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch
 from ceres_cal.cli.files import read_calibration, require_output, save
 from ceres_cal.report.document import Document, Section
@@ -37,7 +37,9 @@ def export(
         "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
     ),
     max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm")),
-    to: str = option(lambda: _listed(formats.EXPORT_FORMATS.values()), "FORMAT", REQUIRED),
+    to: str = option(
+        lambda: _listed(formats.EXPORT_FORMATS.values()), "FORMAT", REQUIRED, elsewhere=("format", "from")
+    ),
     options: Mapping[str, str] = options_of(lambda: formats.EXPORT_FORMATS.values()),
 ) -> Document:
     """A calibration in another format."""
@@ -105,6 +107,7 @@ def from_option() -> Any:
         lambda: f"default: by ending and content. {_listed(formats.IMPORT_FORMATS.values())}",
         "FORMAT",
         flags=("--from",),
+        elsewhere=("format", "to"),
     )
 
 
@@ -156,7 +159,7 @@ class GroupArguments(Arguments):
     """Where the league's messages are."""
 
     address: str = option("multicast group", "IP", "224.5.23.2")
-    port: int = option("", "PORT", 10006)
+    port: int = option("", "PORT", 10006, read=whole(1, 65535))
     interface: str = option("of the own network card; default: the system's choice", "IP", "0.0.0.0")
 
 

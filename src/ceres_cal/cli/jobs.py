@@ -237,9 +237,9 @@ def _holds_observations(file: Path) -> bool:
 
 
 def _of_table(path: Path) -> Iterator[Planned]:
+    content = read_bytes(path)
     if path.suffix not in _ENDINGS:
         raise InputError(f"{path}: a plan is a folder, or a table in {', '.join(_ENDINGS[:-1])} or {_ENDINGS[-1]}")
-    content = read_bytes(path)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

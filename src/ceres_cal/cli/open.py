@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ceres_cal import cli, detect
 from ceres_cal.base import InputError, image_files, plural
-from ceres_cal.cli.arguments import output_option, prior_option, whole
+from ceres_cal.cli.arguments import board_option, output_option, prior_option, whole
 from ceres_cal.cli.command import argument, command, option, switch
 from ceres_cal.cli.files import json_object, require_folder, require_shown
 from ceres_cal.report.document import Document, Section
@@ -29,7 +29,7 @@ def _run(
         "compared over one picture",
     ),
     target: str | None = option("the field, as of `detect field`; the page has a list of them, too", "TARGET"),
-    board: str | None = option("a chessboard, as of `run`", "COLUMNSxROWSxMM"),
+    board: str | None = board_option("a chessboard, as of `run`"),
     prior: tuple[str, ...] = prior_option(),
     output: Path = output_option("what is made", Path("camera"), "FOLDER"),
     port: int = option("of the page's address; default: one that is free", "N", 0, read=whole(0, 65535)),

@@ -157,6 +157,7 @@ class BoardArguments(QuietArguments, DetectArguments):
         'place, spelled out (\'{"kind": "markers", ...}\': `ceres-cal targets`), or a JSON file with it or with a '
         "target named 'board'",
         "TARGET",
+        elsewhere=("board",),
     )
     square: float | None = option("side of a square in metres, or such as 25mm", "M", read=length("m"))
     april_grid: float | None = option(

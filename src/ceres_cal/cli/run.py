@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from ceres_cal import base, detect, formats, scene, start
+from ceres_cal import detect, formats, scene, start
 from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError, each_camera, images_and_videos, replace
 from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
-from ceres_cal.cli.files import attempted, require_shown
+from ceres_cal.cli.files import attempted, folder_of_results, require_shown
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
@@ -37,8 +38,8 @@ class RunArguments(QuietArguments):
         beside=("target",),
     )
     not_painted: str = arguments.not_painted_option("lines that this field does not have", beside=("target",))
-    board: str | None = option(
-        "a chessboard by its inner corners and the side of a square, such as 9x6x25mm", "COLUMNSxROWSxMM"
+    board: str | None = arguments.board_option(
+        "a chessboard by its inner corners and the side of a square, such as 9x6x25mm"
     )
     lens: str = option("as of `calibrate`", "KIND", "auto")
     prior: tuple[str, ...] = arguments.prior_option()
@@ -69,13 +70,15 @@ def _run(args: RunArguments) -> Document:
     cameras = _cameras(args)
     _require_fitting(args, cameras)
     forms = [formats.export_format(name) for name in args.to]  # or says which there are
-    for one in (args, *cameras):
-        base.make_folder(one.output)
-    images = [_photographs(one) for one in cameras]
-    steps = [step for one, own in zip(cameras, images, strict=True) for step in _seen_by(one, own, len(cameras) > 1)]
+    several = len(cameras) > 1
+    with ExitStack() as folders:
+        for one in (args, *cameras):
+            folders.enter_context(folder_of_results(one.output))
+        images = [_photographs(one) for one in cameras]
+        steps = [step for one, own in zip(cameras, images, strict=True) for step in _seen_by(one, own, several)]
     detected = [step.data for step in steps if "output" in step.data]
     observations = [str(data["output"]) for data in detected]
-    if len(cameras) > 1 and _is_named_by_chance(args.board):
+    if several and _is_named_by_chance(args.board):
         steps.append(_attempted(args, "join", [*observations, "-o", str(args.output / "rig.json")]))
         observations = [str(steps[-1].data["output"])] if steps[-1].data else observations
     calibrated = _calibrated(args, cameras, detected, observations)

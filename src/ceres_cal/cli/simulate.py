@@ -38,7 +38,7 @@ def _run(
             "name a scene and a folder, as in `ceres-cal simulate ssl-field -o DIR`; --list shows the scenes"
         )
     require_folder(output)
-    is_file = scene not in scenes and (Path(scene).exists() or scene.endswith(".json"))
+    is_file = scene not in scenes and (Path(scene).exists() or Path(scene).suffix)
     simulation = simulate(*(load_scene(scene) if is_file else built_in_scene(scene)), seed)
     with finishing():
         write_simulation(simulation, output)

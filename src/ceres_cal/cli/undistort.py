@@ -47,7 +47,7 @@ class UndistortArguments(QuietArguments):
     output: Path = arguments.output_option("the pictures; made if missing", metavar="FOLDER")
     camera: str | None = arguments.camera_option("which camera; may be left out where there is only one", None)
     station: str | None = arguments.station_option()
-    format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png")
+    format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png", elsewhere=("to",))
     crop: bool = switch("the largest rectangle without black (default)", group=_STRAIGHT, alone="shape")
     whole: bool = switch("everything that the photograph shows, black around it", group=_STRAIGHT, alone="shape")
     size: tuple[int, int] | None = option(

@@ -97,10 +97,9 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
     stretches = min(count, opened.total)
     written: list[Path] = []
     best: tuple[int, float, Image] | None = None  # of a stretch: its number, sharpness and frame
-    make_folder(folder)
 
     def write(frame: Image) -> None:
-        written.append(folder / f"{len(written) + 1:04d}.png")
+        written.append(make_folder(folder) / f"{len(written) + 1:04d}.png")
         write_bytes(written[-1], encoded(frame, ".png", 100))
 
     for number, frame in opened.frames(max(1, opened.total // (stretches * looked_at))):
