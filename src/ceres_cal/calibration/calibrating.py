@@ -241,7 +241,8 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
         return _of_lens(task, start, sights, _named(options))
 
     def seen_with(lenses: ChosenLenses) -> Explained:
-        problem = problem_of(sights, lenses.options, lenses.start.estimate)
+        smoothness = {name: sd for one in lenses.each.values() for name, sd in one.smoothness.items()}
+        problem = replace(problem_of(sights, lenses.options, lenses.start.estimate), smoothness=smoothness)
         return explained(task, lenses.start, problem, lenses.built)
 
     chosen = choose_lenses(sights, options, start)

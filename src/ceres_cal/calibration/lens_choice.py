@@ -74,6 +74,11 @@ class Chosen(Frozen):
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
 
+    @property
+    def smoothness(self) -> Mapping[str, tuple[float, ...]]:
+        """How smooth a lens without a formula was when lenses were compared, see `Problem`."""
+        return {} if self.among is None else self.among.chosen.of.smoothness
+
     def others(self, posterior: Posterior, options: Options) -> OtherLenses:
         """What other lenses would say, as far as they are probable, see `Comparison.others`."""
         none = OtherLenses(self.start.estimate, (), (), {})
@@ -212,8 +217,7 @@ class Comparison(Frozen):
         placements = Poses.of(start.estimate.placements)
         placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
         others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # with a plainer lens so far
-        near = replace(there, placements=placements)
-        start = replace(start, estimate=near, is_near=not form.blank.roughness, others=others)
+        start = replace(start, estimate=replace(there, placements=placements), is_near=True, others=others)
         return Chosen(form.of(self.seen.options), start, _choice(self), self)
 
     def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float], *, is_alone: bool) -> Chosen | None:

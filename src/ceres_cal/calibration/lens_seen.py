@@ -46,6 +46,7 @@ class Kind(Frozen):
     Attributes:
         forms: the longest first. normals: None where it gives no answer, and `failed` says why. sigma_px: of a typical
             observation. reach_px: how far from its principal point each camera's observations reach.
+        smoothness: of a lens without a formula, see `Problem`.
     """
 
     forms: tuple[Form, ...]
@@ -53,6 +54,7 @@ class Kind(Frozen):
     normals: GroupNormals | None = None
     sigma_px: float = np.nan
     reach_px: Mapping[str, float] = field(default_factory=dict)
+    smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     failed: str = ""
 
     @property
@@ -268,7 +270,7 @@ class InlierRows(Frozen):
         start = self.end.estimate
 
         def near_best() -> Kind:
-            problem, estimate = self._problem(options, start), start
+            problem, estimate = self._problem(options, start, {}), start
             if not is_solved:
                 estimate = seen_through(estimate, options, self._profiles)
                 self._shown(estimate)
@@ -285,9 +287,8 @@ class InlierRows(Frozen):
         def near_best() -> Kind:
             problem = problem_of(self.every, options, start)
             end = solve_robustly(problem, start, most_rounds=MOST_ROUNDS)
-            estimate = end.estimate
-            problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
-            return self._near_best(forms, problem, estimate)
+            problem = self._problem(options, end.estimate, end.problem.smoothness)
+            return self._near_best(forms, problem, end.estimate)
 
         return _or_failed(near_best, forms, start)
 
@@ -320,7 +321,7 @@ class InlierRows(Frozen):
         if np.sum(points**2) + curves @ curves <= self._kept(candidate):
             return candidate.estimate
         options = candidate.form.of(self.options, max_iterations=_MOST_STEPS)
-        problem = self._problem(options, candidate.estimate)
+        problem = self._problem(options, candidate.estimate, candidate.of.smoothness)
         solution = solve(problem, candidate.estimate, precision=_PRECISION)
         return solution.estimate if 2.0 * solution.cost <= self._kept(candidate) else None
 
@@ -341,7 +342,7 @@ class InlierRows(Frozen):
         at_best = 1e-6
         options = candidate.form.of(self.options)
         start = as_held(there or candidate.estimate, options)
-        problem = self._problem(options, start)
+        problem = self._problem(options, start, candidate.of.smoothness)
         for name in () if there is None else start.cameras:
             problem = problem.holding(name, 0)
         solution = solve(problem, start, precision=at_best, posed=at_best)
@@ -355,18 +356,17 @@ class InlierRows(Frozen):
         """Squares up to which a lens is the one that was compared: exact observations leave less than noise would."""
         return _KEPT * max(candidate.least, self.sights.equations)
 
-    def _problem(self, options: Options, estimate: Estimate) -> Problem:
+    def _problem(self, options: Options, estimate: Estimate, smoothness: Mapping[str, tuple[float, ...]]) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""
+        weighting, feet = replace(self.end.problem.weighting, loss="trivial"), self.end.residuals.feet
         problem = problem_of(self.sights, options, estimate)
-        return replace(
-            problem, weighting=replace(self.end.problem.weighting, loss="trivial"), feet=self.end.residuals.feet
-        )
+        return replace(problem, weighting=weighting, feet=feet, smoothness=smoothness)
 
     def _near_best(self, forms: tuple[Form, ...], problem: Problem, estimate: Estimate) -> Kind:
         whole = bool(_placed(self.sights).any())
         normals = group_normals(problem, estimate, self._groups, problem.private if whole else frozenset())
         reach_px = {name: self._profiles[name].reach_px for name in self.sights.cameras}
-        return Kind(forms, estimate, normals, self._sigma_px, reach_px)
+        return Kind(forms, estimate, normals, self._sigma_px, reach_px, problem.smoothness)
 
     @cached_property
     def _groups(self) -> Sights:

@@ -324,13 +324,15 @@ def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
         return solve_robustly(others, _start_of(others, some, first), task.scales)
 
-    end, explanations = compete(first.problem, first.end, solved) if task.knows else (first.end, ())
-    seen = replace(first, problem=replace(first.problem, sights=drawn), end=end, explanations=explanations)
+    # These solves begin with lenses that are about as smooth as the data say. What is held is judged without that.
+    smooth = replace(first.problem, smoothness=first.end.problem.smoothness)
+    end, explanations = compete(smooth, first.end, solved) if task.knows else (first.end, ())
+    seen = replace(first, problem=replace(smooth, sights=drawn), end=end, explanations=explanations)
     if task.before is None:
         seen = _of_targets(seen, solved, built)
     require_fits(seen.end, seen.problem)
     require_possible(seen.problem.sights, seen.end.estimate, seen.end.residuals)
-    return seen
+    return replace(seen, problem=replace(seen.problem, smoothness={}))
 
 
 def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:

@@ -156,7 +156,8 @@ def _is_held(every: Sequence[AsBuilt], problem: Problem) -> bool:
 def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) -> RobustSolution:
     """The end of the problem with targets held as they are built, judged where these are free."""
     settled = replace(end.solution, estimate=replace(end.estimate, structure=structure))
-    return replace(judge_at(problem, settled.estimate), solution=settled, rounds=end.rounds)
+    as_smooth = replace(problem, smoothness=end.problem.smoothness)
+    return replace(judge_at(as_smooth, settled.estimate), solution=settled, rounds=end.rounds)
 
 
 def _beside_views(
