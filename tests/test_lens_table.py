@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import scenes
+from data.built_in_scenes import scene_to_json
 from scenery import join
 
 from ceres_cal.base.arrays import Array
@@ -28,7 +29,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens, make_lens, register
 from ceres_cal.scene.lens.base import LinearEquations
 from ceres_cal.simulate import Disturbance, Simulation, simulate
-from ceres_cal.simulate.files import scene_from_json, scene_to_json
+from ceres_cal.simulate.files import scene_from_json
 
 
 def _inverse(ideal: Any, k: Any) -> Any:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from data.built_in_scenes import scene_to_json
 from rendering.album import take_album
 from rendering.photograph import frames, photograph
 from rendering.photography import Photography, photography_of, taken_as
@@ -26,7 +27,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate import Scene, Station, built_in_scene, scene_from_json, scene_to_json, simulate
+from ceres_cal.simulate import Scene, Station, built_in_scene, scene_from_json, simulate
 
 PLAIN = Photography(
     blur_px=0.0, vignetting=0.0, unevenness=0.0, carpet_texture=0.0, read_noise=0.0, shot_noise=0.0, carpet=0.2

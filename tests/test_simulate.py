@@ -11,7 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from data.built_in_scenes import content
+from data.built_in_scenes import content, scene_to_json
 from hypothesis import given
 from hypothesis import strategies as st
 from scenery import BoardRanges, board_placements, board_scene, field_scene, join, overhead_pose
@@ -37,7 +37,6 @@ from ceres_cal.simulate import (
     load_scene,
     scene_from_json,
     scene_names,
-    scene_to_json,
     simulate,
     truth_to_json,
     write_simulation,

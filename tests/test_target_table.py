@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from data.built_in_scenes import scene_to_json
 from scenery import board_scene, field_scene, join, overhead_pose
 from scenes import camera
 
@@ -21,7 +22,7 @@ from ceres_cal.report.pictures.frames import frame_by_name
 from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.symmetry import TURNED, turns_of
 from ceres_cal.scene.targets import TARGET_KINDS, Grid, Target, TargetKind, target_from_spec, targets_by_name
-from ceres_cal.simulate import Disturbance, Simulation, Station, scene_from_json, scene_to_json, simulate
+from ceres_cal.simulate import Disturbance, Simulation, Station, scene_from_json, simulate
 
 
 def court(size_m: float) -> Target:

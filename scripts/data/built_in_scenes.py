@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 from scenery import BoardRanges, board_scene, field_scene, join, overhead_pose, rings_scene
 
 from ceres_cal.base.files import write_json
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.problem.parameters import Station
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, camera_to_json
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate import Disturbance, Scene, scene_to_json
+from ceres_cal.simulate import Disturbance, Scene
+from ceres_cal.simulate.files import SCENE_FORMAT, SCENE_VERSION, UNITS
 
 FOLDER = Path(__file__).resolve().parents[2] / "src/ceres_cal/simulate/scenes"
 _WORKDAY = Disturbance(
@@ -142,6 +143,35 @@ SCENES: dict[str, Callable[[], tuple[Scene, Disturbance]]] = {
     "boards": _boards,
     "fisheye": _fisheye,
 }
+
+
+def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[str, Any]:
+    """A scene and its disturbance as a file has them; poses come back to rounding, everything else exactly."""
+    return {
+        "format": SCENE_FORMAT,
+        "version": SCENE_VERSION,
+        "units": UNITS,
+        "targets": {name: dict(target.spec) for name, target in scene.targets.items()},
+        "cameras": {name: camera_to_json(camera) for name, camera in scene.cameras.items()},
+        "stations": {
+            name: {
+                "camera": station.camera,
+                "position_m": station.cam_from_world.position.tolist(),
+                "rotation_vector": rotation_log(station.cam_from_world.rotation).tolist(),
+            }
+            for name, station in scene.stations.items()
+        },
+        "placements": {
+            name: {"translation_m": pose.translation.tolist(), "rotation_vector": rotation_log(pose.rotation).tolist()}
+            for name, pose in scene.placements.items()
+        },
+        "views": [
+            {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
+            for plan in scene.views
+        ],
+        "disturbance": asdict(disturbance or Disturbance()),
+        **({"photography": dict(scene.photography)} if scene.photography else {}),
+    }
 
 
 def content(name: str) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from data.built_in_scenes import scene_to_json
 from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
@@ -33,7 +34,6 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import TARGET_KINDS, target_from_spec, targets_from_specs
 from ceres_cal.simulate import built_in_scene, load_scene, simulate
-from ceres_cal.simulate.files import scene_to_json
 from faults.fuzz_mutations import NUMBERS, OTHERS, TEXTS, Rng, mutated, one_of, tree_changed, word_changed
 
 DATA = Path(__file__).resolve().parents[2] / "data"

@@ -5,7 +5,6 @@ from ceres_cal.simulate.built_in import built_in_scene as built_in_scene
 from ceres_cal.simulate.built_in import scene_names as scene_names
 from ceres_cal.simulate.files import load_scene as load_scene
 from ceres_cal.simulate.files import scene_from_json as scene_from_json
-from ceres_cal.simulate.files import scene_to_json as scene_to_json
 from ceres_cal.simulate.files import truth_to_json as truth_to_json
 from ceres_cal.simulate.files import write_simulation as write_simulation
 from ceres_cal.simulate.scene import Disturbance as Disturbance

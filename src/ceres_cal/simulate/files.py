@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, InputError, body_of, convert, make_folder, naming, read_json, write_json
-from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
+from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler
 from ceres_cal.problem.parameters import Station
 from ceres_cal.scene import Camera, CameraFile, Vector, camera_to_json, targets_from_specs
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -63,7 +63,7 @@ def load_scene(path: str | Path) -> tuple[Scene, Disturbance]:
 
 
 def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturbance]:
-    """The scene and the disturbance that a file describes: the inverse of `scene_to_json`.
+    """The scene and the disturbance that a file describes.
 
     A station has its camera's `position_m`, a placement the `translation_m` of world_from_target; both have one of
     `euler_rad` (the paper's angles) and `rotation_vector`, of cam_from_world and world_from_target. A view without
@@ -122,35 +122,6 @@ def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------
-
-
-def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[str, Any]:
-    """A scene and its disturbance as a file has them; poses come back to rounding, everything else exactly."""
-    return {
-        "format": SCENE_FORMAT,
-        "version": SCENE_VERSION,
-        "units": UNITS,
-        "targets": {name: dict(target.spec) for name, target in scene.targets.items()},
-        "cameras": {name: camera_to_json(camera) for name, camera in scene.cameras.items()},
-        "stations": {
-            name: {
-                "camera": station.camera,
-                "position_m": station.cam_from_world.position.tolist(),
-                "rotation_vector": rotation_log(station.cam_from_world.rotation).tolist(),
-            }
-            for name, station in scene.stations.items()
-        },
-        "placements": {
-            name: {"translation_m": pose.translation.tolist(), "rotation_vector": rotation_log(pose.rotation).tolist()}
-            for name, pose in scene.placements.items()
-        },
-        "views": [
-            {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
-            for plan in scene.views
-        ],
-        "disturbance": asdict(disturbance or Disturbance()),
-        **({"photography": dict(scene.photography)} if scene.photography else {}),
-    }
 
 
 def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
