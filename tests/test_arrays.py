@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ceres_cal.base.arrays import distinct, median, medians
+from ceres_cal.base.arrays import distinct, inverse_of, inverse_root_of, median, medians
 
 SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json"
 
@@ -29,6 +29,16 @@ def test_distinct_is_numpys_unique() -> None:
     values = np.random.default_rng(1).integers(0, 3, (20, 2))
     np.testing.assert_array_equal(distinct(values), np.unique(values))
     np.testing.assert_array_equal(distinct(values, axis=0), np.unique(values, axis=0))
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (48,), (49,), (130,), (2, 211)])
+def test_inverses_by_halves_are_numpys(shape: tuple[int, ...]) -> None:
+    root = np.random.default_rng(0).standard_normal((*shape, shape[-1]))
+    matrix = root @ np.swapaxes(root, -1, -2) + shape[-1] * np.eye(shape[-1])
+    inverse, half = np.linalg.inv(matrix), inverse_root_of(matrix)
+    for one in (inverse_of(matrix), np.swapaxes(half, -1, -2) @ half):
+        assert np.allclose(one, inverse, rtol=1e-10, atol=1e-13)
+    assert np.array_equal(half, np.tril(half))
 
 
 def test_they_import_no_masked_arrays() -> None:

@@ -13,9 +13,13 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects.evidence import RepeatedAmounts
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, gather_sights
+from ceres_cal.problem import problem_of
+from ceres_cal.problem.parameters import Options
+from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.robust.unsteady import MOVES, ROLLING
 from ceres_cal.scene.targets import checkerboard
+from ceres_cal.start.initialise import initialise
 
 VIEWS, MOVED_PX = 14, 12.0
 FLAT = Board(views=VIEWS)
@@ -94,6 +98,17 @@ def test_a_saved_calibration_is_diagnosed_beside_them(
     assert not [one for one in diagnosis.findings if one.is_model_error]
     (noise,) = diagnosis.noise
     assert noise.sigma_px == pytest.approx(0.3, rel=0.1)  # the simulation's: 0.292 measured
+
+
+def test_what_is_taken_off_counts_from_the_first_round_on() -> None:
+    """Else the leverages found the noise larger than the count did, and asked for another round each time."""
+    sights, options = gather_sights(shifted(0, 0.0)), Options(lens="radial")
+    start = initialise(sights, options).estimate
+    plain = problem_of(sights, options, start)
+    alone, beside = (solve_robustly(one, start, is_near=True) for one in (plain, replace(plain, taken_up=200.0)))
+    assert beside.rounds == alone.rounds
+    spare = plain.equations - plain.unknowns(start)
+    assert (alone.inliers.point_scale / beside.inliers.point_scale) ** 2 == pytest.approx(1.0 - 200.0 / spare, rel=0.02)
 
 
 def test_a_rolling_shutter_is_found_and_named() -> None:

@@ -169,13 +169,37 @@ def are_known(information: Array, limits: Array) -> bool:
 
 def _regular_inverses(scaled: Array) -> Array | None:
     """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
-    inverse = _unless_singular(np.linalg.inv, scaled)
+    inverse = _unless_singular(inverse_of, scaled)
     if inverse is None:
         return None
     sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
     most = 1e8  # the inverse of an eigenvalue near to being unknown; plain inverses are good to 1e-7 there
     regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < most)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
+
+
+_AT_ONCE = 48  # rows of a matrix up to which LAPACK's own inverse takes less time than one by halves
+
+
+def inverse_of(matrix: Array) -> Array:
+    """The inverse (..., n, n) of symmetric matrices whose eigenvalues are positive."""
+    if matrix.shape[-1] <= _AT_ONCE:
+        return np.asarray(np.linalg.inv(matrix))
+    root = inverse_root_of(matrix)
+    return np.asarray(np.swapaxes(root, -1, -2) @ root)
+
+
+def inverse_root_of(matrix: Array) -> Array:
+    """Lower triangles W (..., n, n); W^T W are these inverses. Takes two fifths of the time of LAPACK's inverse."""
+    if matrix.shape[-1] <= _AT_ONCE:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(matrix)))
+    root, half = np.zeros_like(matrix), matrix.shape[-1] // 2
+    first, last = slice(half), slice(half, None)
+    root[..., first, first] = upper = inverse_root_of(matrix[..., first, first])
+    along = matrix[..., last, first] @ np.swapaxes(upper, -1, -2)
+    root[..., last, last] = lower = inverse_root_of(matrix[..., last, last] - along @ np.swapaxes(along, -1, -2))
+    root[..., last, first] = -lower @ (along @ upper)
+    return root
 
 
 def root_of(matrix: Array) -> Array:

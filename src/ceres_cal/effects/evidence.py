@@ -28,7 +28,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, median, replace
+from ceres_cal.base import Array, Frozen, Indices, inverse_of, inverse_root_of, median, replace
 from ceres_cal.effects.columns import SparseColumns
 from ceres_cal.effects.linearised import Linearised
 
@@ -268,10 +268,11 @@ class RepeatedAmounts(Frozen):
         part = model.equations.sight if part is None else part
         parts = int(part.max()) + 1
         information, score, in_shared = columns.left_of(model)
-        ridge = _DETERMINED * float(np.max(np.diagonal(information))) * np.eye(columns.size)
-        inverse = np.linalg.inv(information + ridge)
-        left = np.where(model.used, model.left_over - model.left_of_column(columns.at(inverse @ score)), 0.0)
-        spare = model.spare - float(np.sum(inverse * information))
+        ridge = _DETERMINED * float(np.max(np.diagonal(information)))
+        root = inverse_root_of(information + ridge * np.eye(columns.size))
+        best = columns.at(root.T @ (root @ score))
+        left = np.where(model.used, model.left_over - model.left_of_column(best), 0.0)
+        spare = model.spare - columns.size + ridge * float(np.sum(root**2))
         least = spare * (LEAST_PX * median(model.weight)) ** 2
         return cls(
             score,
@@ -314,7 +315,7 @@ class RepeatedAmounts(Frozen):
         """(K,) likeliest of some numbers that scatter by sigmas (K,), and their covariance (K, K)."""
         normal = self.information[np.ix_(numbers, numbers)] / self.noise
         inner = np.eye(len(numbers)) + sigmas[:, None] * normal * sigmas
-        covariance = sigmas[:, None] * np.linalg.inv(inner) * sigmas
+        covariance = sigmas[:, None] * inverse_of(inner) * sigmas
         return np.asarray(-covariance @ self.score[numbers] / self.noise), np.asarray(covariance)
 
     def scatter(

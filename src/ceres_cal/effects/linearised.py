@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, replace
+from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, inverse_root_of, replace
 from ceres_cal.observations.sights import STRUCTURE, ranges
 from ceres_cal.problem import Information, Key, Problem, Weighting, columns_by_owner, robust_weights
 from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
@@ -174,7 +174,7 @@ class Linearised(Frozen):
         """The same where these equations and a prior (P, P) in the directions of `shared` are all that is known: in
         directions in which they know everything to one, from where the equations' least squares are.
         """
-        back = np.linalg.inv(np.linalg.cholesky(self.shared.T @ self.shared + prior)).T
+        back = inverse_root_of(self.shared.T @ self.shared + prior).T
         shared = self.shared @ back
         return replace(self, shared=shared, root=self.root @ back, step=shared.T @ self.placed_score)
 

@@ -214,6 +214,7 @@ class EliminatedCost(_SightsCost):
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         sizes = {("camera", self.camera): len(free), STRUCTURE: count}
         self._take({owner: size for owner, size in sizes.items() if size}, self._size + 1)
+        self._blocks = [slice(first, last) for first, last in ((0, len(free)), (len(free), self._size)) if last > first]
 
     def evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         along = self._accepted.jacobian @ (at - self._accepted.at)
@@ -222,8 +223,7 @@ class EliminatedCost(_SightsCost):
         if last is None:
             return None
         self._last = last
-        sizes = np.cumsum(self.parameter_block_sizes()[:-1])
-        return CostValue(at, last.residuals, [part.reshape(-1) for part in np.split(last.jacobian, sizes, axis=1)])
+        return CostValue(at, last.residuals, [last.jacobian[:, own].reshape(-1) for own in self._blocks])
 
     def _accept(self) -> None:
         self._accepted = self._last

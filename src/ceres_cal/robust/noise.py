@@ -50,7 +50,7 @@ Redundancy = tuple[float, float]
 """The share of the equations of points and of curves that is left over for the noise: 1 less the mean leverage."""
 
 
-def by_count(equations: int, unknowns: int) -> Redundancy:
+def by_count(equations: int, unknowns: float) -> Redundancy:
     """As if every equation determined as much as any other."""
     return (1.0 - unknowns / max(equations, 1),) * 2
 

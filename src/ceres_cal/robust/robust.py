@@ -328,10 +328,10 @@ class _RowRounds(Rounds[RobustSolution]):
         return self._with(anew, solution, there, rounds)
 
     def _judge(self, solution: Solution, there: Residuals) -> Inliers:
-        redundancy = self._redundancy or by_count(
-            self._problem.sights.equations, self._problem.unknowns(solution.estimate)
-        )
-        return judge(self._problem.observations, there, redundancy, self._problem.options, self._usual)
+        problem = self._problem
+        unknowns = problem.unknowns(solution.estimate) + problem.taken_up
+        redundancy = self._redundancy or by_count(problem.sights.equations, unknowns)
+        return judge(problem.observations, there, redundancy, problem.options, self._usual)
 
     def _with(self, inliers: Inliers, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
         """The state with the problem that the inliers make; rows are not moved where the last ones were the same."""

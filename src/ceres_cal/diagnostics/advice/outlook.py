@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, evenly, thin_root
+from ceres_cal.base import Array, Frozen, Indices, Spread, cached_property, evenly, inverse_root_of, thin_root
 from ceres_cal.posterior import FieldMap, Mixture, Posterior, locate_slopes, station_keys, visible_pixels
 from ceres_cal.problem import Estimate, Information, Key, moved
 
@@ -84,7 +84,7 @@ class Outlook(Frozen):
             told = np.flatnonzero(np.diagonal(added.matrix))  # of many nodes of a surface a measurement sees a few
             root = thin_root(added.matrix[np.ix_(told, told)], sd[told])
             covariance = spread.covariance[np.ix_(told, told)]
-            half = np.linalg.inv(np.linalg.cholesky(np.eye(len(root)) + root @ covariance @ root.T))
+            half = inverse_root_of(np.eye(len(root)) + root @ covariance @ root.T)
             taken = np.sum(((half @ root) @ along[told]) ** 2, axis=0)
             return _errors_of(variances - np.sum(taken.reshape(len(variances), -1), axis=1))
 
