@@ -211,9 +211,9 @@ class SharedObservations(Frozen):
         """What Ceres sees of them."""
         return SharedCost(run, self, problem, estimate)
 
-    def normals(self, problem: Problem, estimate: Estimate) -> Mapping[SightKey, Mapping[int, Array]]:
+    def normals(self, problem: Problem, estimate: Estimate) -> Mapping[tuple[SightKey, int], Array]:
         """Their normal equations by sight and kind."""
-        return self.engine.ask(Share.normals, self.asked(problem, estimate)).of
+        return self.engine.ask(Share.normals, self.asked(problem, estimate)).of or {}
 
 
 class SharedCost(CachedCost):

@@ -54,7 +54,7 @@ class Elsewhere(Protocol):
     def cost(self, run: Any, problem: Problem, estimate: Estimate) -> Any:
         """What Ceres sees of them: its `owners` say by kind and name which numbers it depends on."""
 
-    def normals(self, problem: Problem, estimate: Estimate) -> Mapping[SightKey, Mapping[int, Array]]:
+    def normals(self, problem: Problem, estimate: Estimate) -> Mapping[tuple[SightKey, int], Array]:
         """Their normal equations by sight and kind, see `problem.reduced`."""
 
 

@@ -163,8 +163,8 @@ class _InformationSums:
             for pose, normals in self._normals(sight):
                 self._add(sight.key, pose[0], {kind: normal[0] for kind, normal in normals.items()})
         if self._problem.elsewhere is not None:
-            for key, kinds in self._problem.elsewhere.normals(self._problem, self._estimate).items():
-                self._add(key, self._estimate.pose_stack([key])[0], kinds)
+            for (key, kind), normal in self._problem.elsewhere.normals(self._problem, self._estimate).items():
+                self._add(key, self._estimate.pose_stack([key])[0], {kind: normal})
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors, pull = self._problem.priors_at(self._estimate), np.zeros(len(self._keys))
         known = Information.nothing(self._keys).beside_all(prior.information for prior in priors)

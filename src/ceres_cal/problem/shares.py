@@ -7,15 +7,16 @@ a histogram of residuals. It keeps nothing that an answer depends on but its row
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import add
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.base import AnyArray, Array, Frozen, Indices, Indices32, Mask
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Indices32, Mask, replace
 from ceres_cal.observations import Curves, FileRows, Observations, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Owner, SightKey, Sights, column_of, shown_rows, sights_of
@@ -92,32 +93,17 @@ class Looked(Frozen):
         return Looked(self.points + other.points, self.curves + other.curves, *map(np.concatenate, each))
 
 
-class CompressedBlocks(Frozen):
-    """Compressed blocks (K + 1, K + 1) by sight, the residual last; None where an observation cannot be projected."""
+class ByKey(Frozen):
+    """Matrices by key, and how two of one key become one; None where an observation cannot be projected."""
 
-    of: Mapping[SightKey, Array] | None
+    of: Mapping[Any, Array] | None
+    together: Callable[[Array, Array], Array]
 
-    def __add__(self, other: CompressedBlocks) -> CompressedBlocks:
+    def __add__(self, other: ByKey) -> ByKey:
         if self.of is None or other.of is None:
-            return CompressedBlocks(None)
-        both = {**self.of, **other.of}
-        for key in self.of.keys() & other.of.keys():
-            both[key] = compressed(np.vstack([self.of[key], other.of[key]]))
-        return CompressedBlocks(both)
-
-
-class SightNormals(Frozen):
-    """Normal equations by sight and by kind, see `problem.reduced`."""
-
-    of: Mapping[SightKey, Mapping[int, Array]]
-
-    def __add__(self, other: SightNormals) -> SightNormals:
-        both = {key: dict(kinds) for key, kinds in self.of.items()}
-        for key, kinds in other.of.items():
-            own = both.setdefault(key, {})
-            for kind, matrix in kinds.items():
-                own[kind] = own[kind] + matrix if kind in own else matrix
-        return SightNormals(both)
+            return replace(self, of=None)
+        shared = {key: self.together(self.of[key], other.of[key]) for key in self.of.keys() & other.of.keys()}
+        return replace(self, of={**self.of, **other.of, **shared})
 
 
 class Used(Frozen):
@@ -140,8 +126,9 @@ class Used(Frozen):
         return Used(self.sums + other.sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
 
 
-def compressed(rows: Array) -> Array:
-    """(K + 1, K + 1) upper triangle with the same products as rows (N, K + 1)."""
+def compressed(*blocks: Array) -> Array:
+    """(K + 1, K + 1) upper triangle with the same products as the rows (N, K + 1) of blocks."""
+    rows = np.vstack(blocks)
     size = rows.shape[1]
     triangle = np.linalg.qr(np.vstack([rows, np.zeros((max(size - len(rows), 0), size))]), mode="r")
     return np.asarray(triangle)
@@ -300,22 +287,21 @@ class Share:
             np.bincount(view[there & ~inside], minlength=size),
         )
 
-    def blocks(self, asked: ShareRequest, numbers: Mapping[Owner, Array]) -> CompressedBlocks:
-        """Compressed blocks at some numbers."""
+    def blocks(self, asked: ShareRequest, numbers: Mapping[Owner, Array]) -> ByKey:
+        """Compressed blocks (K + 1, K + 1) by sight at some numbers, the residual last."""
         answers: dict[SightKey, Array] = {}
         for sight, problem in self._problems(asked):
             cost = SightCost(Run(), sight, problem, asked.estimate)
             rows = cost.block([numbers[owner] for owner in cost.owners])
             if rows is None:
-                return CompressedBlocks(None)
+                return ByKey(None, compressed)
             answers[sight.key] = compressed(rows)
-        return CompressedBlocks(answers)
+        return ByKey(answers, compressed)
 
-    def normals(self, asked: ShareRequest) -> SightNormals:
-        """Normal equations of the rows that take part, at the estimate."""
-        return SightNormals(
-            {sight.key: normals_of(sight, problem, asked.estimate) for sight, problem in self._problems(asked)}
-        )
+    def normals(self, asked: ShareRequest) -> ByKey:
+        """Normal equations by sight and kind of the rows that take part, at the estimate, see `problem.reduced`."""
+        every = ((sight, normals_of(sight, problem, asked.estimate)) for sight, problem in self._problems(asked))
+        return ByKey({(sight.key, kind): own for sight, kinds in every for kind, own in kinds.items()}, add)
 
     def used(self, asked: ShareRequest) -> Used:
         """Which rows take part, and how far off the others are."""
