@@ -208,6 +208,27 @@ def test_on_the_command_line(capsys: pytest.CaptureFixture[str], names: dict[str
     assert code == 2 and out == "" and err.count("\n") == 1 and said in err, err
 
 
+READS_A_FILE = (
+    "advise NO, audit NO --observations OBS, audit CAL --observations NO, batch NO -o OUT, calibrate NO -o OUT.json, "
+    "check NO OBS, check CAL NO, compare NO CAL, compare CAL NO, detect board NO --target 9x6x25mm -o OUT.json, "
+    "detect field NO --target ssl-b --auto -o OUT.json, detect rings NO --radii 1:2:1 -o OUT.json, diagnose NO OBS, "
+    "diagnose CAL NO, export NO --to opencv -o OUT.yml, export-table NO -o OUT.npz, import NO -o OUT.json, "
+    "join NO OBS -o OUT.json, locate NO 1_2, locate CAL --file NO, open NO, project CAL --file NO, publish NO --once, "
+    "refit NO OBS -o OUT.json, refit CAL NO -o OUT.json, run NO --target ssl-b -o OUT, score NO OBS, score CAL NO, "
+    "simulate NO -o OUT, targets NO, targets import NO -o OUT.json, targets print NO -o OUT.pdf, "
+    "undistort NO PHOTO -o OUT, undistort CAL NO -o OUT"
+)
+
+
+@pytest.mark.parametrize("typed", READS_A_FILE.split(", "))
+@pytest.mark.parametrize("missing", ["nowhere.json", "nowhere.xyz"])
+def test_a_file_that_is_missing_is_named(
+    capsys: pytest.CaptureFixture[str], names: dict[str, str], typed: str, missing: str
+) -> None:
+    assert main([{**names, "NO": missing, "1_2": "1,2"}.get(word, word) for word in typed.split()]) == 2
+    assert f"{missing}: no such file" in capsys.readouterr().err
+
+
 def test_options_elsewhere_are_those_of_other_commands() -> None:
     parsers = {name: Parser(add_help=False) for name in COMMANDS}
     for name, parser in parsers.items():
