@@ -160,7 +160,7 @@ def test_what_is_typed() -> None:
         ("penalty", "may be penalty_area_depth_m or penalty_area_width_m"),
         ("height", "'height' is no dimension: there are field_length_m"),
         ("length,length", "given twice"),
-        ("length=long", "is not a number"),
+        ("length=long", "is not a finite number"),
         ("length=9:0", "sigma above 0"),
         ("length=-9", "at least 0.45 m"),
     ):

@@ -111,7 +111,7 @@ ON_THE_COMMAND_LINE = [
     ("calibrate OBS --max-iterations 0", "argument --max-iterations: '0' is no whole number from 1 on"),
     ("publish CAL --port 0", "argument --port: '0' is no whole number from 1 to 65535"),
     ("detect board PHOTO -o OUT.json --board 9x6x25mm", "--board 9x6x25mm: here it is --target"),
-    ("detect board PHOTO -o OUT.json --columns 1.5", "argument --columns: '1.5' is not a whole number"),
+    ("detect board PHOTO -o OUT.json --columns 1.5", "argument --columns: '1.5' is no whole number"),
     ("run PHOTOS --columns 9 -o OUT", "--columns 9: here it is --board"),
     ("export CAL --format opencv --to opencv -o OUT", "--format opencv: here it is --to"),
     ("batch nowhere.json -o OUT", "nowhere.json: no such file"),

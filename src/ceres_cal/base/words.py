@@ -17,6 +17,17 @@ IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0, "inch": 1.0 / 0.0254, "ft": 1
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+def finite(given: object, otherwise: Exception, largest: float = math.inf) -> float:
+    """A number that somebody typed, or a file has; raises `otherwise` for anything else, or one that is too large."""
+    try:
+        value = float(given)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        raise otherwise from None
+    if not abs(value) < largest:
+        raise otherwise
+    return value
+
+
 # ---- numbers --------------------------------------------------------------------------------------------------------
 
 

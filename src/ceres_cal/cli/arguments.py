@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from ceres_cal import observations, scene
-from ceres_cal.base import IN_A_METRE, InputError, did_you_mean, printable
-from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option
+from ceres_cal.base import IN_A_METRE, InputError, did_you_mean, finite, printable
+from ceres_cal.cli.command import REQUIRED, QuietArguments, argument, option, whole
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Prior
@@ -110,13 +110,7 @@ class ReportArguments(QuietArguments):
 
 def parse_number(text: str, where: str) -> float:
     """A finite number; InputError naming `where`."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputError(f"{where}: {text.strip()!r} is not a number: write it as -0.15 is") from None
-    if not abs(value) < float("inf"):
-        raise InputError(f"{where}: {text.strip()!r} is not a finite number")
-    return value
+    return finite(text, InputError(f"{where}: {text.strip()!r} is not a finite number: write it as -0.15 is"))
 
 
 def parse_numbers(text: str, where: str) -> tuple[float, ...]:
@@ -145,17 +139,6 @@ def length(unit: str) -> Callable[[str], float]:
             return parse_length(text, "a length", unit)
         except InputError:
             raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
-
-    return parse
-
-
-def whole(least: int, most: float = float("inf")) -> Callable[[str], int]:
-    """The type of an argument that is a whole number in a range."""
-
-    def parse(text: str) -> int:
-        if not re.fullmatch(r"-?\d+", text) or not least <= int(text) <= most:
-            raise ArgumentTypeError(f"{text!r} is no whole number from {least} {'on' if most > 1e9 else f'to {most}'}")
-        return int(text)
 
     return parse
 

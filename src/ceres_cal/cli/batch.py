@@ -12,8 +12,8 @@ from typing import Any
 
 from ceres_cal import base, cli, report
 from ceres_cal.base import DASH, InputError, counted, mm, plural, printable
-from ceres_cal.cli.arguments import output_option, whole
-from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch
+from ceres_cal.cli.arguments import output_option
+from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option, switch, whole
 from ceres_cal.report.document import Card, Chapter, Document, Piece, Section, Table, Text, Tile
 
 _COMMANDS = ("calibrate", "check", "refit")

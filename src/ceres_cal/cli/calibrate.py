@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from ceres_cal import diagnostics, scene
 from ceres_cal.base import InputError, replace
 from ceres_cal.cli import arguments, files
-from ceres_cal.cli.command import argument, command, option, switch
+from ceres_cal.cli.command import argument, command, option, switch, whole
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document
 
@@ -120,12 +120,12 @@ class CalibrateArguments(arguments.ReportArguments):
     closed_form_only: bool = switch(
         "stop at the closed forms of R. Rojas's paper: a baseline to compare with, not a calibration", group=_SOLVE
     )
-    max_iterations: int = option("most iterations of each solve", "N", 100, read=arguments.whole(1), group=_SOLVE)
+    max_iterations: int = option("most iterations of each solve", "N", 100, read=whole(1), group=_SOLVE)
     threads: int = option(
         "most threads; default: 0, where the solver chooses",
         "N",
         0,
-        read=arguments.whole(0),
+        read=whole(0),
         group=_SOLVE,
         elsewhere=("jobs",),
     )

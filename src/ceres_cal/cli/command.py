@@ -14,12 +14,11 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
-from functools import partial
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
-from ceres_cal.base import Frozen, InputError, LazyTable, cached_property, did_you_mean, field, sentence
+from ceres_cal.base import Frozen, InputError, LazyTable, cached_property, did_you_mean, field, finite, sentence
 from ceres_cal.report.document import Document
 
 _T = TypeVar("_T")
@@ -191,22 +190,27 @@ def _file(text: str) -> str:
     return text
 
 
-def _finite(kind: type[int] | type[float], text: str) -> float:
-    """The type of an argument that is a number of a kind."""
-    otherwise = argparse.ArgumentTypeError(f"{text!r} is not a {'whole' if kind is int else 'finite'} number")
-    try:
-        value = kind(text)
-    except ValueError:
-        raise otherwise from None
-    if not abs(value) < float("inf"):
-        raise otherwise
-    return value
+def _number(text: str) -> float:
+    """The type of an argument that is a number."""
+    return finite(text, argparse.ArgumentTypeError(f"{text!r} is not a finite number"))
+
+
+def whole(least: float = -float("inf"), most: float = float("inf")) -> Callable[[str], int]:
+    """The type of an argument that is a whole number, in a range where that is given."""
+    range_words = f" from {least} {'on' if most > 1e9 else f'to {most}'}" if abs(least) < 1e9 else ""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch(r"-?\d+", text) or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number{range_words}")
+        return int(text)
+
+    return parse
 
 
 _READ: dict[Any, Callable[[str], Any]] = {
     Path: lambda text: Path(_file(text)),
-    int: partial(_finite, int),
-    float: partial(_finite, float),
+    int: whole(),
+    float: _number,
 }
 
 

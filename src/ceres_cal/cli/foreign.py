@@ -10,8 +10,8 @@ from typing import Any
 
 from ceres_cal import formats, scene
 from ceres_cal.base import InputError, replace
-from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length, whole
-from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch
+from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
+from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch, whole
 from ceres_cal.cli.files import read_calibration, require_output, save
 from ceres_cal.report.document import Document, Section
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from ceres_cal import base, detect, formats, moves, report
 from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace, short
 from ceres_cal.cli import arguments, files
-from ceres_cal.cli.command import REQUIRED, argument, command, option, switch
+from ceres_cal.cli.command import REQUIRED, argument, command, option, switch, whole
 from ceres_cal.cli.foreign import from_option, import_options, typed_options
 from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import ProgressBar
@@ -48,7 +48,7 @@ def _check(
         "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
         "N",
         1,
-        read=arguments.whole(1),
+        read=whole(1),
     ),
 ) -> Document:
     images, detections = photographs_in(args), None

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ceres_cal import cli, detect
 from ceres_cal.base import InputError, image_files, plural
-from ceres_cal.cli.arguments import board_option, output_option, prior_option, whole
-from ceres_cal.cli.command import argument, command, option, switch
+from ceres_cal.cli.arguments import board_option, output_option, prior_option
+from ceres_cal.cli.command import argument, command, option, switch, whole
 from ceres_cal.cli.files import json_object, require_folder, require_shown
 from ceres_cal.report.document import Document, Section
 

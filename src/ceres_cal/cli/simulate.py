@@ -7,8 +7,8 @@ from typing import Any
 
 from ceres_cal import simulate
 from ceres_cal.base import InputError, plural
-from ceres_cal.cli.arguments import output_option, whole
-from ceres_cal.cli.command import argument, command, option, switch
+from ceres_cal.cli.arguments import output_option
+from ceres_cal.cli.command import argument, command, option, switch, whole
 from ceres_cal.cli.files import finishing, require_folder
 from ceres_cal.report.document import Document, Section
 

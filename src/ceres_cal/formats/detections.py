@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base import InputError, read_foreign_npz, replace, require_room
+from ceres_cal.base import InputError, finite, read_foreign_npz, replace, require_room
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
@@ -177,13 +177,7 @@ def _place_name(place: tuple[float, float, float]) -> str:
 
 
 def _number(row: Mapping[str, Any], name: str, number: int) -> float:
-    try:
-        value = float(row[name])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"line {number}: {name} is no number, but {row.get(name)!r}") from None
-    if not np.isfinite(value):
-        raise InputError(f"line {number}: {name} is not finite")
-    return value
+    return finite(row.get(name), InputError(f"line {number}: {name} is no finite number, but {row.get(name)!r}"))
 
 
 def _index(numbers: Mapping[str, int], name: str, number: int) -> int:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base import HEIGHTS_M, Array, InputError, Pose, quaternion, rotation_exp, rotation_of, short
+from ceres_cal.base import HEIGHTS_M, Array, InputError, Pose, finite, quaternion, rotation_exp, rotation_of, short
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.formats.format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels, nearest_foreign
@@ -157,15 +157,12 @@ def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
         InputError: a number that is missing, or that makes no camera.
     """
     here = f"camera {entry.get('camera_id', '?')}"
-    values = []
-    for name in NAMES:
-        try:
-            values.append(float(entry[name]))
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{here}: {name} is no number, but {entry.get(name)!r}") from None
-    f, cx, cy, d, *rest = values
+    f, cx, cy, d, *rest = (
+        finite(entry.get(name), InputError(f"{here}: {name} is no number, but {entry.get(name)!r}"), LARGEST)
+        for name in NAMES
+    )
     turn, shift = np.array(rest[:4]), np.array(rest[4:])
-    norm = float(np.linalg.norm(turn)) if np.all(np.abs(values) < LARGEST) else np.nan
+    norm = float(np.linalg.norm(turn))
     if not (f > 1.0 / LARGEST and abs(norm - 1.0) < 0.05):
         raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, makes no camera")
     sizes = [entry.get("pixel_image_width"), entry.get("pixel_image_height")]

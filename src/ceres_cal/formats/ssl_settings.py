@@ -13,7 +13,7 @@ from xml.sax.saxutils import escape
 
 from msgspec import Struct
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base import InputError, finite
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.opencv import ImageSize
@@ -117,14 +117,8 @@ def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
 
 
 def _number(one: _Var) -> float:
-    refused = InputError(f"{one.path[-1]!r} is no number, but {one.text!r}")
-    try:
-        number = float(one.text.replace(",", "."))  # some locales' printf
-    except ValueError:
-        raise refused from None
-    if not abs(number) < LARGEST:
-        raise refused
-    return number
+    number = one.text.replace(",", ".")  # some locales' printf
+    return finite(number, InputError(f"{one.path[-1]!r} is no number, but {one.text!r}"), LARGEST)
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------

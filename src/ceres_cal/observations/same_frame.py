@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
-from ceres_cal.base import InputError, replace
+from ceres_cal.base import InputError, finite, replace
 from ceres_cal.observations.columns import View
 from ceres_cal.observations.observations import Observations
 
@@ -98,7 +98,4 @@ def _within(frames: _Frames, rule: str) -> _Moments:
 
 
 def _number(text: str, where: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"same frames within a time: {text!r} is no number ({where})") from None
+    return finite(text, InputError(f"same frames within a time: {text!r} is no number ({where})"))
