@@ -369,8 +369,7 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
     end, before = seen.end, seen.task.before
     known = end.problem if before is None else replace(end.problem, layout=before)
     estimate = end.estimate
-    reduced = end.reduced if before is None else None
-    reduced = reduced or information(known, estimate)
+    reduced = end.told if before is None else information(known, estimate)
 
     def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
         at_end = there is estimate

@@ -120,9 +120,10 @@ def solve_as_built(
             end = solved(before)
     every, structure = before.every, freed(before)
     as_built = replace(problem, priors=gather_priors(observations, options, structure))
+    held, asked, measured = end, taking_part(as_built, explanations), None
     if views is not None:
-        there = _as_measured(taking_part(as_built, explanations), end, structure)
-        every = tuple(_beside_views(every, there, stated, views))
+        measured = _as_measured(asked, end, structure)
+        every = tuple(_beside_views(every, measured, stated, views))
         if unlikely := frozenset((one.target, one.kind) for one in every if one.probability < LIKELY):
             return solve_as_built(problem, first, explanations, solver, built, views, left_out | unlikely)
     if _change(before, built) > 1.0:
@@ -130,7 +131,9 @@ def solve_as_built(
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     part, problem = taking_part(as_built, explanations), as_built
     if _is_held(every, problem):
-        end = _as_measured(part, end, structure)
+        if measured is None or end is not held or part is not asked:
+            measured = _as_measured(part, end, structure)
+        end = measured
     else:
         end = solve_robustly(part, replace(end.estimate, structure=structure), is_near=True)
     end, structure = end.moved_to(end.estimate, problem), end.estimate.structure

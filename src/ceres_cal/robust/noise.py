@@ -396,9 +396,9 @@ def _leverages(
         chain = from_placement(equations.poses, world)[equations.sight[rows]]
         private[rows] = np.einsum("ei,eij->ej", equations.pose[rows], chain) * weight[rows, None]
         own[rows] = np.einsum("ei,eij->ej", private[rows], part.inverses[placed[rows]])
-        for column, key in enumerate(part.keys):
-            if not key.is_structure:
-                shared[rows, keys.index(key)] -= np.sum(private[rows] * part.gains[placed[rows], :, column], axis=1)
+        told = [column for column, key in enumerate(part.keys) if not key.is_structure]
+        followed = [keys.index(part.keys[column]) for column in told]
+        shared[rows[:, None], followed] -= np.einsum("ei,eij->ej", private[rows], part.gains[:, :, told][placed[rows]])
     along, (first, second) = shared @ covariance, pairs_of(equations)
     return (
         np.sum(along * shared, axis=1) + np.sum(own * private, axis=1),

@@ -11,7 +11,7 @@ from typing import Generic, Self, TypeVar
 
 import numpy as np
 
-from ceres_cal.base import DegenerateError, Frozen, Indices, numerical, replace
+from ceres_cal.base import DegenerateError, Frozen, Indices, cached_property, numerical, replace
 from ceres_cal.effects.linearised import Weights, equation_weights
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem import Estimate, Problem, Solution, SolveProgress, Weighting, solve, with_placements_at_best
@@ -58,7 +58,7 @@ class RobustSolution(Frozen):
         """Where it is."""
         return self.solution.estimate
 
-    @property
+    @cached_property
     def told(self) -> ReducedInformation:
         """What observations and priors say there."""
         return self.reduced or information(self.problem, self.estimate)
@@ -329,8 +329,9 @@ class _RowRounds(Rounds[RobustSolution]):
 
     def _judge(self, solution: Solution, there: Residuals) -> Inliers:
         problem = self._problem
-        unknowns = problem.unknowns(solution.estimate) + problem.taken_up
-        redundancy = self._redundancy or by_count(problem.sights.equations, unknowns)
+        redundancy = self._redundancy or by_count(
+            problem.sights.equations, problem.unknowns(solution.estimate) + problem.taken_up
+        )
         return judge(problem.observations, there, redundancy, problem.options, self._usual)
 
     def _with(self, inliers: Inliers, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
