@@ -268,7 +268,8 @@ class RepeatedAmounts(Frozen):
         part = model.equations.sight if part is None else part
         parts = int(part.max()) + 1
         information, score, in_shared = columns.left_of(model)
-        ridge = _DETERMINED * float(np.max(np.diagonal(information)))
+        rounding = 1e-12  # of what they are before anything is taken: where all of it is, that is left
+        ridge = _DETERMINED * float(np.max(np.diagonal(information))) + rounding * float(np.sum(columns.values**2))
         root = inverse_root_of(information + ridge * np.eye(columns.size))
         best = columns.at(root.T @ (root @ score))
         left = np.where(model.used, model.left_over - model.left_of_column(best), 0.0)
