@@ -13,7 +13,17 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import NORMAL_95, CalibrationError, DegenerateError, Frozen, Mask, attempt, or_none, replace
+from ceres_cal.base import (
+    NORMAL_95,
+    CalibrationError,
+    DegenerateError,
+    Frozen,
+    Mask,
+    attempt,
+    median,
+    or_none,
+    replace,
+)
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
@@ -29,9 +39,9 @@ from ceres_cal.calibration.lens_forms import (
 )
 from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.posterior.other_lenses import OtherLenses
+from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem import Estimate, Key, Options, Solution, moved
+from ceres_cal.problem import Estimate, Options, Solution, moved
 from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
@@ -85,9 +95,6 @@ class Chosen(Frozen):
         return none if self.among is None else self.among.others(posterior, options)
 
 
-_Steps = Mapping[Key, Mapping[Key, float]]
-
-
 class Comparison(Frozen):
     """The lenses that were compared, and the one that was chosen.
 
@@ -124,23 +131,21 @@ class Comparison(Frozen):
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
-        told = [one for one in self.tried if not one.form.blank.roughness]
+        told = self._possible
         likely = dict(zip(told, _probabilities(told), strict=True))
         longer = [one for one in told if one.extends(self.chosen, self.as_good)]
         asked = [one for one in told if one is not self.chosen and (one in longer or likely[one] >= least_probability)]
-        each = list[tuple[Candidate, float, dict[Key, float]]]()
-        if self.chosen.form.blank.roughness or not asked:
+        each = list[tuple[Candidate, float, Sequence[OpenDirection]]]()
+        own = self.chosen.spread(posterior.stated)
+        if self.chosen.form.blank.roughness or not asked or own is None:
             return found
-        here, own = posterior.mixture(), self.chosen.along_phi(posterior.stated)
-        known = dict(zip(here.keys, np.sqrt(here.variances[0]).tolist(), strict=True))
-        factors = dict(zip(posterior.keys, posterior.factors.tolist(), strict=True))
-        rise = max(((NORMAL_95 * factors[phi]) ** 2 for phi in own if phi in known), default=0.0)  # of a cost, at 95 %
         for one in asked:
-            steps = self._open_phi(one.along_phi(posterior.stated), own, known, one.of.estimate)
-            if steps and one in longer:
-                likely[one] = max(likely[one], likely[self.chosen])
-            if likely[one] >= least_probability and not one.fault:
-                each.append((one, likely[one], steps))
+            spread, weight = one.spread(posterior.stated), likely[one]
+            as_long = max(weight, likely[self.chosen]) if one in longer else weight  # no data say that it is shorter
+            is_open = () if spread is None else spread.beyond(own, found, as_long)
+            weight = as_long if is_open else weight
+            if weight >= least_probability and not one.fault:
+                each.append((one, weight, is_open))
         if not each:
             return found
         seen = self.seen.holding(options)
@@ -153,61 +158,55 @@ class Comparison(Frozen):
         if isinstance(near, CalibrationError):
             return replace(found, failed=str(near))
         found, left = replace(found, near=near), 1.0
-        for one, weight, steps in each:
+        for one, weight, is_open in each:
             # quiet: what cannot be solved for, or ends in another minimum, says nothing, and the rest share its weight
             near = attempt(partial(solved, one, as_promised=True))
             if isinstance(near, CalibrationError):
                 left -= weight
                 continue
-            ends = self._ends(seen, one, near, steps, rise)
+            ends = self._ends(seen, one, near, is_open, median(posterior.factors))
             weights = (weight / len(ends),) * len(ends)
             found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
         # What they say by chance is less by as much as there are more observations than took part.
         share = max(self.share, least_share) / max(left, least_probability)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
-    @staticmethod
-    def _open_phi(along: _Steps, own: _Steps, known: Mapping[Key, float], there: Estimate) -> dict[Key, float]:
-        """How numbers vary, by a standard deviation, along what another lens leaves open of phi and the chosen one does
-        not.
-
-        Straight from above the form of a lens alone tells phi. Of a floor one coefficient knew it to 0.4 %, 16 standard
-        deviations off at robot height; three, which predicted as well, knew it to 10 %.
-
-        Args:
-            along, own: of the other lens and the chosen one, see `Candidate.along_phi`. known: standard deviations by
-                the chosen one. there: cameras of the other's kind.
+    @property
+    def _possible(self) -> list[Candidate]:
+        """The lenses with a formula, without those that another of them refutes: what no choice may take is no
+        alternative to what was chosen.
         """
-        much, most, steps = 1.0, 0.5, dict[Key, float]()  # excess of variance over that by the chosen lens; of phi
-        for phi, step in along.items():
-            excess = (step[phi] / own[phi][phi]) ** 2 - 1.0 if known.get(phi, 0.0) and phi in own else 0.0
-            if excess > much:
-                far = min(known[phi] * excess**0.5, most * there.cameras[phi.owner].phi)
-                steps |= {key: steps.get(key, 0.0) + far * value / step[phi] for key, value in step.items()}
-        return steps
+        told = [one for one in self.tried if not one.form.blank.roughness]
+        return [one for i, one in enumerate(told) if one is self.chosen or not _is_refuted(told, i)]
 
     @staticmethod
     def _ends(
-        seen: InlierRows, one: Candidate, near: Estimate, steps: dict[Key, float], most: float
+        seen: InlierRows, one: Candidate, near: Estimate, is_open: Sequence[OpenDirection], widened: float
     ) -> Sequence[Estimate]:
-        """Another lens so far to either side, but no farther than where twice its cost has risen by so much; where
-        there are no steps itself.
+        """Another lens so far to either side of what it leaves open that all of these scatter as it does, but no
+        farther than where twice its cost has risen as it does at 95 %; where it leaves nothing open itself.
 
         In a bent valley normal equations of elsewhere led to ends at which that had risen by 195.
+
+        Args:
+            widened: factor on standard deviations, as the data scatter.
         """
+        most, far = (NORMAL_95 * widened) ** 2, widened * len(is_open) ** 0.5
 
-        def end(side: float, least: float, tries: int = 4) -> Solution:
-            there = moved(near, list(steps), side * np.array(list(steps.values())))
-            found = seen.solved_near(one, as_promised=True, there=there)
+        def end(open_: OpenDirection, side: float, least: float, tries: int = 4) -> Solution:
+            there = moved(near, open_.keys, side * open_.step)
+            found = seen.solved_near(one, as_promised=True, there=there, held=open_.along)
             rise = 2.0 * (found.cost - least)
-            return found if rise <= most or not tries else end(side * (most / rise) ** 0.5, least, tries - 1)
+            return found if rise <= most or not tries else end(open_, side * (most / rise) ** 0.5, least, tries - 1)
 
-        def both() -> Sequence[Estimate]:
-            least = end(0.0, np.inf).cost
-            return [end(side, least).estimate for side in (-1.0, 1.0)]
+        def all_of() -> Sequence[Estimate]:
+            if one.is_near:
+                return [moved(near, open_.keys, side * open_.step) for open_ in is_open for side in (-far, far)]
+            least = end(is_open[0], 0.0, np.inf).cost
+            return [end(open_, side, least).estimate for open_ in is_open for side in (-far, far)]
 
         # quiet: where it ends in another minimum, its middle counts alone
-        ends = attempt(both) if steps else [near]
+        ends = attempt(all_of) if is_open else [near]
         return [near] if isinstance(ends, CalibrationError) else ends
 
     @property

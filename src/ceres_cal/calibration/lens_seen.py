@@ -15,6 +15,7 @@ from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
+from ceres_cal.posterior.other_lenses import LensSpread
 from ceres_cal.problem import (
     Estimate,
     Information,
@@ -22,6 +23,7 @@ from ceres_cal.problem import (
     Options,
     Problem,
     Solution,
+    intrinsic_names,
     moved,
     problem_of,
     solve,
@@ -179,20 +181,17 @@ class Candidate(Frozen):
             cameras[name] = replace(camera, lens=lens)
         return replace(there, cameras=cameras)
 
-    def along_phi(self, stated: Information) -> dict[Key, dict[Key, float]]:
-        """phi of each camera -> how all numbers vary by a standard deviation of it.
+    def spread(self, stated: Information) -> LensSpread | None:
+        """How all numbers vary with it; None where it gives no answer.
 
         Args:
             stated: what is known besides.
         """
         if self.of.normals is None:
-            return {}
+            return None
         keys = self.of.normals.keys
         besides = stated.marginal(stated.among(keys)).over(keys).matrix
-        root = self.of.normals.root(self.of.to_nothing(self.form), besides)
-        phis = {key: own for key, own in zip(keys, root, strict=True) if key[::2] == ("camera", "phi")}
-        each = {phi: (root @ own / np.linalg.norm(own)).tolist() for phi, own in phis.items()}
-        return {phi: {key: v for key, v in zip(keys, step, strict=True) if v} for phi, step in each.items()}
+        return LensSpread(self.of.estimate, keys, self.of.normals.root(self.of.to_nothing(self.form), besides))
 
     @property
     def is_near(self) -> bool:
@@ -326,13 +325,18 @@ class InlierRows(Frozen):
         return solution.estimate if 2.0 * solution.cost <= self._kept(candidate) else None
 
     def solved_near(
-        self, candidate: Candidate, *, as_promised: bool = False, there: Estimate | None = None
+        self,
+        candidate: Candidate,
+        *,
+        as_promised: bool = False,
+        there: Estimate | None = None,
+        held: Key | None = None,
     ) -> Solution:
         """Where a lens is at its best, solved for from where the normal equations have it.
 
         Args:
             as_promised: whether what leaves more than these promise is no answer.
-            there: from where else; phi stays as it is there.
+            there: from where else. held: what stays as it is there.
 
         Raises:
             CalibrationError: it cannot be solved for.
@@ -343,8 +347,8 @@ class InlierRows(Frozen):
         options = candidate.form.of(self.options)
         start = as_held(there or candidate.estimate, options)
         problem = self._problem(options, start, candidate.of.smoothness)
-        for name in () if there is None else start.cameras:
-            problem = problem.holding(name, 0)
+        if held is not None:
+            problem = problem.holding(held.owner, intrinsic_names(start.cameras[held.owner].lens).index(held.quantity))
         solution = solve(problem, start, precision=at_best, posed=at_best)
         if solution.failed:
             raise DegenerateError(f"cannot be solved for: {solution.termination}")
