@@ -140,7 +140,7 @@ WRONG = {
         ("CAL OBS --output table.txt", "the table is written as .csv, .json or .npz"),
         ("CAL OBS --report page.pdf", "a report is written as .html or .htm"),
         ("CAL OBS --images PHOTO", "--images needs --report"),
-        ("CAL OBS --false-alarms 2", "must lie between 0 and 1"),
+        ("CAL OBS --false-alarms 2", "give a share between 0 and 1"),
     ],
     "advise": [
         ("CAL --height-mm tall", "'tall' is no length"),

@@ -81,6 +81,11 @@ def height_option(what: str, default_mm: float | None = None, **about: Any) -> A
     return option(what, "MM", default_mm, read=length("mm"), **about)
 
 
+def false_alarms_option(what: str) -> Any:
+    """The option --false-alarms."""
+    return option(f"{what}, such as 0.01 or 1%", "SHARE", 0.01, read=share)
+
+
 def timeout_option() -> Any:
     """The option --timeout S."""
     return option("give up after so many seconds; default: never", "S")
@@ -141,6 +146,15 @@ def length(unit: str) -> Callable[[str], float]:
             raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
 
     return parse
+
+
+def share(text: str) -> float:
+    """The type of --false-alarms: 0.01, or 1%."""
+    where = f"--false-alarms {text!r}"
+    value = parse_number(text.rstrip("%"), where) / (100.0 if text.endswith("%") else 1.0)
+    if not 0.0 < value < 1.0:
+        raise InputError(f"{where}: give a share between 0 and 1, such as 0.01")
+    return value
 
 
 def name(text: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from ceres_cal import diagnostics, report
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli import arguments, files
-from ceres_cal.cli.command import argument, command, option, switch
+from ceres_cal.cli.command import argument, command, switch
 from ceres_cal.report.document import Document
 
 
@@ -25,12 +25,10 @@ def _run(
     new_data: bool = switch("the observations are others than those it was made from"),
     held_out: bool = switch("say, too, which lens predicts held-out parts best, as `calibrate` does"),
     strict: bool = switch("exit with 1 for any finding, also one that does no harm"),
-    false_alarms: float = option("probability of any finding where nothing is wrong", "P", 0.01),
+    false_alarms: float = arguments.false_alarms_option("probability of any finding where nothing is wrong"),
 ) -> Document:
     files.require_outputs(args, [calibration, *observations])
     files.require_output(output, [], "the table is", ".csv", ".json", ".npz")
-    if not 0.0 < false_alarms < 1.0:
-        raise InputError(f"--false-alarms must lie between 0 and 1, not {false_alarms:g}")
     if held_out and new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
     from ceres_cal.calibration.calibrating import lenses_by_held_out

@@ -25,14 +25,6 @@ if TYPE_CHECKING:
     from ceres_cal.observations import Observations, Prior
 
 
-def _share(text: str) -> float:
-    where = f"--false-alarms {text!r}"
-    value = arguments.parse_number(text.rstrip("%"), where) / (100.0 if text.endswith("%") else 1.0)
-    if not 0.0 < value < 1.0:
-        raise InputError(f"{where}: give a share between 0 and 1, such as 0.01")
-    return value
-
-
 @command(
     "check",
     "does a calibration still hold? exit code 0 yes, 1 no",
@@ -41,9 +33,7 @@ def _share(text: str) -> float:
 )
 def _check(
     args: InputArguments,
-    false_alarms: float = option(
-        "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
-    ),
+    false_alarms: float = arguments.false_alarms_option("how often unmoved cameras may be said to have moved"),
     checks: int = option(
         "that is at least once in N checks of this calibration: 720 for an hourly check over a month",
         "N",

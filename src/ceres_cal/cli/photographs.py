@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from ceres_cal import base, detect, scene
-from ceres_cal.base import InputError, image_files, images_and_videos, plural
+from ceres_cal.base import InputError, first_of, image_files, images_and_videos, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.arguments import frames_option, length, parse_length, parse_lengths
 from ceres_cal.cli.command import REQUIRED, Arguments, QuietArguments, argument, command, flag, option, switch
@@ -131,15 +131,11 @@ def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) 
 
 def median_text(data: dict[str, Any]) -> str:
     """What became of the pictures, in one line."""
-    most_named = 3
     used, left_out = len(data["used"]), data["left_out"]
     reasons: dict[str, list[str]] = {}
     for one in left_out:
         reasons.setdefault(one["reason"], []).append(one["image"])
-    said = [
-        f"{len(names)} left out, {reason} ({', '.join(names[:most_named])}{', ...' if names[most_named:] else ''})"
-        for reason, names in reasons.items()
-    ]
+    said = [f"{len(names)} left out, {reason} ({first_of(names)})" for reason, names in reasons.items()]
     return "; ".join([f"{data['picture']}: the median of {plural(used, 'picture')} of {used + len(left_out)}", *said])
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from ceres_cal import detect, formats, scene, start
 from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError, each_camera, images_and_videos, replace
-from ceres_cal.base.words import plural
+from ceres_cal.base.words import first_of, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
 from ceres_cal.cli.files import attempted, folder_of_results, require_shown
@@ -248,9 +248,7 @@ def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: formats
 
 
 def _sections(args: RunArguments, images: int, steps: Sequence[_Step], level: str) -> Iterator[Section]:
-    more = ", ..." if len(args.images) > _MOST_NAMES else ""
-    named = ", ".join(args.images[:_MOST_NAMES])
-    yield Section("read", [f"{plural(images, 'photograph')} in {named}{more}"])
+    yield Section("read", [f"{plural(images, 'photograph')} in {first_of(args.images, _MOST_NAMES)}"])
     for number, step in enumerate(steps, start=1):
         yield _BLANK
         yield Section(f"step {number}", [_short(step.command)])

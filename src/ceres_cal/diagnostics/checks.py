@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, log_chi2_tail, log_f_tail, rms
+from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, first_of, log_chi2_tail, log_f_tail, rms
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.table import ResidualTable
@@ -169,7 +169,6 @@ def wrong_labels(tested: TestResults) -> Iterator[Finding]:
 
 
 def _wrong_label(tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
-    most_named = 5
     observations, table, one = tested.case.problem.observations, tested.case.table, labels[0]
     described = observations.targets[target]
     names = described.curve_names if one.is_curve else described.point_names
@@ -177,7 +176,7 @@ def _wrong_label(tested: TestResults, target: str, labels: list[Mislabelled]) ->
     rows = np.concatenate([label.rows for label in labels])
     at = rows + (len(observations.points) if one.is_curve else 0)
     frames = list(dict.fromkeys(observations.views[label.view].frame for label in labels))
-    listing = ", ".join(map(repr, frames[:most_named])) + (" ..." if len(frames) > most_named else "")
+    listing = first_of(list(map(repr, frames)), 5)
     away = float(np.mean(np.concatenate([label.distance_px for label in labels])))
     px, mm = _mean(np.abs(table.distance_px[at])), _mean(np.abs(table.error_mm[at]))
     sentence = (

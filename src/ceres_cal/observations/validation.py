@@ -19,7 +19,7 @@ from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, median
+from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, first_of, median
 from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, in_blocks, view_label
 from ceres_cal.observations.files import Content
 
@@ -222,8 +222,8 @@ class Copies(Frozen):
             yield f"frame {frames[0][0]!r} repeats frame {frames[0][1]!r} point by point{more}: counted once"
         twice = {frame: count for (frame, first), count in rows.items() if frame == first}
         if twice:
-            some = ", ".join(map(repr, list(twice)[:3])) + (", ..." if len(twice) > 3 else "")
-            yield f"{sum(twice.values())} observations of frame {some} are there more than once: counted once"
+            frame = first_of(list(map(repr, twice)))
+            yield f"{sum(twice.values())} observations of frame {frame} are there more than once: counted once"
 
 
 def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies:

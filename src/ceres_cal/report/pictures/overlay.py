@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from msgspec import Struct
 
-from ceres_cal.base import Array, Image, Image8, Indices32, Mask, Pose
+from ceres_cal.base import Array, Image, Image8, Indices32, Mask, Pose, first_of
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.diagnostics.advice import Measurement
@@ -137,9 +137,6 @@ def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: f
     return canvas
 
 
-_NAMES = 4  # of missing lines in the legend
-
-
 def draw_seen(photograph: Image, seen: Followed | None, target: Target) -> Image8:
     """A photograph with the lines found in it, and, of the best candidate, where paint was found and where not."""
     grey = in_8_bit_colour(photograph).mean(axis=2).astype(np.float32)
@@ -147,8 +144,7 @@ def draw_seen(photograph: Image, seen: Followed | None, target: Target) -> Image
     if seen is not None:
         lines = seen.lines
         missing = [target.curve_names[number] for number in seen.absent]
-        names = ", ".join(missing[:_NAMES]) + (f" and {len(missing) - _NAMES} more" if len(missing) > _NAMES else "")
-        absent = f"best candidate: no paint{f', all along {names}' if names else ''}"
+        absent = f"best candidate: no paint{f', all along {first_of(missing, 4)}' if missing else ''}"
         layers += [
             Layer(lines.pixels[lines.found], "best candidate: paint", "after"),
             Layer(lines.course.pixels[~lines.found], absent, "taken out", crosses=True),
