@@ -229,6 +229,11 @@ class Evidence(Frozen):
         """Its amounts (Q,) and their standard deviations (Q,), of lengths in mm."""
         return 1e3 * self.score.amount, 1e3 * self.score.sd
 
+    def words(self, sentence: str, advice: str, names: Iterable[str] = (), unit: str = "px") -> Words:
+        """What a finding says, its size behind the sentence; what would mend it are all its amounts, by their names."""
+        values, sds = self.in_mm if unit in ("mm", "mrad") else (self.score.amount, self.score.sd)
+        return Words(f"{sentence} ({self.size})", advice, amounts(names, values, sds, unit))
+
     @property
     def size(self) -> str:
         """Its effect in words."""

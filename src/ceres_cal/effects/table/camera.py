@@ -92,12 +92,12 @@ def _leaning(case: Case, camera: str, pixels: Array) -> Array | None:
 
 def _of_skew(evidence: Evidence) -> Words:
     skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
-    return Words(
-        f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad "
-        f"({evidence.size})",
+    return evidence.words(
+        f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad",
         "calibrate with --free-skew, which no other program reads; better take pictures as the sensor gives them, "
         "neither warped nor stabilised",
-        amounts(["skew"], skew, sd, "mrad"),
+        ["skew"],
+        "mrad",
     )
 
 
@@ -112,33 +112,27 @@ def _held(places: list[int], case: Case, camera: str, pixels: Array) -> Array | 
 def _of_aspect(evidence: Evidence) -> Words:
     score = evidence.score
     held = evidence.case.estimate.cameras[score.subject].aspect
-    return Words(
+    return evidence.words(
         f"camera {score.subject!r}: its pixels are not as wide as high: aspect {held + score.amount[0]:.5f} ± "
-        f"{score.sd[0]:.5f}, not {held:g} ({evidence.size})",
+        f"{score.sd[0]:.5f}, not {held:g}",
         "calibrate with --free-aspect",
-        amounts(["aspect"], score.amount, score.sd, ""),
+        ["aspect"],
+        "",
     )
 
 
 def _of_principal_point(evidence: Evidence) -> Words:
-    score = evidence.score
-    x, y = score.amount
-    return Words(
-        f"camera {score.subject!r}: the principal point is held, but the residuals ask for it {x:+.1f}, {y:+.1f} "
-        f"px from there ({evidence.size})",
-        "let it free",
-        amounts(["cx", "cy"], score.amount, score.sd, "px"),
-    )
+    x, y = evidence.score.amount
+    asked = f"the residuals ask for it {x:+.1f}, {y:+.1f} px from there"
+    sentence = f"camera {evidence.score.subject!r}: the principal point is held, but {asked}"
+    return evidence.words(sentence, "let it free", ["cx", "cy"])
 
 
 def _of_phi(evidence: Evidence) -> Words:
     score = evidence.score
-    return Words(
-        f"camera {score.subject!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± "
-        f"{score.sd[0]:.2f} px ({evidence.size})",
-        "let it free, or give it as a prior with a sigma",
-        amounts(["phi"], score.amount, score.sd, "px"),
-    )
+    asked = f"residuals ask for {score.amount[0]:+.2f} ± {score.sd[0]:.2f} px"
+    sentence = f"camera {score.subject!r}: phi is held, but {asked}"
+    return evidence.words(sentence, "let it free, or give it as a prior with a sigma", ["phi"])
 
 
 _HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
@@ -157,11 +151,11 @@ def _of_shift(evidence: Evidence) -> Words:
     half_sd, half_px = 3.0, 0.1
     px, sd = evidence.score.amount, evidence.score.sd
     half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(half_sd * sd, half_px)))
-    return Words(
+    return evidence.words(
         f"camera {evidence.score.subject!r}: its points are shifted against its curves by ({px[0]:+.2f} ± "
-        f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px ({evidence.size})",
+        f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px",
         f"{_HALF if half else ''}let both detectors count from the centre of the top-left pixel",
-        amounts(("x", "y"), px, sd, "px"),
+        "xy",
     )
 
 
@@ -183,12 +177,9 @@ def _drawn_out(case: Case, camera: str, pixels: Array) -> Array | None:
 
 def _of_coma(evidence: Evidence) -> Words:
     px, sd = evidence.score.amount, evidence.score.sd
-    return Words(
-        f"camera {evidence.score.subject!r}: its lens has coma, which draws everything outwards by {px[0]:+.2f} ± "
-        f"{sd[0]:.2f} px at the corners of the image ({evidence.size})",
-        "stop the lens down, or take another one",
-        amounts(["coma"], px, sd, "px"),
-    )
+    drawn = f"draws everything outwards by {px[0]:+.2f} ± {sd[0]:.2f} px at the corners of the image"
+    sentence = f"camera {evidence.score.subject!r}: its lens has coma, which {drawn}"
+    return evidence.words(sentence, "stop the lens down, or take another one", ["coma"])
 
 
 EFFECTS = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from ceres_cal.base import Array, log_f_tail, numbers_of, replace
 from ceres_cal.effects.columns import EffectColumns, EffectSums, grouped, score_all
-from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
+from ceres_cal.effects.effect import SMALL, Case, Effect, Evidence, Words, camera_effect, half_diagonals
 from ceres_cal.problem import OF_PIXELS, USUAL_DECENTRING, unit_px
 from ceres_cal.scene import LENSES, Camera, Lens
 
@@ -124,17 +124,13 @@ def _of_decentring(evidence: Evidence) -> Words:
         advice = f"let {' and '.join(own)} free"
     else:
         advice = f"calibrate with --lens {kind}, which has {' and '.join(names)}"
-    return Words(
-        f"camera {name!r}: its lens is not centred: a tangential displacement of up to "
-        f"{evidence.most_px():.2f} px ({evidence.size})",
-        advice,
-    )
+    away = f"a tangential displacement of up to {evidence.most_px():.2f} px"
+    return evidence.words(f"camera {name!r}: its lens is not centred: {away}", advice)
 
 
 def _tangential(lens: Lens) -> tuple[str, ...]:
     """Names of Brown's decentring coefficients, which it has or may have."""
-    own = tuple(name for name in ("p1", "p2") if name in lens.names)
-    return own or lens.more_terms.get("tangential", ())
+    return lens.tangential or lens.more_terms.get("tangential", ())
 
 
 def _one_way(case: Case, camera: str, pixels: Array) -> Array | None:
@@ -159,9 +155,9 @@ def _of_prism(evidence: Evidence) -> Words:
     name = evidence.score.subject
     kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
     own = evidence.case.estimate.cameras[name].lens.kind == kind
-    return Words(
+    return evidence.words(
         f"camera {name!r}: its picture is displaced one way towards its rim, as by a thin prism, by up to "
-        f"{evidence.most_px():.2f} px ({evidence.size})",
+        f"{evidence.most_px():.2f} px",
         f"calibrate with {'' if own else f'--lens {kind} '}--terms prism",
     )
 
@@ -190,10 +186,10 @@ def _of_change(evidence: Evidence) -> Words:
     score = evidence.score
     parts = zip(_NUMBERS, score.amount, score.sd, strict=True)
     change = ", ".join(f"{name} {by:+.1f} ± {sd:.1f} px" for name, by, sd in parts)
-    return Words(
-        f"camera {score.subject!r} has another lens after frame {score.frame!r}: {change} ({evidence.size})",
+    return evidence.words(
+        f"camera {score.subject!r} has another lens after frame {score.frame!r}: {change}",
         "give the frames after it a camera of their own: it was knocked or zoomed, or they are another camera's",
-        amounts(_NUMBERS, score.amount, score.sd, "px"),
+        _NUMBERS,
     )
 
 

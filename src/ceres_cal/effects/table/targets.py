@@ -81,8 +81,7 @@ def _of_curve(evidence: Evidence) -> Words:
     advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
     if isinstance(curve, Arc):
         how = f"its centre x {mm[0]:+.1f}, y {mm[1]:+.1f} mm and its radius {mm[2]:+.1f} mm off"
-        sentence = f"{name} is not painted as drawn: {how} ({evidence.size})"
-        return Words(sentence, advice, amounts(("x", "y", "radius"), mm, sd, "mm"))
+        return evidence.words(f"{name} is not painted as drawn: {how}", advice, ("x", "y", "radius"), "mm")
     assert isinstance(curve, Segment)
     along = np.subtract(curve.end, curve.start)[:2]
     x, y = mm[0] * np.array([-along[1], along[0]]) / np.hypot(*along)
@@ -96,11 +95,11 @@ def _of_curve(evidence: Evidence) -> Words:
 def _of_point(evidence: Evidence) -> Words:
     name = evidence.score.subject
     mm, sd = evidence.in_mm
-    return Words(
-        f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn "
-        f"({evidence.size})",
+    return evidence.words(
+        f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn",
         f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
-        amounts("xy", mm, sd, "mm"),
+        "xy",
+        "mm",
     )
 
 
@@ -118,11 +117,9 @@ def _of_length(evidence: Evidence) -> Words:
     target, _, dimension = name.partition("/")
     drawn_m = evidence.case.problem.observations.targets[target].dimensions[dimension]
     by, sd = evidence.score.amount, evidence.score.sd
-    return Words(
-        f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says ({evidence.size})",
-        f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}",
-        amounts((dimension,), 1e3 * by, 1e3 * sd, "mm"),
-    )
+    sentence = f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says"
+    advice = f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}"
+    return evidence.words(sentence, advice, (dimension,), "mm")
 
 
 def _of_board(evidence: Evidence) -> Words:
@@ -135,11 +132,12 @@ def _of_board(evidence: Evidence) -> Words:
         for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
         if abs(a) > clear * s
     ]
-    return Words(
+    return evidence.words(
         f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
-        f"along y{''.join(f', {one}' for one in further)} ({evidence.size})",
+        f"along y{''.join(f', {one}' for one in further)}",
         f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
-        amounts(WARP, mm, sd, "mm"),
+        WARP,
+        "mm",
     )
 
 
@@ -153,13 +151,10 @@ def _of_stretch(evidence: Evidence) -> Words:
     name = evidence.score.subject
     size_m = float(np.max(np.ptp(evidence.case.problem.observations.targets[name].box, axis=0)))
     longer, sd = (100.0 * float(one[0]) / size_m for one in (evidence.score.amount, evidence.score.sd))
-    mm, sd_mm = evidence.in_mm
     sides = "x than along y" if longer > 0.0 else "y than along x"
-    return Words(
-        f"board {name} is {abs(longer):.2f} ± {sd:.2f} % longer along {sides} ({evidence.size})",
-        f"measure both of its sides, print it undistorted, or solve for it: --tolerance {name}.stretch_m=0.002",
-        amounts(("x over y",), mm, sd_mm, "mm"),
-    )
+    sentence = f"board {name} is {abs(longer):.2f} ± {sd:.2f} % longer along {sides}"
+    advice = f"measure both of its sides, print it undistorted, or solve for it: --tolerance {name}.stretch_m=0.002"
+    return evidence.words(sentence, advice, ("x over y",), "mm")
 
 
 def _bowed(case: Case) -> Iterator[EffectColumns]:
@@ -171,12 +166,12 @@ def _bowed(case: Case) -> Iterator[EffectColumns]:
 
 def _of_bow(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    return Words(
+    return evidence.words(
         f"{evidence.score.subject}: its floor appears {_lower(mm[0])} ± {sd[0]:.1f} mm at its edges along x than "
-        f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
-        f"({evidence.size})",
+        f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm",
         "measure its height at some points, and give them as points of a custom target with their z",
-        amounts(("x", "y", "twist"), mm, sd, "mm"),
+        ("x", "y", "twist"),
+        "mm",
     )
 
 
@@ -188,12 +183,9 @@ def _sheared(case: Case) -> Iterator[EffectColumns]:
 
 def _of_shear(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    return Words(
-        f"{evidence.score.subject} is out of square: its edges lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves "
-        f"({evidence.size})",
-        "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are",
-        amounts(("shear",), mm, sd, "mm"),
-    )
+    lie = f"lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves"
+    advice = "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are"
+    return evidence.words(f"{evidence.score.subject} is out of square: its edges {lie}", advice, ("shear",), "mm")
 
 
 def _lower(mm: float) -> str:
@@ -224,12 +216,9 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
 
 def _of_place(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    return Words(
-        f"{evidence.score.subject} the floor is {abs(mm[0]):.0f} ± {sd[0]:.0f} mm "
-        f"{'higher' if mm[0] > 0.0 else 'lower'} than around it ({evidence.size})",
-        "look for what lies under the carpet, and leave out what was observed there",
-        amounts(["height"], mm, sd, "mm"),
-    )
+    high = f"{abs(mm[0]):.0f} ± {sd[0]:.0f} mm {'higher' if mm[0] > 0.0 else 'lower'} than around it"
+    advice = "look for what lies under the carpet, and leave out what was observed there"
+    return evidence.words(f"{evidence.score.subject} the floor is {high}", advice, ["height"], "mm")
 
 
 def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:

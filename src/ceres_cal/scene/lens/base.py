@@ -297,6 +297,17 @@ def _names_of_terms(model: type[Lens], terms: tuple[str, ...]) -> tuple[str, ...
     return tuple(name for term, names in model.more_terms.items() if term in terms for name in names)
 
 
+def required_powers(kind: str, powers: Sequence[int], most: int, fewest: int = 0) -> tuple[int, ...]:
+    """The powers of a lens; InputError where they are no different whole numbers from 2 on, or too few."""
+    whole = tuple(map(int, powers))
+    distinct = len({*whole}) == len(whole) >= fewest and whole == tuple(powers)
+    if not distinct or not all(2 <= power <= most for power in whole):
+        raise InputError(
+            f"powers of the {kind} lens must be different whole numbers from 2 to {most}, not {tuple(powers)}"
+        )
+    return whole
+
+
 _L = TypeVar("_L", bound=Lens)
 LENSES: dict[str, type[Lens]] = {}
 """Every kind of lens, by its name: options, files, diagnosis and command line offer what is here."""

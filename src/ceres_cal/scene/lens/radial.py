@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, Indices, InputError, cached_property
 from ceres_cal.kernels import NOTHING
-from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
+from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, required_powers, unit_rays
 from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, derivative, horner, invert_increasing, inverted, less
 
 
@@ -39,13 +39,7 @@ class Radial(Lens):
 
     def __post_init__(self) -> None:
         most_power = 30  # 100,000 px to this power has a square that a computer holds
-        powers = tuple(int(p) for p in self.powers)
-        distinct = powers and len(set(powers)) == len(powers) and powers == tuple(self.powers)
-        if not distinct or not all(2 <= power <= most_power for power in powers):
-            raise InputError(
-                f"powers of the radial lens must be different whole numbers from 2 to {most_power}, not {self.powers}"
-            )
-        object.__setattr__(self, "powers", powers)
+        object.__setattr__(self, "powers", required_powers(self.kind, self.powers, most_power, fewest=1))
         super().__post_init__()
 
     @property

@@ -11,9 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, cached_property, grid_places, rms, two_digits
+from ceres_cal.base import Array, Frozen, Mask, cached_property, grid_places, rms, two_digits
 from ceres_cal.kernels import NOTHING
-from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
+from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness, required_powers
 from ceres_cal.scene.lens.planar import Planar
 
 _GRID = COLUMNS, ROWS = 16, 12  # of a surface's nodes
@@ -204,12 +204,7 @@ class Spline(Planar):
 
     def __post_init__(self) -> None:
         most = 9  # powers across the radius
-        powers = tuple(int(p) for p in self.powers)
-        if len(set(powers)) != len(powers) or powers != tuple(self.powers) or not all(2 <= p <= most for p in powers):
-            raise InputError(
-                f"powers of the spline lens must be different whole numbers from 2 to {most}, not {powers}"
-            )
-        object.__setattr__(self, "powers", powers)
+        object.__setattr__(self, "powers", required_powers(self.kind, self.powers, most))
         object.__setattr__(self, "values", tuple(self.values) or (0.0,) * len(self.names))
         super().__post_init__()
 
