@@ -20,7 +20,6 @@ from ceres_cal.base.words import did_you_mean
 
 P = ParamSpec("P")
 R = TypeVar("R")
-_Class = TypeVar("_Class", bound=type)
 _MOST_LETTERS = 40  # of a wrong value
 _UNIONS: tuple[Any, ...] = (Union, UnionType)
 _ALIKE: Mapping[Any, tuple[type, ...]] = {
