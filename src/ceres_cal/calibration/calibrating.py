@@ -241,7 +241,8 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
         return _of_lens(task, start, sights, _named(options))
 
     def seen_with(lenses: ChosenLenses) -> Explained:
-        smoothness = {name: sd for one in lenses.each.values() for name, sd in one.smoothness.items()}
+        known = (one.among.chosen.of.smoothness for one in lenses.each.values() if one.among)
+        smoothness = {name: sd for each in known for name, sd in each.items()}
         problem = replace(problem_of(sights, lenses.options, lenses.start.estimate), smoothness=smoothness)
         return explained(task, lenses.start, problem, lenses.built)
 

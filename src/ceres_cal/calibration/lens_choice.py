@@ -8,7 +8,7 @@ lens predict the others no better: a criterion that counts observations would ta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -83,11 +83,6 @@ class Chosen(Frozen):
     def built(self) -> Built:
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
-
-    @property
-    def smoothness(self) -> Mapping[str, tuple[float, ...]]:
-        """How smooth a lens without a formula was when lenses were compared, see `Problem`."""
-        return {} if self.among is None else self.among.chosen.of.smoothness
 
     def others(self, posterior: Posterior, options: Options) -> OtherLenses:
         """What other lenses would say, as far as they are probable, see `Comparison.others`."""
