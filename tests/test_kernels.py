@@ -902,3 +902,19 @@ def test_the_normal_distribution_is_told_far_out() -> None:
     assert np.allclose(found, norm.cdf(x), rtol=1e-12, atol=0.0)
     assert kernels.normal_cdf([-np.inf, np.inf]).tolist() == [0.0, 1.0] and np.isnan(kernels.normal_cdf(np.nan))
     assert kernels.normal_cdf(x.T[::2]).tolist() == found.T[::2].tolist()
+
+
+def test_how_much_of_a_mixture_lies_above() -> None:
+    rng = np.random.default_rng(5)
+    weights, means, scales = rng.random(7), rng.normal(0.0, 3.0, (7, 20)), 1.0 / rng.uniform(0.01, 2.0, (7, 20))
+    means[2, 4], means[3, 4], scales[1, 4] = np.inf, -np.inf, 0.0
+    columns = np.array([4, 0, 19, 19, 7])
+    places = rng.normal(0.0, 4.0, 5)
+    expected = weights @ kernels.normal_cdf((means[:, columns] - places) * scales[:, columns])
+    found = kernels.mixture_above(weights, means, scales, columns, places)
+    assert found == pytest.approx(expected, abs=1e-15)
+    for wrong in ([20], [-1]):
+        with pytest.raises(ValueError, match="columns"):
+            kernels.mixture_above(weights, means, scales, np.array(wrong), places[:1])
+    with pytest.raises(ValueError, match="weights"):
+        kernels.mixture_above(weights[:3], means, scales, columns, places)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 
 NORMAL_95 = 1.959963984540054
 """Half width, in standard deviations, of the interval that holds 95 % of a normal variable."""
@@ -186,3 +186,32 @@ def _lentz(term: Callable[[int], tuple[Array, Array]], first: Array) -> Array:
         if np.all(np.abs(c * d - 1.0) < 1e-15):
             break
     return np.asarray(value)
+
+
+def tail_root(above: Callable[[Array, Indices], Array], low: Array, high: Array, tail: float) -> Array:
+    """(N,) where falling functions are so much, each between two places; `above` gives some of them at a place each.
+
+    By Chandrupatla's method (Advances in Engineering Software 28, 1997) on their logarithms: inverse quadratic
+    interpolation through three places where that may be trusted, else the middle.
+    """
+    least, exact, most_steps = 1e-12, 1e-7, 40  # of the function; of it and of the interval, as good as its values
+    roots, rows = np.full(len(low), np.nan), np.flatnonzero(np.ones(len(low)))
+    x, y, width, share = low, high, exact * (high - low), 0.5 * np.ones_like(low)
+    a, b = -np.log(tail) * np.ones_like(low), np.log(least / tail) * np.ones_like(low)
+    for _ in range(most_steps):
+        roots[rows] = place = x + share * (y - x)
+        value = np.log(np.maximum(above(place, rows), least) / tail)
+        left = (np.abs(value) > exact) & (np.abs(y - x) > width)
+        if not left.any():
+            break
+        rows, (width, place, value, x, y, a, b) = rows[left], (v[left] for v in (width, place, value, x, y, a, b))
+        alike = (value > 0.0) == (a > 0.0)
+        z, c = np.where(alike, x, y), np.where(alike, a, b)  # the place that is left
+        y, b, x, a = np.where(alike, y, x), np.where(alike, b, a), place, value
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off, at = (x - y) / (z - y), (a - b) / (c - b)
+            through = a / (b - a) * c / (b - c) + (z - x) / (y - x) * a / (c - a) * b / (c - b)
+            nearest = np.minimum(0.5 * width / np.abs(y - x), 0.5)
+        share = np.where((at**2 < off) & ((1.0 - at) ** 2 < 1.0 - off), through, 0.5)
+        share = np.clip(share, nearest, 1.0 - nearest)
+    return roots

@@ -242,6 +242,18 @@ def normal_cdf(x: ArrayLike) -> Array:
     return shares
 
 
+def mixture_above(weights: Array, means: Array, scales: Array, columns: Indices, places: Array) -> Array:
+    """(K,) how much of mixtures of normal distributions lies above a place each.
+
+    Args:
+        weights: (F,). means, scales: (F, N) of each component of N mixtures, scales one over its standard deviation.
+        columns: (K,) which mixtures. places: (K,) a place of each.
+    """
+    above = np.empty(len(columns))
+    core().mixture_above(weights, means, scales, columns, places, above)
+    return above
+
+
 # ---- photographs ----------------------------------------------------------------------------------------------------
 
 

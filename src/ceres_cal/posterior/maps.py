@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base import NORMAL_95, Array, InputError, Mask, Pose, brief, drawn, grid_places, largest
+from ceres_cal.base import Array, InputError, Mask, Pose, brief, drawn, grid_places, largest
 from ceres_cal.base.frozen import Frozen, cached_property, replace
-from ceres_cal.kernels import normal_cdf
 from ceres_cal.posterior.bent import weak_axes
-from ceres_cal.posterior.mixture import FARTHER, Mixture, quantiles, radii
+from ceres_cal.posterior.mixture import Mixture, Reading
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, PixelSlopes, intrinsic_names, moved, pixel_slopes
 from ceres_cal.problem.information import STATION_QUANTITIES, Information, Key, over
@@ -200,10 +199,11 @@ def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Fiel
     Raises:
         InputError: see `station_keys`.
     """
-    pixels = visible_pixels(estimate, station, grid.places, grid.height_m)
+    station_keys(estimate, posterior, station)
+    pixels, camera = visible_pixels(estimate, station, grid.places, grid.height_m), estimate.stations[station].camera
     visible = np.isfinite(pixels[:, 0])
-    spread = spread_of_points(estimate, posterior, station, pixels[visible], grid.height_m)
-    return FieldMap.of_visible(grid, station, visible, spread.sd_m, spread.radius_95_m)
+    known = read(posterior, estimate, located_by(station, pixels[visible], grid.height_m), camera)
+    return FieldMap.of_visible(grid, station, visible, known.sd, known.radius_95)
 
 
 _STEPS = 32  # along the longer side
@@ -330,8 +330,6 @@ def shown_by(camera: str, picture: Picture) -> Functional:
 # One path for places on the field, pixels, and the seam of two cameras: where each component of the mixture shows it,
 # and how sure it is of that.
 
-_LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley widens out there
-
 
 class Functional(Frozen):
     """Something that is read off an estimate: N pairs of numbers, and how they move.
@@ -346,83 +344,51 @@ class Functional(Frozen):
     tells_phi: bool = True
 
 
-class Reading(Frozen):
-    """What a posterior says of N pairs of numbers, from where the estimate has them.
-
-    Attributes:
-        low, high: (N, 2) 95 % bounds of each number; infinite where unknown. covariance: (N, 2, 2) second moments.
-        radius_95: (N,) 95 % of the errors are shorter. sd: (N,) root mean square length of the errors; along a valley
-            no more than the radius has it, which a thin tail beyond does not move.
-    """
-
-    low: Array
-    high: Array
-    covariance: Array
-    radius_95: Array
-    sd: Array
-
-
 def read(posterior: Posterior, estimate: Estimate, shown: Functional, camera: str = "") -> Reading:
     """What is known of something shown.
 
     Args:
         camera: which alone it depends on; "" where it depends on several.
     """
-    of_round = 2.447 / np.sqrt(2.0)  # 95 % of errors alike in all directions lie within, over their rms length
     mixture, width = posterior.mixture(camera), posterior.half_width
-    values, covariances = _of_components(mixture, estimate, shown, width)
-    _show_lenses(values, mixture, posterior.lenses, shown)
+    values, covariances = _of_components(mixture, estimate, shown, posterior.lenses, width)
     lost = np.asarray(np.isnan(values).any(axis=(0, 2)) | np.isnan(covariances).any(axis=(0, 2, 3)))
     values[:, lost], covariances[:, lost] = 0.0, 0.0
-    weights, means, known = mixture.refined(values, covariances)
-    variances = np.diagonal(known, axis1=-2, axis2=-1)
-    low, high = quantiles(weights, means, variances, width)
-    radius = radii(weights, means, known) * width / NORMAL_95
-    if mixture.is_followed:
-        tail = 2.0 * float(normal_cdf(-FARTHER))
-        far = _LARGER * radii(weights, means, known, tail)  # of what is normal, 0.7 of the radius
-        radius = np.maximum(radius, np.where(np.isfinite(far), far, 0.0))  # less than 5 % of a valley may show nothing
-    covariance = np.asarray(np.einsum("f,fnij->nij", weights, known))
-    with np.errstate(invalid="ignore"):
-        covariance = covariance + np.einsum("f,fni,fnj->nij", weights, means, means)
-    open_ = lost | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1)
-    radius = np.where(open_, np.inf, radius)
-    low, high = np.where(lost[:, None], -np.inf, low), np.where(lost[:, None], np.inf, high)
-    covariance[open_] = np.diag([np.inf, np.inf])
-    sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    sd = np.minimum(sd, radius / of_round) if mixture.is_followed else sd
-    thin = ~np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(sd)  # a tail that nothing is known in
-    covariance[thin] = 0.5 * sd[thin, None, None] ** 2 * np.eye(2)
-    return Reading(low, high, covariance, radius, sd)
+    return Reading(*mixture.refined(values, covariances), lost, width, mixture.is_followed)
 
 
-def _of_components(mixture: Mixture, estimate: Estimate, shown: Functional, width: float) -> tuple[Array, Array]:
-    """(C, N, 2) values from those of the estimate, and (C, N, 2, 2) covariances."""
-    here, known = shown.values(estimate), dict[int, Array]()
-    values, covariances = [], []
-    for step, number in zip(mixture.steps, mixture.at.tolist(), strict=True):
-        there, off = estimate, np.full(here.shape, np.nan)
-        with suppress(InputError):  # reads: "unknown" at these places of the map
-            there = moved(estimate, mixture.keys, step) if np.any(step) else estimate
-            off = shown.values(there) - here
-        if number not in known:
-            far = width if mixture.is_followed else 0.0
-            known[number] = _covariance(mixture.information[number], there, shown, far)
-        values.append(off)
-        covariances.append(known[number])
-    return np.array(values), np.array(covariances)
+def _of_components(
+    mixture: Mixture, estimate: Estimate, shown: Functional, lenses: Sequence[Estimate], width: float
+) -> tuple[Array, Array]:
+    """(C, N, 2) values from those of the estimate, and (C, N, 2, 2) covariances.
 
-
-def _show_lenses(values: Array, mixture: Mixture, lenses: Sequence[Estimate], shown: Functional) -> None:
-    """Values (C, N, 2) of components that are another lens: by how much it shows them elsewhere than the component that
-    is alike but for it, wherever it shows anything. What changes along a valley changes with a lens's phi, too, which
-    the valley has already: there the numbers follow it.
+    One that is another lens shows things by as much elsewhere than the component that is alike but for it as the lens
+    does, wherever it shows anything. What changes along a valley changes with a lens's phi, too, which the valley has
+    already: there the numbers follow it.
     """
-    if mixture.lenses and not (mixture.is_followed and shown.tells_phi):
-        near = shown.values(lenses[0])
-        off = [shown.values(lens) - near for lens in lenses]
-        for component, (lens, alike) in mixture.lenses.items():
-            values[component] = np.where(np.isfinite(off[lens]), values[alike] + off[lens], values[component])
+    here, known = shown.values(estimate), dict[int, Array]()
+    values = np.full((len(mixture.at), *here.shape), np.nan)
+    as_lenses = {} if mixture.is_followed and shown.tells_phi else mixture.lenses
+    off = [shown.values(lens) - shown.values(lenses[0]) for lens in lenses] if as_lenses else []
+
+    def there(component: int) -> Estimate:
+        step = mixture.steps[component]
+        return moved(estimate, mixture.keys, step) if np.any(step) else estimate
+
+    for component, number in enumerate(mixture.at.tolist()):
+        like_lens = np.isfinite(off[as_lenses[component][0]]).all(axis=1) if component in as_lenses else False
+        if not np.all(like_lens):
+            with suppress(InputError):  # reads: "unknown" at these places of the map
+                values[component] = shown.values(there(component)) - here
+        if number not in known:
+            near = estimate
+            with suppress(InputError):  # reads: "unknown" at these places of the map
+                near = there(component)
+            far = width if mixture.is_followed else 0.0
+            known[number] = _covariance(mixture.information[number], near, shown, far)
+    for component, (lens, alike) in as_lenses.items():
+        values[component] = np.where(np.isfinite(off[lens]), values[alike] + off[lens], values[component])
+    return values, np.array([known[number] for number in mixture.at.tolist()])
 
 
 def _covariance(information: Information, there: Estimate, shown: Functional, width: float) -> Array:

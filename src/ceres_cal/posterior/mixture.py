@@ -9,12 +9,24 @@ deviations its moments.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base import NORMAL_95, NORMAL_95_ONE_SIDED, Array, Frozen, Indices, Mask, cached_property, field, replace
-from ceres_cal.kernels import normal_cdf
+from ceres_cal.base import (
+    NORMAL_95,
+    NORMAL_95_ONE_SIDED,
+    Array,
+    Frozen,
+    Indices,
+    Mask,
+    cached_property,
+    field,
+    replace,
+    tail_root,
+)
+from ceres_cal.kernels import mixture_above, normal_cdf
 from ceres_cal.problem.information import Information, Key, over
 
 FARTHER = 3.0
@@ -272,6 +284,13 @@ def moments(weights: Array, means: Array, variances: Array) -> Array:
     return np.asarray(np.sqrt(_mixed(weights[None], variances + means**2)[0]))
 
 
+def are_unbounded(weights: Array, means: Array, variances: Array, half_width: float) -> Mask:
+    """(...) of a mixture's means and variances (F, ...), whether either of its `quantiles` is infinite."""
+    tail = float(normal_cdf(-half_width))
+    lost = [0.5 * np.isinf(variances), means == np.inf, means == -np.inf]
+    return np.asarray(np.any([np.tensordot(weights, one.astype(float), axes=1) > tail for one in lost], axis=0))
+
+
 def quantiles(weights: Array, means: Array, variances: Array, half_width: float) -> tuple[Array, Array]:
     """(...) below and above which as much of a mixture lies, of means and variances (F, ...), as of a normal variable
     beyond so many sigmas. Half of what has no variance lies beyond any place: infinite where that is more.
@@ -291,48 +310,19 @@ def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Ar
     beyond = np.tensordot(weights, (means == np.inf).astype(float), axes=1) > tail
     low = np.where(beyond, 0.0, np.min(np.where(finite, means - _REACH * sds, np.inf), axis=0))
     high = np.where(beyond, 0.0, np.max(np.where(finite, means + _REACH * sds, -np.inf), axis=0))
-    sds = np.maximum(sds, np.finfo(float).tiny).reshape(len(weights), -1)
-    means = means.reshape(len(weights), -1)
-
-    def above(x: Array, rows: Indices) -> Array:
-        with np.errstate(over="ignore"):
-            return weights @ normal_cdf((means[:, rows] - x) / sds[:, rows])
-
-    return np.where(beyond, np.inf, _root(above, low.ravel(), high.ravel(), tail).reshape(low.shape))
+    scales = 1.0 / np.maximum(sds, np.finfo(float).tiny).reshape(len(weights), -1)
+    above = partial(_above, weights, means.reshape(len(weights), -1), scales)
+    return np.where(beyond, np.inf, tail_root(above, low.ravel(), high.ravel(), tail).reshape(low.shape))
 
 
-def _root(above: Callable[[Array, Indices], Array], low: Array, high: Array, tail: float) -> Array:
-    """(N,) where falling functions are so much, each between two places; `above` gives some of them at a place each.
-
-    By Chandrupatla's method (Advances in Engineering Software 28, 1997) on their logarithms: inverse quadratic
-    interpolation through three places where that may be trusted, else the middle.
-    """
-    least, exact, most_steps = 1e-12, 1e-7, 40  # of the function; of it and of the interval, as good as its values
-    roots, rows = np.full(len(low), np.nan), np.flatnonzero(np.ones(len(low)))
-    x, y, width, share = low, high, exact * (high - low), 0.5 * np.ones_like(low)
-    a, b = -np.log(tail) * np.ones_like(low), np.log(least / tail) * np.ones_like(low)
-    for _ in range(most_steps):
-        roots[rows] = place = x + share * (y - x)
-        value = np.log(np.maximum(above(place, rows), least) / tail)
-        left = (np.abs(value) > exact) & (np.abs(y - x) > width)
-        if not left.any():
-            break
-        rows, (width, place, value, x, y, a, b) = rows[left], (v[left] for v in (width, place, value, x, y, a, b))
-        alike = (value > 0.0) == (a > 0.0)
-        z, c = np.where(alike, x, y), np.where(alike, a, b)  # the place that is left
-        y, b, x, a = np.where(alike, y, x), np.where(alike, b, a), place, value
-        with np.errstate(divide="ignore", invalid="ignore"):
-            off, at = (x - y) / (z - y), (a - b) / (c - b)
-            through = a / (b - a) * c / (b - c) + (z - x) / (y - x) * a / (c - a) * b / (c - b)
-            nearest = np.minimum(0.5 * width / np.abs(y - x), 0.5)
-        share = np.where((at**2 < off) & ((1.0 - at) ** 2 < 1.0 - off), through, 0.5)
-        share = np.clip(share, nearest, 1.0 - nearest)
-    return roots
+def _above(weights: Array, means: Array, scales: Array, places: Array, columns: Indices) -> Array:
+    """(K,) how much of mixtures lies above a place each, see `kernels.mixture_above`."""
+    return mixture_above(weights, means, scales, columns, places)
 
 
 def normal_quantile(tail: float) -> float:
     """Standard deviations that so much of a normal variable lies above."""
-    return float(_root(lambda x, _: normal_cdf(-x), np.zeros(1), np.full(1, _REACH), tail)[0])
+    return float(tail_root(lambda x, _: normal_cdf(-x), np.zeros(1), np.full(1, _REACH), tail)[0])
 
 
 def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) -> Array:
@@ -357,12 +347,94 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
     lost = np.tensordot(weights, np.isinf(each).astype(float), axes=1)
     nowhere = lost > tail
 
-    def above(radius: Array, rows: Indices) -> Array:
-        spread = cubed[:, rows]
-        share = normal_cdf((1.0 - spread - np.cbrt(radius**2 / square[:, rows])) / np.sqrt(spread))
-        return weights @ np.where(sized[:, rows], share, np.isinf(each[:, rows]))
+    # The cube root of a squared length is normal; what has no size lies within any circle, what is lost beyond it.
+    per_cube = np.cbrt(1.0 / square)
+    middles = np.where(sized, (1.0 - cubed) / per_cube, np.where(exact, -np.inf, np.inf))
+    scales = np.where(sized, per_cube / np.sqrt(cubed), 1.0)
+
+    def above(radius: Array, columns: Indices) -> Array:
+        return mixture_above(weights, middles, scales, columns, np.cbrt(radius**2))
 
     # Beside what is lost the rest has to lie nearer than all of it by itself.
     reach = np.where(lost > 0.0, _REACH * np.sqrt(square), each)
     largest = np.max(np.where(np.isfinite(each) & ~nowhere, reach, 0.0), axis=0)
-    return np.asarray(np.where(nowhere, np.inf, _root(above, np.zeros_like(largest), largest, tail)))
+    return np.asarray(np.where(nowhere, np.inf, tail_root(above, np.zeros_like(largest), largest, tail)))
+
+
+_LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley widens out there
+
+
+class Reading(Frozen):
+    """What a posterior says of N pairs of numbers, from where the estimate has them.
+
+    Attributes:
+        weights: (F,) of components. means, known: (F, N, 2), (F, N, 2, 2) of each. lost: (N,) where one shows nothing.
+        width: standard deviations from the middle to either end of a 95 % interval. is_followed: along a valley.
+    """
+
+    weights: Array
+    means: Array
+    known: Array
+    lost: Mask
+    width: float
+    is_followed: bool
+
+    @property
+    def low(self) -> Array:
+        """(N, 2) 95 % bound of each number; infinite where unknown."""
+        return self._bounds[0]
+
+    @property
+    def high(self) -> Array:
+        """(N, 2) likewise."""
+        return self._bounds[1]
+
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        low, high = quantiles(self.weights, self.means, self._variances, self.width)
+        return np.where(self.lost[:, None], -np.inf, low), np.where(self.lost[:, None], np.inf, high)
+
+    @property
+    def _variances(self) -> Array:
+        return np.diagonal(self.known, axis1=-2, axis2=-1)
+
+    @cached_property
+    def _is_open(self) -> Mask:
+        """(N,) where a bound is infinite."""
+        return self.lost | are_unbounded(self.weights, self.means, self._variances, self.width).any(axis=1)
+
+    @cached_property
+    def radius_95(self) -> Array:
+        """(N,) 95 % of the errors are shorter."""
+        radius = radii(self.weights, self.means, self.known) * self.width / NORMAL_95
+        if self.is_followed:
+            tail = 2.0 * float(normal_cdf(-FARTHER))
+            far = _LARGER * radii(self.weights, self.means, self.known, tail)  # of what is normal, 0.7 of the radius
+            radius = np.maximum(radius, np.where(np.isfinite(far), far, 0.0))  # 5 % of a valley may show nothing
+        return np.where(self._is_open, np.inf, radius)
+
+    @cached_property
+    def _moments(self) -> tuple[Array, Array]:
+        """`covariance` and `sd`."""
+        of_round = 2.447 / np.sqrt(2.0)  # 95 % of errors alike in all directions lie within, over their rms length
+        covariance = np.asarray(np.einsum("f,fnij->nij", self.weights, self.known))
+        with np.errstate(invalid="ignore"):
+            covariance = covariance + np.einsum("f,fni,fnj->nij", self.weights, self.means, self.means)
+        covariance[self._is_open] = np.diag([np.inf, np.inf])
+        sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+        sd = np.minimum(sd, self.radius_95 / of_round) if self.is_followed else sd
+        thin = ~np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(sd)  # a tail that nothing is known in
+        covariance[thin] = 0.5 * sd[thin, None, None] ** 2 * np.eye(2)
+        return covariance, sd
+
+    @property
+    def covariance(self) -> Array:
+        """(N, 2, 2) second moments."""
+        return self._moments[0]
+
+    @property
+    def sd(self) -> Array:
+        """(N,) root mean square length of the errors; along a valley no more than the radius has it, which a thin tail
+        beyond does not move.
+        """
+        return self._moments[1]

@@ -15,13 +15,13 @@ from ceres_cal.posterior.maps import (
     FieldGrid,
     FieldMap,
     Functional,
-    Reading,
     field_map,
     located_by,
     read,
     station_keys,
     visible_pixels,
 )
+from ceres_cal.posterior.mixture import Reading
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Key, moved, natural_sizes
 from ceres_cal.scene import Camera, Target, along_track, nearest_on_track, turned_on

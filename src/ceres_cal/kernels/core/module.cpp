@@ -113,6 +113,30 @@ void normal_cdf(const Read<N>& x, const Filled<N>& shares) {
     });
 }
 
+double normal_share(double z) {
+    constexpr double least = -8.5, most = 8.5;  // standard deviations beyond which less than 1e-17 lies
+    return z > most ? 1.0 : z < least ? 0.0 : 0.5 * std::erfc(-z / std::sqrt(2.0));
+}
+
+void mixture_above(const Read<N>& weights, const Read<N, N>& means, const Read<N, N>& scales, const Bounds& columns,
+                   const Read<N>& places, const Filled<N>& above) {
+    const size_t parts = means.shape(0), width = means.shape(1), count = columns.size();
+    require(weights.size() == parts && scales.shape(0) == parts && scales.shape(1) == width,
+            "weights are (F,), means and scales (F, N)");
+    require(places.size() == count && above.size() == count, "columns, places and above are (K,)");
+    const int64_t *at = columns.data(), *last = at + count;
+    require(std::all_of(at, last, [&](int64_t i) { return i >= 0 && i < static_cast<int64_t>(width); }),
+            "columns: numbers of means");
+    unlocked([&] {
+        std::fill_n(above.data(), count, 0.0);
+        for (size_t part = 0; part < parts; ++part) {
+            const double *mean = means.data() + part * width, *scale = scales.data() + part * width;
+            for (size_t k = 0; k < count; ++k)
+                above.data()[k] += weights.data()[part] * normal_share((mean[at[k]] - places.data()[k]) * scale[at[k]]);
+        }
+    });
+}
+
 bool block(Tuple optics, Tuple unknowns, Tuple points, Tuple curves, Tuple loss, Tuple at, const Filled<N>& residuals,
            Tuple jacobians) {
     Seen seen(0, 1, optics, unknowns, points, curves, loss);
@@ -304,6 +328,7 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("cholesky", &factor);
     m.def("loss_weights", &loss_weights);
     m.def("normal_cdf", &normal_cdf);
+    m.def("mixture_above", &mixture_above);
     m.def("evaluate_block", &block);
     m.def("eliminate_placements", &eliminate_placements);
     m.def("sight_normals", &sight_normals);
