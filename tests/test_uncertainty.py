@@ -111,6 +111,9 @@ def test_straight_down_is_an_exact_null_direction() -> None:
     assert known.weak_directions[0].relative == np.inf
     assert known.weak_directions[0].words.startswith("phi of 'overhead' and its height trade off: only their ratio")
     floor, robots = known.map_sd_mm(), known.map_sd_mm(height_m=0.15)
+    assert (
+        known.map_sd_mm() is floor and known.map_sd_mm(x_m=floor.x_m) is not floor and known.map_px() is known.map_px()
+    )
     assert 0.5 < floor.mean_mm < 1.2 and floor.worst_mm < 2.5  # 0.93 and 1.7 mm measured
     middle = np.abs(robots.x_m) < 0.1, np.abs(robots.y_m) < 0.1
     assert np.isinf(robots.worst_mm) and np.isinf(robots.sd_mm[~middle[1]][:, ~middle[0]]).all()

@@ -6,8 +6,9 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,7 @@ from ceres_cal.scene.targets import Target
 if TYPE_CHECKING:
     from ceres_cal.posterior.seam import RigPair
 
+T = TypeVar("T")
 KNOWN, WEAK = 0.01, 0.3
 """Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
 degrees), up to the second it is weak, beyond it, or with a bound that is open, unknown."""
@@ -277,7 +279,8 @@ class Uncertainty(Frozen):
             InputError: no such station, none named where there are several, or it was held as the world.
         """
         name = self.estimate.station_name(station)
-        return field_map(self.estimate, self.posterior, name, self._grid(height_m, x_m, y_m))
+        make = partial(field_map, self.estimate, self.posterior, name, self._grid(height_m, x_m, y_m))
+        return self._kept(make, (name, height_m)) if x_m is None and y_m is None else make()
 
     def map_px(self, camera: str | None = None) -> ImageMap:
         """How well a camera knows its image, px, whatever its pose.
@@ -289,7 +292,18 @@ class Uncertainty(Frozen):
             (camera, *others) = self.estimate.cameras
             if others:
                 raise InputError(f"which camera? One of {', '.join(self.estimate.cameras)}")
-        return image_map(self.estimate, self.posterior, camera)
+        return self._kept(partial(image_map, self.estimate, self.posterior, camera), camera)
+
+    def _kept(self, make: Callable[[], T], of: Hashable) -> T:
+        """A map as it was made first: along a valley it takes a second, and three chapters of a report read it."""
+        if of not in self._maps:
+            self._maps[of] = make()
+        kept: T = self._maps[of]
+        return kept
+
+    @cached_property
+    def _maps(self) -> dict[Hashable, Any]:
+        return {}
 
     def seam_sd_mm(
         self, first: str, second: str, height_m: float = 0.0, x_m: ArrayLike | None = None, y_m: ArrayLike | None = None
