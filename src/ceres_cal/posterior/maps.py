@@ -376,14 +376,14 @@ def _of_components(
         return moved(estimate, mixture.keys, step) if np.any(step) else estimate
 
     for component, number in enumerate(mixture.at.tolist()):
-        like_lens = np.isfinite(off[as_lenses[component][0]]).all(axis=1) if component in as_lenses else False
-        if not np.all(like_lens):
-            with suppress(InputError):  # reads: "unknown" at these places of the map
-                values[component] = shown.values(there(component)) - here
+        like_lens = np.isfinite(off[as_lenses[component][0]]).all() if component in as_lenses else False
+        if like_lens and number in known:
+            continue
+        near = estimate
+        with suppress(InputError):  # reads: "unknown" at these places of the map
+            near = there(component)
+            values[component] = shown.values(near) - here
         if number not in known:
-            near = estimate
-            with suppress(InputError):  # reads: "unknown" at these places of the map
-                near = there(component)
             far = width if mixture.is_followed else 0.0
             known[number] = _covariance(mixture.information[number], near, shown, far)
     for component, (lens, alike) in as_lenses.items():
