@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from scenery import board_scene, field_scene, overhead_pose
 
 from ceres_cal.base.arrays import Array, grid_places
 from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.frozen import replace
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration, LensChoice, calibrating, solving
@@ -43,9 +43,9 @@ from ceres_cal.effects.linearised import Linearised, equation_weights, make_line
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.posterior.maps import Picture
-from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses, _shown
+from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
 from ceres_cal.problem.bundle import Solution, solve
-from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.information import Information, Key, over
 from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import values_of
@@ -152,20 +152,16 @@ def test_all_that_a_longer_lens_leaves_open_is_in_its_directions() -> None:
     """At the floor and above it, where it was observed and in the picture's corners."""
     among, other = _longer_straight_from_above()
     lenses = OtherLenses(among.there, (), (), among.chosen.of.reach_px)
-    chosen, longer = (one.spread(Information.nothing()) for one in (among.chosen, other))
+    chosen, longer = (one.spread(Information.nothing(), lenses) for one in (among.chosen, other))
     assert chosen is not None and longer is not None
-    found = longer.beyond(chosen, lenses, 1.0)
+    found = longer.beyond(chosen, 1.0)
     assert 1 <= len(found) <= 6  # 5
-    for pixels in (lenses.pixels, lenses.farther):
-        each = _shown(longer.keys, lenses.near, pixels)
-        for (_, one), by_chosen, own in zip(
-            each, chosen._shown(lenses, pixels), longer._shown(lenses, pixels), strict=True
-        ):
-            known = np.isfinite(own).all(axis=1) & np.isfinite(by_chosen).all(axis=1)
-            steps = [one.slopes(longer.there, way.keys).reshape(len(own), -1) @ way.step for way in found]
-            whole, squares = (float(np.sum(shown[known] ** 2)) for shown in (own, by_chosen))
-            covered = squares + float(np.sum(np.array(steps)[:, known] ** 2))
-            assert 0.6 * whole < covered < 1.1 * whole + squares
+    steps = np.column_stack([over(way.step, way.keys, longer.keys) for way in found])
+    by_steps = replace(longer, root=steps).shown
+    for by_chosen, own, covered in zip(chosen.shown, longer.shown, by_steps, strict=True):
+        known = np.isfinite(own).all(axis=1) & np.isfinite(by_chosen).all(axis=1)
+        whole, squares, along = (float(np.sum(shown[known] ** 2)) for shown in (own, by_chosen, covered))
+        assert 0.6 * whole < squares + along < 1.1 * whole + squares
 
 
 @pytest.mark.parametrize("mix", ["boards", "lines-arcs", "field-boards"])

@@ -126,18 +126,18 @@ class Comparison(Frozen):
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
-        told = self._possible
+        told = self._possible(least_probability)
         likely = dict(zip(told, _probabilities(told), strict=True))
         longer = [one for one in told if one.extends(self.chosen, self.as_good)]
         asked = [one for one in told if one is not self.chosen and (one in longer or likely[one] >= least_probability)]
         each = list[tuple[Candidate, float, Sequence[OpenDirection]]]()
-        own = self.chosen.spread(posterior.stated)
+        own = self.chosen.spread(posterior.stated, found)
         if self.chosen.form.blank.roughness or not asked or own is None:
             return found
         for one in asked:
-            spread, weight = one.spread(posterior.stated), likely[one]
+            spread, weight = one.spread(posterior.stated, found), likely[one]
             as_long = max(weight, likely[self.chosen]) if one in longer else weight  # no data say that it is shorter
-            is_open = () if spread is None else spread.beyond(own, found, as_long)
+            is_open = () if spread is None else spread.beyond(own, as_long)
             weight = as_long if is_open else weight
             if weight >= least_probability and not one.fault:
                 each.append((one, weight, is_open))
@@ -166,13 +166,14 @@ class Comparison(Frozen):
         share = max(self.share, least_share) / max(left, least_probability)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
-    @property
-    def _possible(self) -> list[Candidate]:
-        """The lenses with a formula, without those that another of them refutes: what no choice may take is no
-        alternative to what was chosen.
+    def _possible(self, least: float) -> list[Candidate]:
+        """The lenses with a formula, without those that another of them refutes, where they are as probable as that:
+        what no choice may take is no alternative to what was chosen.
         """
         told = [one for one in self.tried if not one.form.blank.roughness]
-        return [one for i, one in enumerate(told) if one is self.chosen or not _is_refuted(told, i)]
+        likely = _probabilities(told)
+        asked = [p >= least and one is not self.chosen for one, p in zip(told, likely, strict=True)]
+        return [one for i, one in enumerate(told) if not (asked[i] and _is_refuted(told, i))]
 
     @staticmethod
     def _ends(

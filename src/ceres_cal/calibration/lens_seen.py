@@ -15,7 +15,7 @@ from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
-from ceres_cal.posterior.other_lenses import LensSpread
+from ceres_cal.posterior.other_lenses import LensSpread, OtherLenses
 from ceres_cal.problem import (
     Estimate,
     Information,
@@ -140,6 +140,8 @@ class Candidate(Frozen):
         if more <= 0 or self.squares is None:
             return False
         left, known = other.least - self.least, len(self.squares) + _UNSEEN_GROUPS
+        if left <= more * self.of.noise:  # of noise alone every other one leaves as much, which takes no tail
+            return False
         # Seldom does it leave more than the noise alone explains, which takes less to know.
         by_noise = upper_tail(left / self.of.noise, more, known) < _REFUTED
         return by_noise and upper_tail(left / self.of.scatter, more, known) < _REFUTED
@@ -181,17 +183,17 @@ class Candidate(Frozen):
             cameras[name] = replace(camera, lens=lens)
         return replace(there, cameras=cameras)
 
-    def spread(self, stated: Information) -> LensSpread | None:
+    def spread(self, stated: Information, lenses: OtherLenses) -> LensSpread | None:
         """How all numbers vary with it; None where it gives no answer.
 
         Args:
-            stated: what is known besides.
+            stated: what is known besides. lenses: with the pixels that are asked.
         """
         if self.of.normals is None:
             return None
         keys = self.of.normals.keys
         besides = stated.marginal(stated.among(keys)).over(keys).matrix
-        return LensSpread(self.of.estimate, keys, self.of.normals.root(self.of.to_nothing(self.form), besides))
+        return LensSpread(self.of.estimate, keys, self.of.normals.root(self.of.to_nothing(self.form), besides), lenses)
 
     @property
     def is_near(self) -> bool:

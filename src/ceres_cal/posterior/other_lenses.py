@@ -61,11 +61,6 @@ class OtherLenses(Frozen):
         """Camera -> (N, 2) of a grid over its image, as far as it was observed."""
         return {name: _places_of(self.near.cameras[name], reach_px) for name, reach_px in self.reach_px.items()}
 
-    @property
-    def farther(self) -> dict[str, Array]:
-        """Camera -> (N, 2) of the same grid, farther out."""
-        return {name: _places_of(self.near.cameras[name], np.inf, reach_px) for name, reach_px in self.reach_px.items()}
-
 
 class OpenDirection(NamedTuple):
     """How numbers (K) vary with one of a camera's, by a standard deviation of that."""
@@ -80,13 +75,15 @@ class LensSpread(Frozen):
 
     Attributes:
         there: with it. keys: (K) the numbers. root: (K, R) a root of their covariance.
+        lenses: with the pixels that are asked, and none besides yet.
     """
 
     there: Estimate
     keys: tuple[Key, ...]
     root: Array
+    lenses: OtherLenses
 
-    def beyond(self, chosen: LensSpread, lenses: OtherLenses, probability: float) -> Sequence[OpenDirection]:
+    def beyond(self, chosen: LensSpread, probability: float) -> Sequence[OpenDirection]:
         """What this lens leaves open and the chosen one does not, along one number of a camera after the other, as far
         as it makes a difference to what pixels show at a height, where they were observed or farther out.
 
@@ -95,12 +92,12 @@ class LensSpread(Frozen):
         two knew a place to 10 mm, 60 off, and four, which predicted better, to 36.
 
         Args:
-            lenses: none yet, with the pixels that are asked. probability: of this lens.
+            probability: of this lens.
         """
         least = 0.25  # of all variance by the chosen lens, for a direction to be worth two more components
         columns = [i for i, key in enumerate(self.keys) if key.kind == "camera" and np.any(self.root[i])]
         found, root, tiny = list[OpenDirection](), self.root, np.finfo(float).tiny
-        of_chosen, own = self._shown_beside(chosen, lenses)
+        of_chosen, own = self._shown_beside(chosen)
         while columns and len(found) < len(columns):
             axes = root[columns].T / np.maximum(np.linalg.norm(root[columns], axis=1), tiny)
             seen = own @ axes
@@ -115,23 +112,30 @@ class LensSpread(Frozen):
             root, own = root @ left, own @ left
         return found
 
-    def _shown_beside(self, chosen: LensSpread, lenses: OtherLenses) -> tuple[Array, Array]:
+    def _shown_beside(self, chosen: LensSpread) -> tuple[Array, Array]:
         """(N, R), (N, Q) how what pixels show varies with the chosen lens and with this one, each height and part of
         the picture over all that it varies with the chosen one.
         """
         each = [(np.empty((0, chosen.root.shape[1])), np.empty((0, self.root.shape[1])))]
-        for pixels in (lenses.pixels, lenses.farther):
-            for of_chosen, own in zip(chosen._shown(lenses, pixels), self._shown(lenses, pixels), strict=True):
-                known = np.isfinite(of_chosen).all(axis=1) & np.isfinite(own).all(axis=1)
-                size = np.linalg.norm(of_chosen[known])
-                if size > 0.0:
-                    each.append((of_chosen[known] / size, own[known] / size))
+        for of_chosen, own in zip(chosen.shown, self.shown, strict=True):
+            known = np.isfinite(of_chosen).all(axis=1) & np.isfinite(own).all(axis=1)
+            size = np.linalg.norm(of_chosen[known])
+            if size > 0.0:
+                each.append((of_chosen[known] / size, own[known] / size))
         of_chosen, own = (np.concatenate(part) for part in zip(*each, strict=True))
         return of_chosen, own
 
-    def _shown(self, lenses: OtherLenses, pixels: Mapping[str, Array]) -> Iterator[Array]:
-        for _, one in _shown(self.keys, lenses.near, pixels):
-            yield one.slopes(self.there, self.keys).reshape(-1, len(self.keys)) @ self.root
+    @cached_property
+    def shown(self) -> Sequence[Array]:
+        """(N, R) how what pixels show varies, at each height where they were observed, and farther out."""
+        near, found = self.lenses.near, list[Array]()
+        for name, reach_px in self.lenses.reach_px.items():
+            places = _places_of(near.cameras[name])
+            is_within = np.repeat(_distance_px(near.cameras[name], places) <= reach_px, 2)
+            for _, one in _shown(self.keys, near, {name: places}):
+                shown = one.slopes(self.there, self.keys).reshape(-1, len(self.keys)) @ self.root
+                found += [shown[is_within], shown[~is_within]]
+        return found
 
     def _along(self, along: Key, step: Array) -> OpenDirection:
         """The direction, no farther than to half of phi and half as much again."""
@@ -170,14 +174,15 @@ def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate)
     )
 
 
-def _places_of(camera: Camera, reach_px: float = np.inf, from_px: float = -1.0) -> Array:
-    """(N, 2) px of a grid over a camera's image, farther from its principal point than one and no farther than the
-    other.
-    """
+def _places_of(camera: Camera, reach_px: float = np.inf) -> Array:
+    """(N, 2) px of a grid over a camera's image, so far from its principal point."""
     x, y = (np.linspace(0.0, side - 1.0, _PLACES) for side in camera.image_size)
     places = grid_places(x, y)
-    radius = np.linalg.norm(places - camera.principal_point, axis=1)
-    return np.asarray(places[(radius > from_px) & (radius <= reach_px)])
+    return np.asarray(places[_distance_px(camera, places) <= reach_px])
+
+
+def _distance_px(camera: Camera, places: Array) -> Array:
+    return np.asarray(np.linalg.norm(places - camera.principal_point, axis=1))
 
 
 def counted(weights: Sequence[float]) -> Array:
