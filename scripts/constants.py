@@ -128,7 +128,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.uncertainty", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
     *_of("posterior.assess", "_MOST_DOUBT", "verdicts"),
     *_of("posterior.other_lenses", "_PARTS", "verdicts"),
-    *_of("posterior.maps", "_LARGER", "verdicts"),
+    *_of("posterior.mixture", "_LARGER", "verdicts"),
     *_of("posterior.mixture", "_FLAT", "verdicts"),
     *_of("posterior.uncertainty", "_LEARNT", "verdicts"),
     *_of("posterior.bent", "BENDING", "verdicts"),

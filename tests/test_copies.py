@@ -55,7 +55,7 @@ def test_one_file_given_twice_counts_once() -> None:
     twice = calibrate(combine([seen(), seen()]), RADIAL)
     assert_same(twice, calibrated())
     assert twice.remarks == (
-        "936 observations of frame '0001', '0002', 'board_01', ... are there more than once: counted once",
+        "936 observations of frame '0001', '0002', 'board_01' and 5 more are there more than once: counted once",
         *calibrated().remarks,
     )
     assert len(twice.rejected) == 936 + len(calibrated().rejected)
