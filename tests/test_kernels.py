@@ -911,10 +911,10 @@ def test_how_much_of_a_mixture_lies_above() -> None:
     columns = np.array([4, 0, 19, 19, 7])
     places = rng.normal(0.0, 4.0, 5)
     expected = weights @ kernels.normal_cdf((means[:, columns] - places) * scales[:, columns])
-    found = kernels.mixture_above(weights, means, scales, columns, places)
+    found = kernels.mixture_above(weights, means, scales, places, columns)
     assert found == pytest.approx(expected, abs=1e-15)
     for wrong in ([20], [-1]):
         with pytest.raises(ValueError, match="columns"):
-            kernels.mixture_above(weights, means, scales, np.array(wrong), places[:1])
+            kernels.mixture_above(weights, means, scales, places[:1], np.array(wrong))
     with pytest.raises(ValueError, match="weights"):
-        kernels.mixture_above(weights[:3], means, scales, columns, places)
+        kernels.mixture_above(weights[:3], means, scales, places, columns)

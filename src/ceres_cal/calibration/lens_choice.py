@@ -131,13 +131,13 @@ class Comparison(Frozen):
         longer = [one for one in told if one.extends(self.chosen, self.as_good)]
         asked = [one for one in told if one is not self.chosen and (one in longer or likely[one] >= least_probability)]
         each = list[tuple[Candidate, float, Sequence[OpenDirection]]]()
-        own = self.chosen.spread(posterior.stated, found)
-        if self.chosen.form.blank.roughness or not asked or own is None:
+        if self.chosen.form.blank.roughness or not asked:
             return found
+        own = self.chosen.spread(posterior.stated, found)
         for one in asked:
             spread, weight = one.spread(posterior.stated, found), likely[one]
             as_long = max(weight, likely[self.chosen]) if one in longer else weight  # no data say that it is shorter
-            is_open = () if spread is None else spread.beyond(own, as_long)
+            is_open = () if spread is None or own is None else spread.beyond(own, as_long)
             weight = as_long if is_open else weight
             if weight >= least_probability and not one.fault:
                 each.append((one, weight, is_open))

@@ -242,12 +242,12 @@ def normal_cdf(x: ArrayLike) -> Array:
     return shares
 
 
-def mixture_above(weights: Array, means: Array, scales: Array, columns: Indices, places: Array) -> Array:
+def mixture_above(weights: Array, means: Array, scales: Array, places: Array, columns: Indices) -> Array:
     """(K,) how much of mixtures of normal distributions lies above a place each.
 
     Args:
         weights: (F,). means, scales: (F, N) of each component of N mixtures, scales one over its standard deviation.
-        columns: (K,) which mixtures. places: (K,) a place of each.
+        places: (K,) a place of each. columns: (K,) which mixtures.
     """
     above = np.empty(len(columns))
     core().mixture_above(weights, means, scales, columns, places, above)

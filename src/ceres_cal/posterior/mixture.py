@@ -311,13 +311,8 @@ def _quantile(weights: Array, means: Array, sds: Array, half_width: float) -> Ar
     low = np.where(beyond, 0.0, np.min(np.where(finite, means - _REACH * sds, np.inf), axis=0))
     high = np.where(beyond, 0.0, np.max(np.where(finite, means + _REACH * sds, -np.inf), axis=0))
     scales = 1.0 / np.maximum(sds, np.finfo(float).tiny).reshape(len(weights), -1)
-    above = partial(_above, weights, means.reshape(len(weights), -1), scales)
+    above = partial(mixture_above, weights, means.reshape(len(weights), -1), scales)
     return np.where(beyond, np.inf, tail_root(above, low.ravel(), high.ravel(), tail).reshape(low.shape))
-
-
-def _above(weights: Array, means: Array, scales: Array, places: Array, columns: Indices) -> Array:
-    """(K,) how much of mixtures lies above a place each, see `kernels.mixture_above`."""
-    return mixture_above(weights, means, scales, columns, places)
 
 
 def normal_quantile(tail: float) -> float:
@@ -353,7 +348,7 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
     scales = np.where(sized, per_cube / np.sqrt(cubed), 1.0)
 
     def above(radius: Array, columns: Indices) -> Array:
-        return mixture_above(weights, middles, scales, columns, np.cbrt(radius**2))
+        return mixture_above(weights, middles, scales, np.cbrt(radius**2), columns)
 
     # Beside what is lost the rest has to lie nearer than all of it by itself.
     reach = np.where(lost > 0.0, _REACH * np.sqrt(square), each)
