@@ -234,7 +234,7 @@ class Mixture(Frozen):
         """Weights (F,) of places along the valley, its ends first and last; of which nodes (F, N) each is, and by how
         much of them (F, N) the next one differs.
         """
-        fine = 0.125  # standard deviations from one interpolated place to the next
+        fine = 0.25  # standard deviations from one interpolated place to the next; nothing changes from half to double
         roots, log_phi = chain.roots, np.log(self.phi[chain.at])
         counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / fine), 2).astype(int)
         node = np.repeat(np.arange(len(counts)), counts)
@@ -320,9 +320,9 @@ def normal_quantile(tail: float) -> float:
     return float(tail_root(lambda x, _: normal_cdf(-x), np.zeros(1), np.full(1, _REACH), tail)[0])
 
 
-def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) -> Array:
+def radii(weights: Array, means: Array, covariances: Array, tails: Sequence[float] = (0.05,)) -> Iterator[Array]:
     """(N,) radius of the circle about the estimate beyond which so much of a mixture lies, of means (F, N, 2) and
-    covariances (F, N, 2, 2).
+    covariances (F, N, 2, 2); for each of the tails.
 
     The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
     """
@@ -332,28 +332,29 @@ def radii(weights: Array, means: Array, covariances: Array, tail: float = 0.05) 
         variance = 2.0 * np.sum(finite**2, axis=(-2, -1)) + 4.0 * np.einsum("fni,fnij,fnj->fn", means, finite, means)
         cubed = variance / (9.0 * square**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
     sized = np.isfinite(square) & np.isfinite(variance) & (square > 0.0)
-    exact = square == 0.0
+    unsized = np.where(square == 0.0, 0.0, np.inf)
     square, cubed = np.where(sized, square, 1.0), np.where(sized, np.maximum(cubed, 1e-30), 1e-30)
-    away = NORMAL_95_ONE_SIDED if tail == 0.05 else normal_quantile(tail)
-    each = np.sqrt(square * (1.0 - cubed + away * np.sqrt(cubed)) ** 3)
-    each = np.where(sized, each, np.where(exact, 0.0, np.inf))
-    if len(weights) == 1:
-        return np.asarray(each[0])
-    lost = np.tensordot(weights, np.isinf(each).astype(float), axes=1)
-    nowhere = lost > tail
+    lost = np.tensordot(weights, (~sized & (unsized > 0.0)).astype(float), axes=1)
 
     # The cube root of a squared length is normal; what has no size lies within any circle, what is lost beyond it.
-    per_cube = np.cbrt(1.0 / square)
-    middles = np.where(sized, (1.0 - cubed) / per_cube, np.where(exact, -np.inf, np.inf))
-    scales = np.where(sized, per_cube / np.sqrt(cubed), 1.0)
+    cube, spread = np.cbrt(square), np.sqrt(cubed)
+    middles = np.where(sized, (1.0 - cubed) * cube, np.where(unsized > 0.0, np.inf, -np.inf))
+    scales = np.where(sized, 1.0 / (cube * spread), 1.0)
 
     def above(radius: Array, columns: Indices) -> Array:
         return mixture_above(weights, middles, scales, np.cbrt(radius**2), columns)
 
-    # Beside what is lost the rest has to lie nearer than all of it by itself.
-    reach = np.where(lost > 0.0, _REACH * np.sqrt(square), each)
-    largest = np.max(np.where(np.isfinite(each) & ~nowhere, reach, 0.0), axis=0)
-    return np.asarray(np.where(nowhere, np.inf, tail_root(above, np.zeros_like(largest), largest, tail)))
+    for tail in tails:
+        away = NORMAL_95_ONE_SIDED if tail == 0.05 else normal_quantile(tail)
+        each = np.where(sized, np.sqrt(square * (1.0 - cubed + away * spread) ** 3), unsized)
+        if len(weights) == 1:
+            yield each[0]
+            continue
+        nowhere = lost > tail
+        # Beside what is lost the rest has to lie nearer than all of it by itself.
+        reach = np.where(lost > 0.0, _REACH * np.sqrt(square), each)
+        largest = np.max(np.where(np.isfinite(each) & ~nowhere, reach, 0.0), axis=0)
+        yield np.where(nowhere, np.inf, tail_root(above, np.zeros_like(largest), largest, tail))
 
 
 _LARGER = 0.5  # share of the radius at FARTHER that counts, where a valley widens out there
@@ -401,11 +402,12 @@ class Reading(Frozen):
     @cached_property
     def radius_95(self) -> Array:
         """(N,) 95 % of the errors are shorter."""
-        radius = radii(self.weights, self.means, self.known) * self.width / NORMAL_95
-        if self.is_followed:
-            tail = 2.0 * float(normal_cdf(-FARTHER))
-            far = _LARGER * radii(self.weights, self.means, self.known, tail)  # of what is normal, 0.7 of the radius
-            radius = np.maximum(radius, np.where(np.isfinite(far), far, 0.0))  # 5 % of a valley may show nothing
+        far = 2.0 * float(normal_cdf(-FARTHER))
+        tails = (0.05, far) if self.is_followed else (0.05,)
+        near, *farther = radii(self.weights, self.means, self.known, tails)
+        radius = near * self.width / NORMAL_95
+        for one in farther:  # of what is normal, _LARGER of it is 0.7 of the radius; 5 % of a valley may show nothing
+            radius = np.maximum(radius, np.where(np.isfinite(one), _LARGER * one, 0.0))
         return np.where(self._is_open, np.inf, radius)
 
     @cached_property

@@ -215,8 +215,9 @@ def poles(search: CandidateSearch) -> Iterator[Measurement]:
 
     Where phi is followed along its profile, that is wherever the camera may be by it, if not hardly over the pole.
     """
-    grid_m = 0.5  # between two places that a pole is tried at
+    most, step_m = 12, 0.5  # places along the longer side, on full steps
     camera, grid = search.camera, search.outlook.today
+    grid_m = step_m * np.ceil(max(np.ptp(grid.x_m), np.ptp(grid.y_m)) / (most * step_m))
     top = min(POLE_M, float(np.floor(4.0 * camera.position[2]) / 10.0))  # a short one under a low camera
     elsewhere = [estimate.camera_at(search.station) for _, estimate in search.outlook.possible]
     cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]

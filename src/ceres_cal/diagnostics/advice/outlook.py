@@ -129,6 +129,11 @@ class Outlook(Frozen):
         some = within[evenly(len(within), nodes)]
         return tuple((int(node), moved(self.estimate, keys, steps[node])) for node in some)
 
+    @cached_property
+    def _possible_slopes(self) -> tuple[Array, ...]:
+        """Like `slopes`, where each of these is true."""
+        return tuple(_slopes(there, self.today, self.keys) for _, there in self.possible)
+
     def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
         """phi (px), its relative standard deviation and the errors if that is what it is and the information there is
         added, over what phi may be by its 95 % bounds.
@@ -142,7 +147,7 @@ class Outlook(Frozen):
         phi, steps = valley.phi[at], valley.steps[at]
         tangents = np.gradient(steps[:, 1:], steps[:, 0], axis=0)
         bend = max(float(np.polyfit(np.log(phi), roots**2, 2)[0]), 0.0) if len(phi) > 2 else 0.0
-        for node, there in self.possible:
+        for (node, there), slopes in zip(self.possible, self._possible_slopes, strict=True):
             added = information_at(there).given(valley.keys)
             if not np.any(added.matrix):
                 yield float(phi[node]), np.inf, Errors(np.inf, np.inf)
@@ -153,8 +158,7 @@ class Outlook(Frozen):
             matrix = np.block([[np.atleast_2d(of_phi), coupling[None]], [coupling[:, None], across]])
             whole = Information(valley.keys, matrix) + added
             known = _part(whole.spread, whole.columns(self.keys))
-            errors = _errors(known, _slopes(there, self.today, self.keys))
-            yield float(phi[node]), self._phi_sd(there, known), errors
+            yield float(phi[node]), self._phi_sd(there, known), _errors(known, slopes)
 
 
 def _part(known: Spread, at: Indices) -> Spread:

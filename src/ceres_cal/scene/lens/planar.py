@@ -138,21 +138,21 @@ def inverted(profile: Profile, target: Array, mapped: Callable[[Array], Array] |
 def _newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit: float) -> Array:
     """Points (N, 2) whose image is `target`, from `flat`; NaN where Newton's method does not get there."""
     longest = 0.1  # step of Newton's method, of the limit
-    rows = np.arange(len(flat))
+    exact, rounding = 1e-12, 1e-15  # errors that will do, and that nothing makes smaller
+    rows, error, size = np.arange(len(flat)), np.full(len(flat), np.inf), 1.0 + np.max(np.abs(target), axis=1)
     for _ in range(STEPS):
         (x, xx, xy), (y, yx, yy) = mapped(flat[rows])
         x, y = x - target[rows, 0], y - target[rows, 1]
+        error[rows] = np.maximum(np.abs(x), np.abs(y)) / size[rows]
         step = np.column_stack([yy * x - xy * y, xx * y - yx * x]) / (xx * yy - xy * yx)[:, None]
         # At the limit the map hardly grows, and a whole step would end behind others that lead past it.
-        length = np.linalg.norm(step, axis=1)
+        length = np.hypot(step[:, 0], step[:, 1])
         step *= np.minimum(1.0, longest * limit / np.maximum(length, 1e-300))[:, None]
         flat[rows] -= step
-        rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
+        rows = rows[(length > 1e-13) & (error[rows] > rounding)]
         if not len(rows):
             break
-    error = np.max(np.abs(mapped(flat)[:, 0].T - target), axis=1)
-    solved = error <= 1e-12 * (1.0 + np.max(np.abs(target), axis=1))
-    return np.where(solved[:, None], flat, np.nan)
+    return np.where((error <= exact)[:, None], flat, np.nan)
 
 
 def dense_polynomial(values: Sequence[float], powers: Sequence[int]) -> Array:
