@@ -19,7 +19,7 @@ from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
-from ceres_cal.effects.groups import _averaged, _expected
+from ceres_cal.effects.groups import GroupScatter, _averaged, _expected
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.strands import Strand, StrandFamily, _shown, decay, decays, distances_of
 from ceres_cal.moves.refits import refit
@@ -402,3 +402,14 @@ def test_rounding_widens_nothing_that_priors_alone_know() -> None:
     seen = Information((Key("camera", "one", "phi", "px"), Key("camera", "one", "cx", "px")), np.diag([1.0, 3e-10]))
     rounded = Scatter(np.eye(2), np.eye(2) - np.diag([0.0, 2.9e-10]), Dependence())
     np.testing.assert_allclose(rounded.widened(seen).matrix, seen.matrix, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("variance", "probability", "widens"), [(4.0, 0.9, True), (0.2, 0.9, False), (4.0, 0.1, False)]
+)
+def test_what_takes_width_back_is_no_reason_for_it(variance: float, probability: float, widens: bool) -> None:
+    """Views that scatter less than what is within them says are likely, and no cause of a larger deviation."""
+    between = GroupScatter(12, variance, probability, 10.0)
+    dependence = Dependence(between=between)
+    assert dependence.is_likely == (probability > 0.5)
+    assert bool(dependence.causes) == widens

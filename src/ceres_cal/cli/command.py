@@ -197,11 +197,11 @@ def _number(text: str) -> float:
 
 def whole(least: float = -float("inf"), most: float = float("inf")) -> Callable[[str], int]:
     """The type of an argument that is a whole number, in a range where that is given."""
-    range_words = f" from {least} {'on' if most > 1e9 else f'to {most}'}" if abs(least) < 1e9 else ""
+    range_words = (f" of {least} or more" if most > 1e9 else f" from {least} to {most}") if abs(least) < 1e9 else ""
 
     def parse(text: str) -> int:
         if not re.fullmatch(r"-?\d+", text) or not least <= int(text) <= most:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number{range_words}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number{range_words}")
         return int(text)
 
     return parse

@@ -224,13 +224,18 @@ class Dependence(Frozen, eq=True):
     read_out_px: float = 0.0
 
     @property
+    def is_likely(self) -> bool:
+        """Whether anything goes together, or views scatter by more, or by less, than what is within them says."""
+        return bool(self.causes) or (self.between is not None and self.between.probability > LIKELY)
+
+    @property
     def causes(self) -> tuple[str, ...]:
-        """What is likely, in words."""
+        """What of it is likely and widens, in words."""
         likely = [one for one in self.correlations if one.probability > LIKELY]
         causes = [_OVER[one.kind] + _reach(one) for one in likely]
         if self.read_out_px > 0.0:
             causes.append(f"views move by {two_digits(self.read_out_px)} px while rows are read out (rolling shutter)")
-        if self.between is not None and self.between.probability > LIKELY:
+        if self.between is not None and self.between.probability > LIKELY and self.between.variance > 1.0:
             factor = two_digits(self.between.variance**0.5)
             causes.append(f"views scatter {factor} times as far as what is within them says")
         return tuple(causes)
@@ -301,7 +306,7 @@ def measure_scatter(
         if model is None or not model.root.shape[1]:
             return None
         scatter = _measured(problem, model, reduced, estimate)
-        if not scatter.dependence.causes or len(model.equations) == problem.sights.equations:
+        if not scatter.dependence.is_likely or len(model.equations) == problem.sights.equations:
             break
     return scatter
 

@@ -133,7 +133,7 @@ def _of_board(evidence: Evidence) -> Words:
         if abs(a) > clear * s
     ]
     return evidence.words(
-        f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
+        f"board {name!r} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
         f"along y{''.join(f', {one}' for one in further)}",
         f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
         WARP,
@@ -152,7 +152,7 @@ def _of_stretch(evidence: Evidence) -> Words:
     size_m = float(np.max(np.ptp(evidence.case.problem.observations.targets[name].box, axis=0)))
     longer, sd = (100.0 * float(one[0]) / size_m for one in (evidence.score.amount, evidence.score.sd))
     sides = "x than along y" if longer > 0.0 else "y than along x"
-    sentence = f"board {name} is {abs(longer):.2f} ± {sd:.2f} % longer along {sides}"
+    sentence = f"board {name!r} is {abs(longer):.2f} ± {sd:.2f} % longer along {sides}"
     advice = f"measure both of its sides, print it undistorted, or solve for it: --tolerance {name}.stretch_m=0.002"
     return evidence.words(sentence, advice, ("x over y",), "mm")
 
