@@ -45,7 +45,7 @@ def information(lines: Sightlines, pose: Candidates, scale_px: float) -> Array:
     """(8, 8) what is known of one camera's numbers by rows that fit it, and beforehand; 0 of those that are held."""
     r, derivatives = lines.equations(pose)
     weights = 1.0 / (scale_px**2 * (1.0 + (r[0] / (2.0 * scale_px)) ** 2) ** 2)
-    matrix = (derivatives[0] * weights[:, None]).T @ derivatives[0]
+    matrix = (derivatives[0] * weights) @ derivatives[0].T
     matrix[range(3, 8), range(3, 8)] += lines.known.residuals(pose)[1] ** 2
     free = ~lines.known.held
     return np.asarray(matrix * free[:, None] * free)
@@ -81,10 +81,10 @@ def _step(lines: Sightlines, at: tuple[Array, Array], poses: Candidates, scale: 
     r, derivatives = at
     free = np.flatnonzero(~lines.known.held)
     weights = lines.weight / (scale**2 * (1.0 + (r / (2.0 * scale)) ** 2))
-    jacobian = derivatives[:, :, free]
-    weighted = jacobian * weights[..., None]
-    normal = np.swapaxes(weighted, 1, 2) @ jacobian
-    right = (np.swapaxes(weighted, 1, 2) @ r[..., None])[..., 0]
+    jacobian = derivatives[:, free]
+    weighted = jacobian * weights[:, None]
+    normal = weighted @ np.swapaxes(jacobian, 1, 2)
+    right = (weighted @ r[..., None])[..., 0]
     said, share = lines.known.residuals(poses)
     diagonal, sums = np.zeros(8), np.zeros((len(poses), 8))
     diagonal[3:], sums[:, 3:] = share**2, said * share

@@ -60,17 +60,23 @@ class Beforehand(Frozen):
     bend_sd: float
     least_px: float = LEAST_PX
 
-    @property
+    @cached_property
     def held(self) -> Mask:
         """(8,) numbers that do not move."""
         sd = np.array([np.inf, np.inf, np.inf, *self.position_sd, self.log_phi[1], self.bend_sd])
         return np.asarray(sd == 0.0)
 
+    @cached_property
+    def _share(self) -> Array:
+        """(5,) of a standard deviation for each unit."""
+        sd = np.array([*self.position_sd, self.log_phi[1], self.bend_sd])
+        return np.where(sd > 0.0, 1.0 / np.maximum(sd, 1e-12), 0.0)
+
     def residuals(self, poses: Candidates) -> tuple[Array, Array]:
         """(K, 5) in standard deviations, and the diagonal (5,) of their derivatives."""
-        sd = np.array([*self.position_sd, self.log_phi[1], self.bend_sd])
-        share = np.where(sd > 0.0, 1.0 / np.maximum(sd, 1e-12), 0.0)
-        off = np.column_stack([poses.positions - self.position, poses.log_phi - self.log_phi[0], poses.bend])
+        share, off = self._share, np.empty((len(poses), 5))
+        off[:, :3] = poses.positions - self.position
+        off[:, 3], off[:, 4] = poses.log_phi - self.log_phi[0], poses.bend
         return np.where(share > 0.0, off, 0.0) * share, share
 
 
@@ -137,85 +143,88 @@ class Sightlines(Frozen):
     def _arcs(self) -> slice:
         return slice(2 * self.counts[0] + self.counts[1], None)
 
-    @property
+    @cached_property
     def _squared(self) -> Array:
         return np.asarray(np.sum(self.pixels**2, axis=1) / self.unit_px**2)
 
-    def _rays(self, poses: Candidates) -> Array:
-        """(K, N, 3) L."""
-        rays = np.empty((len(poses), len(self.w), 3))
-        rays[:, :, :2] = self.pixels
-        rays[:, :, 2] = np.exp(poses.log_phi)[:, None] * (self.w + poses.bend[:, None] * self._squared)
+    def _rays(self, log_phi: Array, bend: Array) -> Array:
+        """(K, 3, N) L: numbers of one kind lie side by side, here and below."""
+        rays = np.empty((len(log_phi), 3, len(self.w)))
+        rays[:, :2] = self.pixels.T
+        rays[:, 2] = np.exp(log_phi)[:, None] * (self.w + bend[:, None] * self._squared)
         return rays
+
+    def _to(self, poses: Candidates) -> Array:
+        """(K, 3, N) P - C."""
+        return np.asarray(self.places.T - poses.positions[:, :, None])
 
     def distances(self, poses: Candidates) -> Array:
         """Distances (K, N) px."""
-        d = self._rays(poses) @ np.swapaxes(poses.rotations, 1, 2)  # rows times it are R times columns
-        normals = self._normals(self.places - poses.positions[:, None], self._directions(poses.rotations), d)
-        return np.asarray(np.sum(normals * d, axis=2) * self._shares(poses, normals @ poses.rotations))
+        d = poses.rotations @ self._rays(poses.log_phi, poses.bend)
+        normals = self._normals(self._to(poses), self._directions(poses.rotations), d)
+        return _dot(normals, d) * self._shares(poses, np.swapaxes(poses.rotations, 1, 2) @ normals)
 
     def equations(self, poses: Candidates) -> tuple[Array, Array]:
-        """Distances (K, N) px and their derivatives (K, N, 8) by `Candidates.moved`."""
-        rays = self._rays(poses)
-        d = rays @ np.swapaxes(poses.rotations, 1, 2)
-        to, along = self.places - poses.positions[:, None], self._directions(poses.rotations)
+        """Distances (K, N) px and their derivatives (K, 8, N) by `Candidates.moved`."""
+        rays = self._rays(poses.log_phi, poses.bend)
+        d, to, along = poses.rotations @ rays, self._to(poses), self._directions(poses.rotations)
         normals = self._normals(to, along, d)
-        before = normals @ poses.rotations  # in the camera's frame
-        share, derivatives = self._shares(poses, before), np.empty((*d.shape[:2], 8))
-        derivatives[:, :, :3], derivatives[:, :, 3:6] = self._slopes(to, along, d, normals)
-        derivatives[:, :, 6] = before[:, :, 2] * rays[:, :, 2]
-        derivatives[:, :, 7] = before[:, :, 2] * np.exp(poses.log_phi)[:, None] * self._squared
-        return np.sum(normals * d, axis=2) * share, derivatives * share[:, :, None]
+        before = np.swapaxes(poses.rotations, 1, 2) @ normals  # in the camera's frame
+        share, derivatives = self._shares(poses, before), np.empty((len(d), 8, d.shape[2]))
+        derivatives[:, :3], derivatives[:, 3:6] = self._slopes(to, along, d, normals)
+        derivatives[:, 6] = before[:, 2] * rays[:, 2]
+        derivatives[:, 7] = before[:, 2] * np.exp(poses.log_phi)[:, None] * self._squared
+        return _dot(normals, d) * share, derivatives * share[:, None]
 
     def _shares(self, poses: Candidates, before: Array) -> Array:
         """(K, N) px by which a row is off for each unit of n . d; before: n in the camera's frame."""
         bent = self.slope + 2.0 * poses.bend[:, None] / self.unit_px**2
-        lean = before[:, :, 2] * np.exp(poses.log_phi)[:, None] * bent
-        steep = np.hypot(before[:, :, 0] + lean * self.pixels[:, 0], before[:, :, 1] + lean * self.pixels[:, 1])
-        return np.asarray(1.0 / np.maximum(steep, _LEAST))
+        lean = before[:, 2] * np.exp(poses.log_phi)[:, None] * bent
+        across, down = before[:, 0] + lean * self.pixels[:, 0], before[:, 1] + lean * self.pixels[:, 1]
+        return np.asarray(1.0 / np.maximum(np.sqrt(across**2 + down**2), _LEAST))
 
     def _normals(self, to: Array, along: Array, d: Array) -> Array:
-        """n (K, N, 3)."""
+        """n (K, 3, N)."""
         normals, straight, arcs = np.empty_like(d), slice(0, self._arcs.start), self._arcs
-        normals[:, straight] = _cross(to[:, straight], along[:, straight])
-        unit = self._outwards(to, d)
-        normals[:, arcs, :2] = to[:, arcs, 2:] * unit
-        normals[:, arcs, 2] = -np.sum(unit * to[:, arcs, :2], axis=2) - np.sign(to[:, arcs, 2]) * self.along[arcs, 0]
+        normals[:, :, straight] = _cross(to[:, :, straight], along[:, :, straight])
+        if self.counts[2]:
+            unit = self._outwards(to, d)
+            normals[:, :2, arcs] = to[:, 2:, arcs] * unit
+            normals[:, 2, arcs] = -_dot(unit, to[:, :2, arcs]) - np.sign(to[:, 2, arcs]) * self.along[arcs, 0]
         return normals
 
     def _outwards(self, to: Array, d: Array) -> Array:
-        """(K, A, 2) from an arc's middle to where the ray meets its plane, of unit length."""
-        to, e = to[:, self._arcs], d[:, self._arcs]
-        away = to[:, :, 2:] * e[:, :, :2] - to[:, :, :2] * e[:, :, 2:]  # times d_z
-        return np.asarray(away / np.maximum(np.linalg.norm(away, axis=2), _LEAST)[..., None])
+        """(K, 2, A) from an arc's middle to where the ray meets its plane, of unit length."""
+        to, e = to[:, :, self._arcs], d[:, :, self._arcs]
+        away = to[:, 2:] * e[:, :2] - to[:, :2] * e[:, 2:]  # times d_z
+        return np.asarray(away / np.maximum(np.sqrt(_dot(away, away)), _LEAST)[:, None])
 
     def _slopes(self, to: Array, along: Array, d: Array, normals: Array) -> tuple[Array, Array]:
-        """(K, N, 3) derivatives of n . d by a turn and by the position."""
+        """(K, 3, N) derivatives of n . d by a turn and by the position."""
         by_position, points, arcs = np.empty_like(d), self._points, self._arcs
         straight = slice(0, arcs.start)
-        by_position[:, straight] = -_cross(along[:, straight], d[:, straight])
+        by_position[:, :, straight] = _cross(d[:, :, straight], along[:, :, straight])
         by_turn = _cross(d, normals)
-        by_turn[:, points] = _cross(to[:, points], by_position[:, points])  # whose directions turn with the camera
-        unit = self._outwards(to, d)
-        by_position[:, arcs, :2] = unit * d[:, arcs, 2:]
-        by_position[:, arcs, 2] = -np.sum(unit * d[:, arcs, :2], axis=2)
+        by_turn[:, :, points] = _cross(to[:, :, points], by_position[:, :, points])  # whose directions turn with it
+        if self.counts[2]:
+            unit = self._outwards(to, d)
+            by_position[:, :2, arcs] = unit * d[:, 2:, arcs]
+            by_position[:, 2, arcs] = -_dot(unit, d[:, :2, arcs])
         return by_turn, by_position
 
     def seen(self, poses: Candidates) -> Mask:
         """(K, N) whether each row's place lies ahead and, on a line, between its ends."""
         beyond = 0.05  # share of a line's length by which a start may see it beyond its ends
-        d = self._rays(poses) @ np.swapaxes(poses.rotations, 1, 2)
-        to = self.places - poses.positions[:, None]
-        good = np.sum(to * d, axis=2) > 0.0
+        d, to = poses.rotations @ self._rays(poses.log_phi, poses.bend), self._to(poses)
+        good = _dot(to, d) > 0.0
         lines, arcs = slice(self._points.stop, self._arcs.start), self._arcs
-        a, e, p = np.broadcast_to(self.along[lines], d[:, lines].shape), d[:, lines], to[:, lines]
+        a, e, p = self.along[lines].T[None], d[:, :, lines], to[:, :, lines]
         # The place P + s a nearest to the ray t d: both ends of the common perpendicular.
-        aa, ee, ae = np.sum(a * a, axis=2), np.sum(e * e, axis=2), np.sum(a * e, axis=2)
-        ap, ep = np.sum(a * p, axis=2), np.sum(e * p, axis=2)
+        aa, ee, ae, ap, ep = _dot(a, a), _dot(e, e), _dot(a, e), _dot(a, p), _dot(e, p)
         det = np.maximum(aa * ee - ae**2, _LEAST)
         s, t = (ae * ep - ee * ap) / det, (aa * ep - ae * ap) / det
         good[:, lines] = (t > 0.0) & (np.abs(s - 0.5) < 0.5 + beyond)
-        good[:, arcs] = to[:, arcs, 2] * d[:, arcs, 2] > 0.0
+        good[:, arcs] = to[:, 2, arcs] * d[:, 2, arcs] > 0.0
         return np.asarray(good)
 
     def positions(self, rotations: Array, log_phi: Array) -> Array:
@@ -223,59 +232,64 @@ class Sightlines(Frozen):
         rays make on a plane one metre below. Where all that leaves it open they stand over the middle of it.
         """
         rounds = 2  # of reweighting against wrong labels
-        rays = np.empty((len(rotations), len(self.w), 3))
-        rays[:, :, :2], rays[:, :, 2] = self.pixels, np.exp(log_phi)[:, None] * self.w
-        d = rays @ np.swapaxes(rotations, 1, 2)
-        d /= np.linalg.norm(d, axis=2, keepdims=True)
+        d = rotations @ self._rays(log_phi, np.zeros(len(log_phi)))
+        d /= np.sqrt(_dot(d, d))[:, None]
         straight = slice(0, self._arcs.start)
-        rows = _cross(self._directions(rotations)[:, straight], d[:, straight])
-        places = np.broadcast_to(self.places[straight], rows.shape)
+        rows = _cross(self._directions(rotations)[:, :, straight], d[:, :, straight])
+        sides = _dot(rows, self.places[straight].T[None])
         for number in distinct(self.curve[self._arcs]):
             own = np.flatnonzero(self.curve == number)
-            where, weight = _over_circle(d[:, own], self.places[own[0]], self.along[own[0], 0])
-            rows = np.concatenate([rows, weight[:, None, None] * np.eye(3)], axis=1)
-            places = np.concatenate([places, np.repeat(where[:, None], 3, axis=1)], axis=1)
-        middle, weights = self.places.mean(axis=0), np.ones(rows.shape[:2])
+            where, weight = _over_circle(d[:, :, own], self.places[own[0]], self.along[own[0], 0])
+            rows = np.concatenate([rows, weight[:, None, None] * np.eye(3)], axis=2)
+            sides = np.concatenate([sides, weight[:, None] * where], axis=1)
+        middle, weights = self.places.mean(axis=0), np.ones(sides.shape)
         for _ in range(rounds):
-            weighted = rows * weights[..., None]
-            matrix = np.swapaxes(weighted, 1, 2) @ rows + _RIDGE * np.eye(3)
-            right = np.einsum("kni,kn->ki", weighted, np.sum(rows * places, axis=2)) + _RIDGE * middle
-            positions = np.linalg.solve(matrix, right[..., None])[..., 0]
-            off = np.sum(rows * (places - positions[:, None]), axis=2)
+            weighted = rows * weights[:, None]
+            matrix = weighted @ np.swapaxes(rows, 1, 2) + _RIDGE * np.eye(3)
+            right = weighted @ sides[..., None] + _RIDGE * middle[:, None]
+            positions = np.linalg.solve(matrix, right)[..., 0]
+            off = sides - (positions[:, None] @ rows)[:, 0]
             usual = np.maximum(medians(np.abs(off))[:, None], _LEAST)
             weights = 1.0 / (1.0 + (off / usual) ** 2)
         return np.asarray(positions)
 
     def _directions(self, rotations: Array) -> Array:
-        """(K, N, 3) a of each row, of unit length but of arcs; those of points are the camera's x and y."""
+        """(K, 3, N) a of each row, of unit length but of arcs; those of points are the camera's x and y."""
         lines = slice(self._points.stop, self._arcs.start)
-        along = self.along.copy()
-        along[lines] /= np.linalg.norm(along[lines], axis=1)[:, None]
-        every = np.broadcast_to(along, (len(rotations), *along.shape)).copy()
-        half = self.counts[0]
-        every[:, :half], every[:, half : 2 * half] = rotations[:, None, :, 0], rotations[:, None, :, 1]
+        along = self.along.T.copy()
+        along[:, lines] /= np.linalg.norm(along[:, lines], axis=0)
+        every, half = np.empty((len(rotations), *along.shape)), self.counts[0]
+        every[:, :, 2 * half :] = along[:, 2 * half :]
+        every[:, :, :half], every[:, :, half : 2 * half] = rotations[:, :, :1], rotations[:, :, 1:2]
         return every
 
 
 def _over_circle(d: Array, centre: Array, radius: float) -> tuple[Array, Array]:
-    """(K, 3) m where cameras stand whose rays d (K, n, 3) show a circle, and a weight (K,), 0 where they do not."""
+    """(K, 3) m where cameras stand whose rays d (K, 3, n) show a circle, and a weight (K,), 0 where they do not."""
     least_down = 0.03  # sine of the angle under the horizon: nearer to it a ray has no place on the floor
-    down = np.maximum(-d[:, :, 2], least_down)
-    u = d[:, :, :2] / down[..., None]
-    rows = np.concatenate([2.0 * u, np.ones((*u.shape[:2], 1))], axis=2)
-    matrix = np.swapaxes(rows, 1, 2) @ rows + _RIDGE * np.eye(3)
-    solved = np.linalg.solve(matrix, np.einsum("kni,kn->ki", rows, np.sum(u**2, axis=2))[..., None])[..., 0]
+    down = np.maximum(-d[:, 2:], least_down)
+    u = d[:, :2] / down
+    rows = np.concatenate([2.0 * u, np.ones_like(down)], axis=1)
+    matrix = rows @ np.swapaxes(rows, 1, 2) + _RIDGE * np.eye(3)
+    solved = np.linalg.solve(matrix, rows @ _dot(u, u)[..., None])[..., 0]
     seen = np.sqrt(np.maximum(solved[:, 2] + np.sum(solved[:, :2] ** 2, axis=1), _RIDGE))  # its radius there
     height = radius / seen
     where = centre - np.column_stack([solved[:, :2] * height[:, None], -height])
-    return where, np.where((d[:, :, 2] < -least_down).all(axis=1), np.sqrt(float(d.shape[1])), 0.0)
+    return where, np.where((d[:, 2] < -least_down).all(axis=1), np.sqrt(float(d.shape[2])), 0.0)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """(K, N) of (K, 3, N), or of as many numbers."""
+    return np.asarray(np.einsum("kin,kin->kn", a, b))
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """As np.cross of the last axis, several times as fast."""
-    x, y, z = a[..., 0], a[..., 1], a[..., 2]
-    u, v, w = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    """As np.cross of the middle axis, several times as fast."""
+    x, y, z = a[:, 0], a[:, 1], a[:, 2]
+    u, v, w = b[:, 0], b[:, 1], b[:, 2]
+    crossed = np.empty(b.shape)
+    crossed[:, 0], crossed[:, 1], crossed[:, 2] = y * w - z * v, z * u - x * w, x * v - y * u
+    return crossed
 
 
 def _turns(vectors: Array) -> Array:
