@@ -152,7 +152,7 @@ def test_all_that_a_longer_lens_leaves_open_is_in_its_directions() -> None:
     """At the floor and above it, where it was observed and in the picture's corners."""
     among, other = _longer_straight_from_above()
     lenses = OtherLenses(among.there, (), (), among.chosen.of.reach_px)
-    chosen, longer = (one.spread(Information.nothing(), lenses) for one in (among.chosen, other))
+    chosen, longer = (one.spread(Information.nothing(), one.of.slopes(lenses)) for one in (among.chosen, other))
     assert chosen is not None and longer is not None
     found = longer.beyond(chosen, 1.0)
     assert 1 <= len(found) <= 6  # 5

@@ -133,9 +133,10 @@ class Comparison(Frozen):
         each = list[tuple[Candidate, float, Sequence[OpenDirection]]]()
         if self.chosen.form.blank.roughness or not asked:
             return found
-        own = self.chosen.spread(posterior.stated, found)
+        slopes = {kind: kind.slopes(found) for kind in {one.of for one in (self.chosen, *asked)}}
+        own = self.chosen.spread(posterior.stated, slopes[self.chosen.of])
         for one in asked:
-            spread, weight = one.spread(posterior.stated, found), likely[one]
+            spread, weight = one.spread(posterior.stated, slopes[one.of]), likely[one]
             as_long = max(weight, likely[self.chosen]) if one in longer else weight  # no data say that it is shorter
             is_open = () if spread is None or own is None else spread.beyond(own, as_long)
             weight = as_long if is_open else weight

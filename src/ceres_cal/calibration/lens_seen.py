@@ -5,7 +5,7 @@ Each kind of lens near its best, and what follows for each of its lenses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ceres_cal.calibration.file import TOO_FEW
 from ceres_cal.calibration.lens_forms import AS_GOOD, PAPER, Form, standard_errors, surprise
 from ceres_cal.effects.groups import GroupNormals, group_normals
 from ceres_cal.observations.sights import Sights
-from ceres_cal.posterior.other_lenses import LensSpread, OtherLenses
+from ceres_cal.posterior.other_lenses import LensSpread, OtherLenses, shown_slopes
 from ceres_cal.problem import (
     Estimate,
     Information,
@@ -78,6 +78,10 @@ class Kind(Frozen):
         rms_px = self.sigma_px * float(np.sqrt(max(squares.sum(), 0.0) / self.normals.counts.sum()))
         least = self.normals.squares_at(step)
         return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step, least)
+
+    def slopes(self, lenses: OtherLenses) -> Sequence[Array]:
+        """How what pixels show moves with its numbers, see `shown_slopes`."""
+        return () if self.normals is None else shown_slopes(self.estimate, self.normals.keys, lenses)
 
     def to_nothing(self, form: Form) -> dict[Key, float]:
         """How far from where they stand the coefficients that one of its lenses does not have are 0."""
@@ -183,17 +187,17 @@ class Candidate(Frozen):
             cameras[name] = replace(camera, lens=lens)
         return replace(there, cameras=cameras)
 
-    def spread(self, stated: Information, lenses: OtherLenses) -> LensSpread | None:
+    def spread(self, stated: Information, slopes: Sequence[Array]) -> LensSpread | None:
         """How all numbers vary with it; None where it gives no answer.
 
         Args:
-            stated: what is known besides. lenses: with the pixels that are asked.
+            stated: what is known besides. slopes: of its kind.
         """
         if self.of.normals is None:
             return None
         keys = self.of.normals.keys
         besides = stated.marginal(stated.among(keys)).over(keys).matrix
-        return LensSpread(self.of.estimate, keys, self.of.normals.root(self.of.to_nothing(self.form), besides), lenses)
+        return LensSpread(self.of.estimate, keys, self.of.normals.root(self.of.to_nothing(self.form), besides), slopes)
 
     @property
     def is_near(self) -> bool:

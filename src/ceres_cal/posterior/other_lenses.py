@@ -74,14 +74,13 @@ class LensSpread(Frozen):
     """How numbers vary with a lens.
 
     Attributes:
-        there: with it. keys: (K) the numbers. root: (K, R) a root of their covariance.
-        lenses: with the pixels that are asked, and none besides yet.
+        there: with it. keys: (K) the numbers. root: (K, R) a root of their covariance. slopes: see `shown_slopes`.
     """
 
     there: Estimate
     keys: tuple[Key, ...]
     root: Array
-    lenses: OtherLenses
+    slopes: Sequence[Array]
 
     def beyond(self, chosen: LensSpread, probability: float) -> Sequence[OpenDirection]:
         """What this lens leaves open and the chosen one does not, along one number of a camera after the other, as far
@@ -125,17 +124,10 @@ class LensSpread(Frozen):
         of_chosen, own = (np.concatenate(part) for part in zip(*each, strict=True))
         return of_chosen, own
 
-    @cached_property
+    @property
     def shown(self) -> Sequence[Array]:
-        """(N, R) how what pixels show varies, at each height where they were observed, and farther out."""
-        near, found = self.lenses.near, list[Array]()
-        for name, reach_px in self.lenses.reach_px.items():
-            places = _places_of(near.cameras[name])
-            is_within = np.repeat(_distance_px(near.cameras[name], places) <= reach_px, 2)
-            for _, one in _shown(self.keys, near, {name: places}):
-                shown = one.slopes(self.there, self.keys).reshape(-1, len(self.keys)) @ self.root
-                found += [shown[is_within], shown[~is_within]]
-        return found
+        """(N, R) of each of the slopes, how what pixels show varies."""
+        return [slopes @ self.root for slopes in self.slopes]
 
     def _along(self, along: Key, step: Array) -> OpenDirection:
         """The direction, no farther than to half of phi and half as much again."""
@@ -144,6 +136,23 @@ class LensSpread(Frozen):
         far = max((abs(float(step[i])) / size for i, size in phi), default=0.0)
         moving = [i for i, value in enumerate(step) if value]
         return OpenDirection(along, tuple(self.keys[i] for i in moving), step[moving] * min(1.0, most / max(far, most)))
+
+
+def shown_slopes(there: Estimate, keys: Sequence[Key], lenses: OtherLenses) -> Sequence[Array]:
+    """(N, K) how what pixels show moves with numbers of an estimate, at each height where they were observed, and
+    farther out: the same for all lenses of a kind.
+
+    Args:
+        lenses: with the pixels that are asked, and none besides yet.
+    """
+    near, found = lenses.near, list[Array]()
+    for name, reach_px in lenses.reach_px.items():
+        places = _places_of(near.cameras[name])
+        is_within = np.repeat(_distance_px(near.cameras[name], places) <= reach_px, 2)
+        for _, one in _shown(keys, near, {name: places}):
+            slopes = one.slopes(there, keys).reshape(-1, len(keys))
+            found += [slopes[is_within], slopes[~is_within]]
+    return found
 
 
 def together(each: Sequence[OtherLenses], floors: Container[str], end: Estimate) -> OtherLenses:
