@@ -90,7 +90,7 @@ def _found(of: type, kw_only: bool) -> Iterator[Field[Any]]:
     for name, kind in get_annotations(of).items():
         if kind.startswith("ClassVar"):
             continue
-        default = getattr(of, name, MISSING)
+        default: Any = getattr(of, name, MISSING)
         one: Any = default if isinstance(default, Field) else field(default=default)
         one.name, one.type, one._field_type = name, kind, _FIELD  # by which the standard library knows a field
         one.kw_only = kw_only if one.kw_only is MISSING else one.kw_only

@@ -30,7 +30,6 @@ from ceres_cal.effects.effect import AsBuilt, EffectEstimate
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.files import PosteriorFile
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.uncertainty import Uncertainty
 from ceres_cal.problem import Estimate, GaussianPrior, Key, Options, every_key, gather_priors, make_layout, redrawn
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.robust.stated import Conflict, agreed
@@ -39,6 +38,7 @@ from ceres_cal.scene import Camera, CameraFile, PoseFile, Target, targets_from_s
 
 if TYPE_CHECKING:
     from ceres_cal.posterior.seam import Disagreement
+    from ceres_cal.posterior.uncertainty import Uncertainty
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
@@ -140,6 +140,8 @@ class Calibration(Frozen):
         """
         if self.posterior is None:
             raise InputError("this calibration does not say how well it is known: calibrate again")
+        from ceres_cal.posterior.uncertainty import Uncertainty
+
         return Uncertainty(self.estimate, self.posterior, self.targets, self.conflicts)
 
     def disagreement(self, observations: Observations, first: str, second: str) -> Disagreement:

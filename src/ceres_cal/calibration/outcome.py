@@ -16,7 +16,6 @@ from ceres_cal.calibration.file import COPY, Fit, Rejected
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.posterior.uncertainty import Uncertainty
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
 from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout
@@ -26,7 +25,6 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.noise import visible_from
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_possible
-from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start
 
 if TYPE_CHECKING:
@@ -82,6 +80,10 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
 
 def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
     """Warnings of cameras whose phi the observations leave open."""
+    if not posterior.followed:
+        return
+    from ceres_cal.posterior.uncertainty import Uncertainty
+
     known = Uncertainty(end.estimate, posterior, {})
     for name in posterior.followed:
         verdict = known.verdict("camera", name, "phi")
@@ -197,6 +199,8 @@ def came_out(
 
 def of_closed_form(start: Start, problem: Problem) -> Calibration:
     """The paper's own method alone: nothing is minimised."""
+    from ceres_cal.start.baseline import four_point_baseline
+
     estimate = four_point_baseline(problem.sights, start.estimate)
     there = residuals(problem.sights, estimate)
     require_possible(problem.sights, estimate, there)

@@ -46,7 +46,6 @@ from ceres_cal.robust.as_built import (
 )
 from ceres_cal.robust.competing import Solver, Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
-from ceres_cal.robust.effects import EffectsEnd, solve_beside_effects
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.unsteady import Unsteady, find_unsteady
@@ -59,6 +58,7 @@ if TYPE_CHECKING:
 
     from ceres_cal.effects.aside import Explanation
     from ceres_cal.robust.bulk import Settled
+    from ceres_cal.robust.effects import EffectsEnd
 
 
 class Task(Frozen):
@@ -342,6 +342,8 @@ def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
     if is_asked:
         end, problem, explanations, as_built = solve_as_built(problem, end, explanations, solved, built, views)
     if is_asked and estimated(problem.observations):
+        from ceres_cal.robust.effects import solve_beside_effects
+
         part, is_all = taking_part(problem, explanations), seen.task.settle is None
         beside = solve_beside_effects(problem, part, end, solves=is_all)
         problem, end = beside.problem, beside.end
