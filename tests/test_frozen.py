@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import FrozenInstanceError, fields
+from typing import ClassVar
 
 import msgspec
 import numpy as np
@@ -17,6 +18,7 @@ from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 class Ring(Frozen):
     """A ring."""
 
+    kind: ClassVar[str] = "ring"
     places: Array
     name: str = "ring"
     notes: list[str] = field(default_factory=list)

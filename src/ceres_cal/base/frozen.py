@@ -88,7 +88,7 @@ def _found(of: type, kw_only: bool) -> Iterator[Field[Any]]:
     four ways what it may be besides a field.
     """
     for name, kind in get_annotations(of).items():
-        if kind.startswith("ClassVar"):
+        if str(kind).removeprefix("typing.").startswith("ClassVar"):
             continue
         default: Any = getattr(of, name, MISSING)
         one: Any = default if isinstance(default, Field) else field(default=default)
