@@ -142,7 +142,7 @@ def test_another_lens_leaves_phi_no_more_open_than_its_cost_allows() -> None:
     least = among.seen.solved_near(other, there=near, held=phi).cost
     for most in (1.0, 4.0):
         far = OpenDirection(phi, (phi,), np.array([0.4 * near.cameras["c"].phi]))
-        ends = Comparison._ends(among.seen, other, near, [far], most**0.5 / NORMAL_95)
+        ends = Comparison._ends(among.seen, other, (near, least), [far], most**0.5 / NORMAL_95)
         rises = [2.0 * (among.seen.solved_near(other, there=end, held=phi).cost - least) for end in ends]
         assert len(rises) == 2 and max(rises) < 1.1 * most
         assert min(rises) > 0.05 * most

@@ -41,7 +41,7 @@ from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
 from ceres_cal.posterior.posterior import Posterior
-from ceres_cal.problem import Estimate, Options, Solution, moved
+from ceres_cal.problem import Estimate, Options, moved
 from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Built
 from ceres_cal.start.initialise import Start
@@ -146,21 +146,23 @@ class Comparison(Frozen):
             return found
         seen = self.seen.holding(options)
 
-        def solved(one: Candidate, *, as_promised: bool = False) -> Estimate:
-            is_there = one.is_near and seen is self.seen
-            return one.estimate if is_there else seen.solved_near(one, as_promised=as_promised).estimate
+        def solved(one: Candidate, *, as_promised: bool = False) -> tuple[Estimate, float]:
+            if one.is_near and seen is self.seen:
+                return one.estimate, 0.5 * one.least
+            found = seen.solved_near(one, as_promised=as_promised)
+            return found.estimate, found.cost
 
-        near = attempt(partial(solved, self.chosen))  # reads: "other lenses could not be compared, ..."
-        if isinstance(near, CalibrationError):
-            return replace(found, failed=str(near))
-        found, left = replace(found, near=near), 1.0
+        own_end = attempt(partial(solved, self.chosen))  # reads: "other lenses could not be compared, ..."
+        if isinstance(own_end, CalibrationError):
+            return replace(found, failed=str(own_end))
+        found, left = replace(found, near=own_end[0]), 1.0
         for one, weight, is_open in each:
             # quiet: what cannot be solved for, or ends in another minimum, says nothing, and the rest share its weight
-            near = attempt(partial(solved, one, as_promised=True))
-            if isinstance(near, CalibrationError):
+            end = attempt(partial(solved, one, as_promised=True))
+            if isinstance(end, CalibrationError):
                 left -= weight
                 continue
-            ends = self._ends(seen, one, near, is_open, median(posterior.factors))
+            ends = self._ends(seen, one, end, is_open, median(posterior.factors))
             weights = (weight / len(ends),) * len(ends)
             found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
         # What they say by chance is less by as much as there are more observations than took part.
@@ -178,7 +180,7 @@ class Comparison(Frozen):
 
     @staticmethod
     def _ends(
-        seen: InlierRows, one: Candidate, near: Estimate, is_open: Sequence[OpenDirection], widened: float
+        seen: InlierRows, one: Candidate, at: tuple[Estimate, float], is_open: Sequence[OpenDirection], widened: float
     ) -> Sequence[Estimate]:
         """Another lens so far to either side of what it leaves open that all of these scatter as it does, but no
         farther than where twice its cost has risen as it does at 95 %; where it leaves nothing open itself.
@@ -186,21 +188,20 @@ class Comparison(Frozen):
         In a bent valley normal equations of elsewhere led to ends at which that had risen by 195.
 
         Args:
-            widened: factor on standard deviations, as the data scatter.
+            at: where it is at its best, and its cost. widened: factor on standard deviations, as the data scatter.
         """
-        most, far = (NORMAL_95 * widened) ** 2, widened * len(is_open) ** 0.5
+        most, far, (near, least) = (NORMAL_95 * widened) ** 2, widened * len(is_open) ** 0.5, at
 
-        def end(open_: OpenDirection, side: float, least: float, tries: int = 4) -> Solution:
+        def end(open_: OpenDirection, side: float, tries: int = 4) -> Estimate:
             there = moved(near, open_.keys, side * open_.step)
             found = seen.solved_near(one, as_promised=True, there=there, held=open_.along)
             rise = 2.0 * (found.cost - least)
-            return found if rise <= most or not tries else end(open_, side * (most / rise) ** 0.5, least, tries - 1)
+            return found.estimate if rise <= most or not tries else end(open_, side * (most / rise) ** 0.5, tries - 1)
 
         def all_of() -> Sequence[Estimate]:
             if one.is_near:
                 return [moved(near, open_.keys, side * open_.step) for open_ in is_open for side in (-far, far)]
-            least = end(is_open[0], 0.0, np.inf).cost
-            return [end(open_, side, least).estimate for open_ in is_open for side in (-far, far)]
+            return [end(open_, side) for open_ in is_open for side in (-far, far)]
 
         # quiet: where it ends in another minimum, its middle counts alone
         ends = attempt(all_of) if is_open else [near]
