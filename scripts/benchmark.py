@@ -50,7 +50,7 @@ MODULES = {OURS: "ceres_cal.calibration.calibrating", "opencv": "cv2", "pycolmap
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
 MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
 WARM_UP_LINE_POINTS, WARM_UP_S = 1000, 0.3
-PIXELS = 1_000_000
+PIXELS, FEW_PIXELS = 1_000_000, 10_000
 LAST_DECADES = 2.0  # over which growth is told
 
 Solver = Callable[[Corners], Answer]
@@ -397,10 +397,10 @@ def print_table(title: str, columns: Mapping[str, tuple[str, str]], rows: Iterab
         print("  ".join(["", first.ljust(widths[0]), *cells]), flush=True)
 
 
-def pixel_rows(repeat: int) -> list[dict[str, Any]]:
-    """Seconds that a million pixels take to the floor at robot height and back, for a lens of each kind."""
+def pixel_rows(repeat: int, count: int) -> list[dict[str, Any]]:
+    """Seconds that so many pixels take to the floor at robot height and back, for a lens of each kind."""
     camera = replace(OVERHEAD, phi=600.0).at(overhead_pose(0.0, 0.0, HEIGHT_M, tilt_x_deg=TILT_DEG))
-    pixels = np.random.default_rng(0).uniform((0.0, 0.0), camera.image_size, (PIXELS, 2))
+    pixels = np.random.default_rng(0).uniform((0.0, 0.0), camera.image_size, (count, 2))
     rows = []
     for lens in (OVERHEAD.lens, WIDE.lens, KannalaBrandt((-0.02, 0.004, -0.001, 0.0))):
         one, there, back = replace(camera, lens=lens), [], []
@@ -463,9 +463,10 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     if chosen.points:
         report["field"] = [alone("field", count, chosen.repeat) for count in chosen.points]
         print_growth("growth with the line points of a static camera over a field, ours", report["field"])
-    report["pixels"] = pixel_rows(chosen.repeat)
+    pixels = FEW_PIXELS if chosen.quick else PIXELS
+    report["pixels"] = pixel_rows(chosen.repeat, pixels)
     print_table(
-        f"{PIXELS:,} pixels located at {1e3 * ROBOT_TOP_M:.0f} mm, and projected back", PIXELS_TOLD, report["pixels"]
+        f"{pixels:,} pixels located at {1e3 * ROBOT_TOP_M:.0f} mm, and projected back", PIXELS_TOLD, report["pixels"]
     )
     report["environment"]["load after"] = round(os.getloadavg()[0], 2)
     print(f"\nload after {report['environment']['load after']}")

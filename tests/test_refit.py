@@ -1,6 +1,7 @@
 """Refits after a move, on the scenes of scripts/accuracy/moves.py."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from accuracy.moves import (
     TILTED,
     bound_case,
     moves_case,
-    of_one_picture,
     random_move,
     seen,
     sigmas_off,
@@ -25,6 +25,7 @@ from accuracy.moves import (
     truth_of,
 )
 from accuracy.moves import calibrated as calibrated_at_home
+from accuracy.moves import of_one_picture as refitted_of_one_picture
 from accuracy.scenes import FIELD
 from scenery import field_scene, overhead_pose
 from scenes import side_by_side
@@ -51,6 +52,7 @@ from ceres_cal.scene.symmetry import MIRRORED, TURNED
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import simulate
 
+of_one_picture = cache(refitted_of_one_picture)
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 
 

@@ -173,6 +173,7 @@ def test_opencv_left_right(real_data: Path) -> None:
     assert 1e3 * pair.baseline_sd_m < 0.5
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_opencv_left_right_by_defaults_is_usable(real_data: Path, say: Say, tmp_path: Path) -> None:
     """What may be a thin prism of 4 ± 2 px, beside a spline that leaves 0.006 px of it, moved the principal point by 42
     standard deviations, "cannot be trusted"; heights above the other camera were "known to 9.6 % only".

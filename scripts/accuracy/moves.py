@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -58,6 +58,7 @@ DAY = replace(NOISE, outliers=0.04, wrong_labels=0.01)
 MOST_SIGMA = 5.0
 
 
+@lru_cache(maxsize=8)
 def calibrated(seed: int, disturbance: Disturbance = NOISE, boards: int = 12) -> Calibration:
     """The camera at home: the field and boards, as before any move."""
     stations = {"overhead": Station("overhead", HOME)}

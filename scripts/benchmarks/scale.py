@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from ceres_cal.observations.files import HEADER, Content, header_of
 
 FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
 _FRAMES = 2000  # written at once
-_WARM_UP = 20_000
+_WARM_UP = 20_000  # line points at most
 _TIMES = 10  # the fewest frames between two times of more
 _ASKED = 50  # times, for what asking takes
 _BYTES = 40  # of disk for a line point, and what else a frame has
@@ -48,7 +49,7 @@ def folder_for(line_points: int) -> Iterator[Path]:
 
 def write_field(path: Path, line_points: int) -> None:
     """`field_observations` as a folder of columns, of which never more than a part is in memory."""
-    one = field_observations(_WARM_UP)
+    one = field_observations(min(line_points, _WARM_UP))
     per_frame = int(np.count_nonzero(one.curves.view == 0))
     frames = -(-line_points // per_frame)
     counts = {"points": frames * int(np.count_nonzero(one.points.view == 0)), "curves": line_points}
@@ -83,11 +84,12 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.problem.parameters import Options
 
-    _warm_up()
+    warm_up = partial(_warm_up, min(line_points, _WARM_UP))
+    warm_up()
     with ExitStack() as stack:
         client = stack.enter_context(_cluster(workers)) if workers else None
         if client is not None:
-            client.run(_warm_up)
+            client.run(warm_up)
         before, start = _processor(client), time.perf_counter()
         observations = Observations.load(os.environ[FOLDER])
         opened = time.perf_counter()
@@ -113,12 +115,12 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
         }
 
 
-def _warm_up() -> None:
+def _warm_up(line_points: int) -> None:
     """What a process does once: imports, compiled kernels."""
     from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.problem.parameters import Options
 
-    calibrate(field_observations(_WARM_UP), Options(lens="radial"))
+    calibrate(field_observations(line_points), Options(lens="radial"))
 
 
 def _processor(client: Any) -> list[float]:
