@@ -196,7 +196,11 @@ def test_a_folder_without_images_names_those_of_its_cameras(tmp_path: Path, caps
 def test_no_folder_is_left_where_nothing_could_be_read(tmp_path: Path, name: str) -> None:
     bad = tmp_path / name
     bad.write_bytes(b"no picture")
-    for kind in (("run", "--board", "9x6x25mm"), ("detect", "board", "--target", "9x6x25mm")):
+    for kind in (
+        ("run", "--board", "9x6x25mm"),
+        ("run", "--target", "9x6x25mm"),
+        ("detect", "board", "--target", "9x6x25mm"),
+    ):
         out = tmp_path / ("out/deep" if kind[0] == "run" else "x.json")
         assert main([*kind, str(bad), "-o", str(out)]) == 2
         assert list(tmp_path.iterdir()) == [bad]

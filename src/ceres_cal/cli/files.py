@@ -26,11 +26,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+def is_board(text: str) -> bool:
+    """Whether a target is spelled as a chessboard."""
+    return re.fullmatch(r"\d+x\d+x.+", text) is not None
+
+
 def spelled_target(text: str, where: str) -> scene.Target | None:
     """The target that somebody spelled out, as a chessboard such as 9x6x25mm or as `{"kind": ...}`; None for anything
     else, such as a name or a file.
     """
-    if re.fullmatch(r"\d+x\d+x.+", text):
+    if is_board(text):
         return scene.checkerboard(*parse_board(text))
     if not text.lstrip().startswith("{"):
         return None

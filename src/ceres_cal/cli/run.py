@@ -13,7 +13,7 @@ from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError,
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
-from ceres_cal.cli.files import attempted, folder_of_results, require_shown
+from ceres_cal.cli.files import attempted, folder_of_results, is_board, require_shown
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
@@ -67,6 +67,9 @@ class _Step(Frozen, eq=True):
     "cameras/ --target ssl-b --facing left.LeftGoalLine=left --facing right.LeftGoalLine=left -o field/",
 )
 def _run(args: RunArguments) -> Document:
+    of_field = args.board or args.facing or args.not_painted or args.estimate
+    if args.target is not None and is_board(args.target) and not of_field:  # a board is a target to other commands
+        args = replace(args, board=args.target, target=None)
     cameras = _cameras(args)
     _require_fitting(args, cameras)
     forms = [formats.export_format(name) for name in args.to]  # or says which there are
