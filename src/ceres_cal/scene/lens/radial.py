@@ -33,10 +33,7 @@ class Radial(Lens):
     kind: ClassVar[str] = "radial"
     acts_on_pixels: ClassVar[bool] = True
     may_fold: ClassVar[bool] = False  # the paper's polynomial can be had without a fold
-    # The last one says what the four of a moustache leave open, where the floor was 4 mm off, 1.9 of what was stated.
-    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = (
-        (3,), (2, 3), (3, 5), (2, 3, 4), (2, 3, 4, 5), (2, 3, 4, 5, 6),
-    )  # fmt: skip
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((3,), (2, 3), (3, 5), (2, 3, 4), (2, 3, 4, 5))
     missing_powers: ClassVar[tuple[int, ...]] = (2, 3, 4, 5, 6, 7)
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"tangential": ("p1", "p2")})
 
