@@ -52,7 +52,7 @@ from ceres_cal.problem.quantities import values_of
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.as_built import Built
 from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.lens import LENSES, Brown, KannalaBrandt
+from ceres_cal.scene.lens import LENSES, Brown, KannalaBrandt, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Disturbance, Station, simulate
 from ceres_cal.start.initialise import Start, initialise
@@ -107,6 +107,22 @@ def test_a_lens_that_no_formula_has_in_one_view_of_a_floor() -> None:
     pixels = scene.camera_at("s").project(places)
     off = np.linalg.norm(calibration.station().locate(pixels) - places[:, :2], axis=1)
     assert np.sqrt(np.mean(off**2)) < 1e-3  # 0.4 mm, of 1.3 stated
+
+
+def test_what_one_power_more_would_leave_open_is_stated() -> None:
+    """Four powers are the longest that may be chosen, and no data say that there is no fifth."""
+    lens = Radial((-3.5e-4, 4.5e-6, -1.024e-8, 8.5e-12), (2, 3, 4, 5))
+    camera, place = Camera((960, 720), 443.0, (474.0, 367.0), lens), overhead_pose(0.2, -0.3, 4.66, 3.8, -3.0, 2.0)
+    outer = [name for name in ssl_field("B").curves if "Circle" not in name and "Halfway" not in name]
+    scene = field_scene(ssl_field("B"), {"c": camera}, {"s": Station("c", place)}, curves=tuple(outer), spacing_m=0.1)
+    observations = simulate(scene, Disturbance(0.09, 0.09), 0).observations
+    calibration = calibrate(observations)
+    assert calibration.options.powers == (2, 3, 4, 5)
+    assert "radial 2,3,4,5,6" in [one.label for one in calibration.lens_choice.tried]
+    pixels = grid_places(np.linspace(100.0, 860.0, 9), np.linspace(100.0, 620.0, 7))
+    alone = calibrate(observations, calibration.options)
+    sd, of_four = (one.uncertainty.located(pixels).sd_m for one in (calibration, alone))
+    assert np.max(sd / of_four) > 1.3  # 1.7, where no line passes near
 
 
 def _straight_from_above() -> tuple[Camera, Observations]:

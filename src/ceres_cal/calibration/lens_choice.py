@@ -26,7 +26,7 @@ from ceres_cal.base import (
 )
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
-from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
+from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort, one_power_more
 from ceres_cal.calibration.lens_forms import (
     AS_GOOD,
     AS_GOOD_BESIDE_LENGTHS,
@@ -302,7 +302,7 @@ def _among(
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
     more = tuple(last_resort(seen, found.chosen, by_most=by_most))
-    found = replace(found, tried=(*found.tried, *more))
+    found = replace(found, tried=(*found.tried, *one_power_more(seen, found.chosen), *more))
     # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.
     least = AS_GOOD if by_most else CLEARLY
     clearly = next((one for one in more if one.beats(found.chosen, least)), None)

@@ -166,7 +166,7 @@ class Candidate(Frozen):
 
     def extends(self, other: Candidate, as_good: float) -> bool:
         """Whether it is the other lens with more coefficients and predicts as well: no data say that these are 0."""
-        if self.of is not other.of or self.squares is None or other.squares is None:
+        if self.form.lens != other.form.lens or self.squares is None or other.squares is None:
             return False
         is_longer = {*self.form.names} > {*other.form.names}
         return is_longer and standard_errors(self.squares, other.squares) <= as_good
