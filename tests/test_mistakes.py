@@ -142,7 +142,10 @@ ON_THE_COMMAND_LINE = [
     ("run PHOTOS --target ssl-b --facing LeftGoalLine=up -o OUT", "there is no side 'up': choose one of left, right"),
     ("run PHOTOS --target ssl-b --not-painted Halfway -o OUT", "there is no line 'Halfway': did you mean"),
     ("run PHOTOS --target pitch -o OUT", "(or a board such as 9x6x25mm, or a file)"),
-    ("run PHOTOS --target 4x6x30mm -o OUT", "boards are found by `detect board`, or `run --board 9x6x25mm`"),
+    (
+        "run PHOTOS --target 4x6x30mm --facing LeftGoalLine=top -o OUT",
+        "boards are found by `detect board`, or `run --board 9x6x25mm`",
+    ),
     ("run PHOTOS --target pitch.json -o OUT", "pitch.json: no such file"),
     ("run PHOTOS --board 9x6 -o OUT", "board '9x6': write COLUMNSxROWSxSQUARE, such as 9x6x25mm"),
     ("run PHOTOS --board 9x6x25mm --to opencvv -o OUT", "there is no export format 'opencvv': did you mean 'opencv'?"),
