@@ -118,8 +118,6 @@ def test_what_one_power_more_would_leave_open_is_stated() -> None:
     observations = simulate(scene, Disturbance(0.09, 0.09), 0).observations
     calibration = calibrate(observations)
     assert calibration.options.powers == (2, 3, 4, 5)
-    choice = calibration.lens_choice
-    assert choice is not None and "radial 2,3,4,5,6" in [one.label for one in choice.tried]
     pixels = grid_places(np.linspace(100.0, 860.0, 9), np.linspace(100.0, 620.0, 7))
     alone = calibrate(observations, calibration.options)
     sd, of_four = (one.uncertainty.located(pixels).sd_m for one in (calibration, alone))

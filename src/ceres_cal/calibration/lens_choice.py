@@ -97,6 +97,7 @@ class Comparison(Frozen):
         seen: the observations that took part, and `share` of all. as_good: how many standard errors worse is as good.
         start: of everything. there: where the chosen one is at its best.
         passed: the one that was chosen first, where all of the observations make no calibration with it.
+        beyond: longer than any that was tried: what it leaves open counts, and it takes no share from others.
     """
 
     seen: InlierRows
@@ -108,6 +109,7 @@ class Comparison(Frozen):
     chosen: Candidate
     there: Estimate
     passed: Candidate | None = None
+    beyond: tuple[Candidate, ...] = ()
 
     @property
     def worse_than_passed(self) -> float:
@@ -126,12 +128,17 @@ class Comparison(Frozen):
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
+        if self.chosen.form.blank.roughness:
+            return found
         told = self._possible(least_probability)
         likely = dict(zip(told, _probabilities(told), strict=True))
-        longer = [one for one in told if one.extends(self.chosen, self.as_good)]
-        asked = [one for one in told if one is not self.chosen and (one in longer or likely[one] >= least_probability)]
+        longer = [one for one in (*told, *self.beyond) if one.extends(self.chosen, self.as_good)]
+        likely |= {one: likely[self.chosen] for one in self.beyond if one in longer}
+        asked = [
+            one for one in likely if one is not self.chosen and (one in longer or likely[one] >= least_probability)
+        ]
         each = list[tuple[Candidate, float, Sequence[OpenDirection]]]()
-        if self.chosen.form.blank.roughness or not asked:
+        if not asked:
             return found
         slopes = {kind: kind.slopes(found) for kind in {one.of for one in (self.chosen, *asked)}}
         own = self.chosen.spread(posterior.stated, slopes[self.chosen.of])
@@ -302,7 +309,7 @@ def _among(
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
     more = tuple(last_resort(seen, found.chosen, by_most=by_most))
-    found = replace(found, tried=(*found.tried, *one_power_more(seen, found.chosen), *more))
+    found = replace(found, tried=(*found.tried, *more), beyond=tuple(one_power_more(seen, found.chosen)))
     # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.
     least = AS_GOOD if by_most else CLEARLY
     clearly = next((one for one in more if one.beats(found.chosen, least)), None)
