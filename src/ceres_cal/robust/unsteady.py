@@ -17,7 +17,7 @@ of boards; but without them lenses predict other views worse.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -154,15 +154,20 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
     def seen(some: Problem, there: Estimate = estimate) -> tuple[Equations, Weights]:
         return _equations(there, end.residuals, end.weights_of, before, some, problem.private)
 
+    @cache
+    def modelled(some: Problem) -> Linearised:
+        return make_linear_model(some, estimate, *seen(some))
+
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
         sights = problem.sights.numbers(camera)
         boards = [number for number in sights.tolist() if problem.sights.keys[number].placement is not None]
         if len(boards) < _FEWEST:
             continue
-        some = problem.of_sights(np.array(boards[:: -(-len(boards) // _ENOUGH)]))
+        chosen = boards[:: -(-len(boards) // _ENOUGH)]
+        some = problem if len(chosen) == len(problem.sights) else problem.of_sights(np.array(chosen))
         if before is not None or _seem_displaced(*seen(*some.built_as(estimate))):
-            model = make_linear_model(some, estimate, *seen(some))
+            model = modelled(some)
             if before is None and any(lens_changes(Case(some, estimate, model))):
                 continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` tells that
             own, left = _sizes(model, smooth_image(model.equations, estimate))
@@ -170,7 +175,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None
                 sizes[camera], noise = own, max(left, noise)
     if not sizes:
         return None
-    return _predicted(make_linear_model(problem, estimate, *seen(problem)), problem, estimate, sizes, noise)
+    return _predicted(modelled(problem), problem, estimate, sizes, noise)
 
 
 def without_unsteadiness(
