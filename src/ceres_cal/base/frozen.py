@@ -13,6 +13,7 @@ from dataclasses import field as field
 from functools import cache
 from importlib import import_module
 from inspect import get_annotations
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast, dataclass_transform
 
@@ -52,10 +53,8 @@ class Frozen:
 
     def __init_subclass__(cls, *, eq: bool = False, kw_only: bool = False, **others: Any) -> None:
         super().__init_subclass__(**others)
-        every: dict[str, Field[Any]] = {}
-        for base in cls.__mro__[:0:-1]:
-            every |= vars(base).get("__dataclass_fields__", {})
-        cls.__dataclass_fields__ = every | {one.name: one for one in _found(cls, kw_only)}
+        every = [vars(base).get("__dataclass_fields__", {}).values() for base in cls.__mro__[:0:-1]]
+        cls.__dataclass_fields__ = {one.name: one for one in chain(*every, _found(cls, kw_only))}
         if eq:
             cls.__eq__, cls.__hash__ = _are_equal, lambda one: hash(_held(one))  # type: ignore[assignment]
 
@@ -94,10 +93,8 @@ def _found(of: type, kw_only: bool) -> Iterator[Field[Any]]:
         one: Any = default if isinstance(default, Field) else field(default=default)
         one.name, one.type, one._field_type = name, kind, _FIELD  # by which the standard library knows a field
         one.kw_only = kw_only if one.kw_only is MISSING else one.kw_only
-        if one is default and one.default is MISSING:
+        if one is default:  # which is no value of the class
             delattr(of, name)
-        elif one is default:
-            setattr(of, name, one.default)
         yield one
 
 
