@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Any
 
 import numpy as np
 
@@ -65,7 +64,9 @@ def _steps_across(image: Image, grid: Array) -> Array:
     """(rows, columns) half the step between dark and bright about each corner; NaN where it is not all in the picture.
     Where a board ends three of the four quarters are alike, or two are: it is half of what it is within.
     """
-    u, v = (_padded(np.gradient(grid[1:-1, 1:-1], axis=axis), mode="edge")[..., None, None, :] for axis in (1, 0))
+    # Beyond the ends they go on as at the ends.
+    rows, columns = ([0, *range(size - 2), size - 3] for size in grid.shape[:2])
+    u, v = (np.gradient(grid[1:-1, 1:-1], axis=axis)[rows][:, columns, None, None] for axis in (1, 0))
     places = grid[..., None, None, :] + _QUARTERS[:, None] * u + _QUARTERS[:, None, None] * v
     inside = _inside(places, image.shape, 0.0)
     x, y = np.moveaxis(np.where(inside[..., None], places, 0.0).round().astype(int), -1, 0)
@@ -97,9 +98,12 @@ def _clean(saddles: Saddles, shape: tuple[int, ...]) -> Saddles:
         return saddles.without(~(_inside(saddles.grid, shape, _BORDER_PX) & (saddles.misfit < _MISFIT)))
 
 
-def _padded(values: Array, **how: Any) -> Array:
+def _padded(values: Array) -> Array:
     """With one more line on every side, of unknown corners."""
-    return np.pad(values, ((1, 1), (1, 1), (0, 0))[: values.ndim], **(how or {"constant_values": np.nan}))
+    rows, columns, *rest = values.shape
+    wider = np.full((rows + 2, columns + 2, *rest), np.nan)
+    wider[1:-1, 1:-1] = values
+    return wider
 
 
 def _trimmed(saddles: Saddles) -> Saddles:
@@ -123,8 +127,11 @@ def _foreseen(grid: Array) -> Array:
 
 def _shifted(values: Array, axis: int, by: int) -> Array:
     """The values of the neighbours `by` places before; NaN beyond the ends."""
-    moved = np.roll(values, by, axis)
-    moved.swapaxes(0, axis)[slice(by) if by > 0 else slice(by, None)] = np.nan
+    moved, there = (
+        np.full_like(values, np.nan),
+        (slice(by, None), slice(-by)) if by > 0 else (slice(by), slice(-by, None)),
+    )
+    moved.swapaxes(0, axis)[there[0]] = values.swapaxes(0, axis)[there[1]]
     return moved
 
 

@@ -94,14 +94,15 @@ def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH
     corner, level = _around(image, grid)
     seen, discs, first = grid - corner, (reach, wanted), (_ROUGH * reach, wanted)
     smooth = _smoothed(level)
-    fitted = _fit_grid(smooth, seen, seen, first)
-    shrink = _shrink(fitted, grid, reach)
+    edges = _edges(seen)
+    fitted = _fit_grid(smooth, seen, edges, seen, first)
+    shrink = _shrink(fitted, edges[2], reach)
     start = _started(fitted, seen, wanted)
     if shrink > 1:
         smooth = _smoothed(_shrunk(level, shrink))
         places, seen = ((places + 0.5) / shrink - 0.5 for places in (start[..., :2], seen))
-        start = _started(_fit_grid(smooth, places, seen, discs), seen, wanted)
-    fitted = _fit_grid(smooth, start, seen, discs)
+        start = _started(_fit_grid(smooth, places, _edges(places), seen, discs), seen, wanted)
+    fitted = _fit_grid(smooth, start, _edges(start[..., :2]), seen, discs)
     contrast = fitted[..., _CONTRAST]
     misfit = fitted[..., _LEFT] / np.maximum(np.abs(contrast), 1e-9)
     return Saddles((fitted[..., :2] + 0.5) * shrink - 0.5 + corner, contrast, misfit)
@@ -144,11 +145,11 @@ def _started(fitted: Array, seen: Array, wanted: Mask) -> Array:
     return start
 
 
-def _shrink(fitted: Array, grid: Array, reach: float) -> int:
+def _shrink(fitted: Array, distance: Array, reach: float) -> int:
     """By how much the picture is shrunk for the last fit: as far as its blur allows, where a disc of the most pixels
     would see but a part of each square, or nothing but blur.
     """
-    sharp, distance = fitted[..., _SHARP], _distances(grid)[2]
+    sharp = fitted[..., _SHARP]
     if not np.any(np.isfinite(sharp + distance)):
         return 1
     blur_px, radius_px = (float(medians_known(each.ravel())) for each in (_BLUR / sharp, reach * distance))
@@ -160,13 +161,13 @@ def _shrunk(level: AnyArray, factor: int) -> AnyArray:
     return cv2.resize(level[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _fit_grid(smooth: AnyArray, start: Array, seen: Array, discs: tuple[float, Mask]) -> Array:
+def _fit_grid(smooth: AnyArray, start: Array, edges: _Edges, seen: Array, discs: tuple[float, Mask]) -> Array:
     """What one fit has found, (rows, columns, _FITTED); NaN where a corner got lost on its way from where it was
     `seen`. `start`: places, from which it is fitted roughly and where the edges bend is not known yet, or what such a
-    fit has found. `discs`: their reach, and which corners are wanted.
+    fit has found. `edges`: of the start. `discs`: their reach, and which corners are wanted.
     """
     reach, wanted = discs
-    (along_row, row_bend), (along_column, column_bend), distance = _distances(start[..., :2])
+    (along_row, row_bend), (along_column, column_bend), distance = edges
     known = wanted & np.isfinite(distance) & np.isfinite(start[..., :2]).all(axis=-1)
     fitted = np.full((*distance.shape, _FITTED), np.nan)
     if not np.any(known):
@@ -186,7 +187,10 @@ def _fit_grid(smooth: AnyArray, start: Array, seen: Array, discs: tuple[float, M
     return fitted
 
 
-def _distances(grid: Array) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
+_Edges = tuple[tuple[Array, Array], tuple[Array, Array], Array]
+
+
+def _edges(grid: Array) -> _Edges:
     """Tangent and curvature of the edge along each row and along each column, and how far (px) the next edges are."""
     along_row, row_bend, row_step = _line_geometry(grid, axis=1)
     along_column, column_bend, column_step = _line_geometry(grid, axis=0)
