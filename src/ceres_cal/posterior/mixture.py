@@ -257,7 +257,8 @@ class Mixture(Frozen):
         away = np.abs(np.log(phi / phi[end]))
         order = np.argsort(away)
         flat = values.reshape(len(values), -1)
-        halves = [np.array([np.interp(d, away[order], column[order]) for column in flat.T]) for d in _TWICE]
+        each = np.eye(len(phi))[:, order]  # shares of the nodes serve all numbers: a map has thousands
+        halves = _mixed(np.array([[np.interp(d, away[order], one) for one in each] for d in _TWICE]), flat)
         last, before = flat[end] - halves[0], halves[0] - halves[1]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.abs(last / before)
