@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, dots
 from ceres_cal.scene.targets import Grid, Target
 
 
@@ -25,7 +25,7 @@ class Footprints:
 
     def step_m(self, direction: Array) -> Array:
         """(M,) how far the place moves along a direction (M, 2) over one square, m."""
-        across = np.sum(self.along_x * direction, axis=1), np.sum(self.along_y * direction, axis=1)
+        across = dots(self.along_x, direction), dots(self.along_y, direction)
         return np.asarray(np.maximum(np.hypot(*across), 1e-12))
 
 

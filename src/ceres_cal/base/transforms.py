@@ -7,6 +7,7 @@ A pose named `cam_from_world` maps world coordinates to camera coordinates, so f
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import atan2, copysign, hypot
 from typing import ClassVar
 
 import numpy as np
@@ -22,7 +23,7 @@ _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
 
 def skew(v: ArrayLike) -> Array:
     """The matrix [v]x with [v]x w = v x w, shape (3, 3)."""
-    x, y, z = np.asarray(v, dtype=float)
+    x, y, z = np.asarray(v, dtype=float).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
@@ -33,39 +34,49 @@ def skews(v: Array) -> Array:
     return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
 
 
+def _with_powers(vector: Array, first: float, second: float) -> Array:
+    """I + first [w]x + second [w]x^2, number by number: arrays of three take several times as long."""
+    x, y, z = vector.tolist()
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    u, v, w = first * x, first * y, first * z
+    return np.array(
+        [
+            [1.0 - second * (y * y + z * z), xy - w, xz + v],
+            [xy + w, 1.0 - second * (x * x + z * z), yz - u],
+            [xz - v, yz + u, 1.0 - second * (x * x + y * y)],
+        ]
+    )
+
+
 def rotation_exp(rotation_vector: ArrayLike) -> Array:
     """Rotation matrix of a rotation vector (axis times angle, rad): Rodrigues' formula."""
     w = np.asarray(rotation_vector, dtype=float)
-    angle = float(np.linalg.norm(w))
+    angle = hypot(*w.tolist())
     if angle < _SMALL_ANGLE:
         sine, versine = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
     else:
-        sine, versine = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
-    hat = skew(w)
-    return np.asarray(np.eye(3) + sine * hat + versine * hat @ hat)
+        sine, versine = float(np.sin(angle)) / angle, 2.0 * (float(np.sin(0.5 * angle)) / angle) ** 2
+    return _with_powers(w, sine, versine)
 
 
 def rotation_log(rotation: ArrayLike) -> Array:
     """Rotation vector (rad, length at most pi) of a rotation matrix, by way of the quaternion: exact up to angle pi."""
-    r = np.asarray(rotation, dtype=float)
-    trace = np.trace(r)
+    r = np.asarray(rotation, dtype=float).tolist()
+    trace = r[0][0] + r[1][1] + r[2][2]
     # The four squared quaternion components times four; dividing by the largest one never loses digits.
-    squares = np.array([1.0 + trace, *(1.0 - trace + 2.0 * np.diag(r))])
-    largest = int(np.argmax(squares))
-    w_xyz = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    squares = [1.0 + trace, *(1.0 - trace + 2.0 * r[i][i] for i in range(3))]
+    largest = squares.index(max(squares))
+    w_xyz = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]]
     if largest == 0:
-        q = np.array([squares[0], *w_xyz])
+        q = [squares[0], *w_xyz]
     else:
         i = largest - 1
-        q = np.array([w_xyz[i], *(r[i] + r[:, i])])
+        q = [w_xyz[i], *(r[i][k] + r[k][i] for k in range(3))]
         q[largest] = squares[largest]
-    q /= np.linalg.norm(q)
-    if q[0] < 0.0:
-        q = -q
-    sine = float(np.linalg.norm(q[1:]))
-    if sine < 1e-12:
-        return np.asarray(2.0 * q[1:])
-    return np.asarray(2.0 * np.arctan2(sine, q[0]) / sine * q[1:])
+    length = copysign(hypot(*q), q[0])
+    cosine, *axis = (component / length for component in q)
+    sine = hypot(*axis)
+    return np.array(axis) * (2.0 if sine < 1e-12 else 2.0 * atan2(sine, cosine) / sine)
 
 
 def quaternion(rotation: ArrayLike) -> Array:
@@ -85,14 +96,13 @@ def rotation_of(quaternion: ArrayLike) -> Array:
 def left_jacobian(rotation_vector: ArrayLike) -> Array:
     """J with exp(w + dw) = exp(J dw) exp(w) to first order, shape (3, 3)."""
     w = np.asarray(rotation_vector, dtype=float)
-    angle = float(np.linalg.norm(w))
+    angle = hypot(*w.tolist())
     if angle < _SMALL_ANGLE:
         versine, rest = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
     else:
-        versine = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
-        rest = (angle - np.sin(angle)) / angle**3
-    hat = skew(w)
-    return np.asarray(np.eye(3) + versine * hat + rest * hat @ hat)
+        versine = 2.0 * (float(np.sin(0.5 * angle)) / angle) ** 2
+        rest = (angle - float(np.sin(angle))) / angle**3
+    return _with_powers(w, versine, rest)
 
 
 def require_rotation(matrix: ArrayLike, name: str) -> Array:

@@ -22,6 +22,7 @@ from ceres_cal.base import (
     Indices,
     Mask,
     cached_property,
+    dots,
     field,
     replace,
     tail_root,
@@ -328,9 +329,10 @@ def radii(weights: Array, means: Array, covariances: Array, tails: Sequence[floa
     The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        square = np.trace(covariances, axis1=-2, axis2=-1) + np.sum(means**2, axis=-1)
+        square = covariances[..., 0, 0] + covariances[..., 1, 1] + dots(means, means)
         finite = np.nan_to_num(covariances, nan=0.0)
-        variance = 2.0 * np.sum(finite**2, axis=(-2, -1)) + 4.0 * np.einsum("fni,fnij,fnj->fn", means, finite, means)
+        across = finite[..., 0] * means[..., :1] + finite[..., 1] * means[..., 1:]
+        variance = 2.0 * np.einsum("fnij,fnij->fn", finite, finite) + 4.0 * dots(means, across)
         cubed = variance / (9.0 * square**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
     sized = np.isfinite(square) & np.isfinite(variance) & (square > 0.0)
     unsized = np.where(square == 0.0, 0.0, np.inf)
@@ -417,7 +419,8 @@ class Reading(Frozen):
         of_round = 2.447 / np.sqrt(2.0)  # 95 % of errors alike in all directions lie within, over their rms length
         covariance = np.asarray(np.einsum("f,fnij->nij", self.weights, self.known))
         with np.errstate(invalid="ignore"):
-            covariance = covariance + np.einsum("f,fni,fnj->nij", self.weights, self.means, self.means)
+            weighted = np.transpose(self.weights[:, None, None] * self.means, (1, 2, 0))
+            covariance = covariance + weighted @ np.swapaxes(self.means, 0, 1)
         covariance[self._is_open] = np.diag([np.inf, np.inf])
         sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
         sd = np.minimum(sd, self.radius_95 / of_round) if self.is_followed else sd

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base import Array, InputError, Mask
+from ceres_cal.base import Array, InputError, Mask, dots
 
 SIDES = {"centre": 0, "left": 1, "right": -1}
 """Which part of a painted curve was observed. Left and right are those of someone walking along it: from `start` to
@@ -132,8 +132,8 @@ def nearest_on_track(tracks: Array, is_arc: bool | Mask, points: Array) -> Array
     """
     c, a, b = tracks[..., 0, :], tracks[..., 1, :], tracks[..., 2, :]
     away = points - c
-    straight = np.sum(away * a, axis=1) / np.sum(a * a, axis=-1)
-    turned = np.arctan2(np.sum(away * b, axis=1), np.sum(away * a, axis=1))
+    along = dots(away, a)
+    straight, turned = along / dots(a, a), np.arctan2(dots(away, b), along)
     return np.asarray(np.where(is_arc, turned, straight))
 
 
@@ -148,8 +148,8 @@ def nearest_to_rays(tracks: Array, is_arc: bool | Mask, origin: Array, rays: Arr
     with np.errstate(divide="ignore", invalid="ignore"):
         on_plane = away - (away[..., 2] / rays[:, 2])[:, None] * rays
         turned = np.arctan2(on_plane[:, 1], on_plane[:, 0])
-        aa, ar, rr = np.sum(a * a, -1), np.sum(a * rays, 1), np.sum(rays * rays, 1)
-        straight = (np.sum(a * away, -1) * rr - np.sum(rays * away, 1) * ar) / (aa * rr - ar * ar)
+        aa, ar, rr = dots(a, a), dots(a, rays), dots(rays, rays)
+        straight = (dots(a, away) * rr - dots(rays, away) * ar) / (aa * rr - ar * ar)
     return np.nan_to_num(np.where(is_arc, turned, straight), posinf=0.0, neginf=0.0)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal import kernels
-from ceres_cal.base import Array, DegenerateError, Frozen, Indices, Pose, median, parts_of, run_parts
+from ceres_cal.base import Array, DegenerateError, Frozen, Indices, Pose, dots, median, parts_of, run_parts
 from ceres_cal.scene import Camera, Lens
 
 # Medians of the errors: no clean residual is that long, nine standard deviations. Nothing changes at half of it.
@@ -31,7 +31,7 @@ class RadialProfile(Frozen, eq=True):
 
     def lift(self, offsets: Array) -> Array:
         """Offsets (N, 2) -> (N, 3): (p, w(r)), homogeneous undistorted image points."""
-        squared = np.sum(offsets * offsets, axis=1) / self.unit_px**2
+        squared = dots(offsets, offsets) / self.unit_px**2
         w = np.ones(len(offsets))
         for k, c in enumerate(self.coefficients, start=1):
             w += c * squared**k
@@ -243,7 +243,7 @@ def _fitted_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array
         values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
         inverse = vectors[:, :, 0].reshape(-1, 3, 3)
         sent = image_points @ np.swapaxes(inverse, 1, 2)
-        distance = np.abs(np.sum(lines * sent, axis=2)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
+        distance = np.abs(dots(lines, sent)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
         typical = np.partition(distance, middle, axis=1)[:, middle]
         bound = np.maximum(3.0 * typical, 1e-9)[:, None]
         weights = 1.0 / (np.maximum(sent[:, :, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))

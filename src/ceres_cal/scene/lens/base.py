@@ -35,11 +35,11 @@ _DIFFERENCES = np.vstack([np.eye(13)[0], np.pad(np.kron(np.eye(3), _WEIGHTS), ((
 def _in_blocks(function: Callable[[Array, float], Array], rows: ArrayLike, phi: float, columns: int) -> Array:
     """A lens's map over rows of any number; NaN in the whole row where the answer is not finite."""
     rows = np.asarray(rows, dtype=float)
-    answer = np.empty((len(rows), columns))
+    answer, ones = np.empty((len(rows), columns)), np.ones(columns)
     with np.errstate(all="ignore"):  # what overflows or divides by zero on the way ends as NaN
         for start in range(0, len(rows), _BLOCK):
             block = function(rows[start : start + _BLOCK], phi)
-            block[~np.isfinite(np.sum(block, axis=1))] = np.nan
+            block[~np.isfinite(block @ ones)] = np.nan
             answer[start : start + _BLOCK] = block
     return answer
 

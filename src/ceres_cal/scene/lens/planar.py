@@ -139,7 +139,8 @@ def _newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit:
     """Points (N, 2) whose image is `target`, from `flat`; NaN where Newton's method does not get there."""
     longest = 0.1  # step of Newton's method, of the limit
     exact, rounding = 1e-12, 1e-15  # errors that will do, and that nothing makes smaller
-    rows, error, size = np.arange(len(flat)), np.full(len(flat), np.inf), 1.0 + np.max(np.abs(target), axis=1)
+    rows, error = np.arange(len(flat)), np.full(len(flat), np.inf)
+    size = 1.0 + np.maximum(np.abs(target[:, 0]), np.abs(target[:, 1]))
     for _ in range(STEPS):
         (x, xx, xy), (y, yx, yy) = mapped(flat[rows])
         x, y = x - target[rows, 0], y - target[rows, 1]
