@@ -308,6 +308,7 @@ def test_wrong_usage_is_one_line(say: Say, arguments: Sequence[object], words: s
 
 def test_no_command_lists_all_of_them(say: Say) -> None:
     said, asked = say(), say("--help")
+    assert say("help") == asked and say("help", "run") == say("run", "--help")
     assert (said.code, said.out, said.err) == (2, asked.out, "") and asked.code == 0
 
 

@@ -17,6 +17,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from select import select
 from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO, cast
@@ -292,6 +293,8 @@ def _fail(message: str, exit_code: int, as_json: bool) -> int:
 
 
 def _run(arguments: list[str]) -> int:
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     beginning = " ".join(arguments[:-1])
     if arguments[-1:] in ([], ["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
         print(_overview(beginning))
@@ -319,6 +322,8 @@ def chosen(arguments: list[str]) -> tuple[Command, list[str]]:
         raise InputError(f"{arguments[0]} what{meant or listed}")
     typed = arguments[0] if arguments[0].startswith("-") else " ".join(arguments[:2])
     meant = did_you_mean(typed, COMMANDS) or did_you_mean(arguments[0], COMMANDS)
+    if Path(arguments[0]).exists():
+        meant = ": a command comes first, such as `ceres-cal run` before photographs"
     raise InputError(f"there is no command {arguments[0]!r}{meant or ': see `ceres-cal --help`'}")
 
 
