@@ -93,8 +93,10 @@ def _found(of: type, kw_only: bool) -> Iterator[Field[Any]]:
         one: Any = default if isinstance(default, Field) else field(default=default)
         one.name, one.type, one._field_type = name, kind, _FIELD  # by which the standard library knows a field
         one.kw_only = kw_only if one.kw_only is MISSING else one.kw_only
-        if one is default:  # which is no value of the class
+        if one is default and one.default is MISSING:
             delattr(of, name)
+        elif one is default:  # as the class's own: `RunArguments.camera` is what nobody asked for
+            setattr(of, name, one.default)
         yield one
 
 
