@@ -7,7 +7,7 @@ A pose named `cam_from_world` maps world coordinates to camera coordinates, so f
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from math import atan2, copysign, hypot
+from math import atan2, hypot
 from typing import ClassVar
 
 import numpy as np
@@ -61,29 +61,22 @@ def rotation_exp(rotation_vector: ArrayLike) -> Array:
 
 def rotation_log(rotation: ArrayLike) -> Array:
     """Rotation vector (rad, length at most pi) of a rotation matrix, by way of the quaternion: exact up to angle pi."""
-    r = np.asarray(rotation, dtype=float).tolist()
-    trace = r[0][0] + r[1][1] + r[2][2]
-    # The four squared quaternion components times four; dividing by the largest one never loses digits.
-    squares = [1.0 + trace, *(1.0 - trace + 2.0 * r[i][i] for i in range(3))]
-    largest = squares.index(max(squares))
-    w_xyz = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]]
-    if largest == 0:
-        q = [squares[0], *w_xyz]
-    else:
-        i = largest - 1
-        q = [w_xyz[i], *(r[i][k] + r[k][i] for k in range(3))]
-        q[largest] = squares[largest]
-    length = copysign(hypot(*q), q[0])
-    cosine, *axis = (component / length for component in q)
+    *axis, cosine = quaternion(rotation).tolist()
     sine = hypot(*axis)
     return np.array(axis) * (2.0 if sine < 1e-12 else 2.0 * atan2(sine, cosine) / sine)
 
 
 def quaternion(rotation: ArrayLike) -> Array:
     """(x, y, z, w) of a rotation matrix, of unit length, w not below 0."""
-    half = 0.5 * rotation_log(rotation)
-    angle = float(np.linalg.norm(half))
-    return np.array([*(np.sinc(angle / np.pi) * half), np.cos(angle)])
+    r = np.asarray(rotation, dtype=float).tolist()
+    trace = r[0][0] + r[1][1] + r[2][2]
+    # Four times the squared components, w last; dividing by the largest one never loses digits.
+    squares = [*(1.0 - trace + 2.0 * r[i][i] for i in range(3)), 1.0 + trace]
+    largest = squares.index(max(squares))
+    turns = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1], 0.0]  # four times x w, y w and z w
+    q = turns if largest == 3 else [*(r[largest][k] + r[k][largest] for k in range(3)), turns[largest]]
+    q[largest] = squares[largest]
+    return np.array(q) / (-hypot(*q) if q[3] < 0.0 else hypot(*q))
 
 
 def rotation_of(quaternion: ArrayLike) -> Array:
