@@ -80,3 +80,14 @@ def test_what_a_file_leaves_out_is_the_default() -> None:
     """msgspec writes no default into an instance: it is its class's."""
     read = msgspec.convert({"width": 2}, Size)
     assert read == Size(2) and repr(read) == repr(Size(2)) and replace(read, width=3) == Size(3)
+
+
+def test_a_default_is_a_value_of_the_class() -> None:
+    """`run` of a folder of cameras asks its class for what nobody asked for, and found none."""
+
+    class Named(Frozen):
+        name: str = field(default="ring", metadata={"help": "what it is called"})
+        notes: list[str] = field(default_factory=list)
+
+    assert Named.name == Named().name == "ring"
+    assert not hasattr(Named, "notes")
