@@ -108,6 +108,8 @@ CIRCLING = (
     Brown((0.3696602911999488, 0.23772868894562144, -0.001024502834884153, 0.0009761263523310101, -0.0283)),
     1000.0,
 )
+# Near its pole a place is found to the last digit before its image is.
+POLE = Brown((-0.0116, 0.1295, 0.0094, 1e-5, 0.0, 0.0094, -0.1616, 3e-4, 1e-5, 0.0123, 0.0, 0.0), ("rational", "prism"))
 RIM = Radial((8.528542732914017e-06, -1.274056190889818e-10), (3, 5)), 202.0
 
 
@@ -129,6 +131,7 @@ def test_a_pixel_has_its_own_ray_or_none(drawn: tuple[Lens, float]) -> None:
 @given(lenses(decentring=2e-2), st.integers(0, 2**32))
 @example(CIRCLING, 0)
 @example(RIM, 0)
+@example((POLE, 572.5), 0)
 def test_a_ray_has_its_own_pixel_or_none(drawn: tuple[Lens, float], seed: int) -> None:
     lens, phi = drawn
     rays = np.random.default_rng(seed).normal(size=(2000, 3))

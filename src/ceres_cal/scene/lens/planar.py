@@ -150,7 +150,7 @@ def _newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit:
         length = np.hypot(step[:, 0], step[:, 1])
         step *= np.minimum(1.0, longest * limit / np.maximum(length, 1e-300))[:, None]
         flat[rows] -= step
-        rows = rows[(length > 1e-13) & (error[rows] > rounding)]
+        rows = rows[(error[rows] > rounding) & ((length > 1e-13) | (error[rows] > exact))]
         if not len(rows):
             break
     return np.where((error <= exact)[:, None], flat, np.nan)
