@@ -155,4 +155,4 @@ def test_a_board_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().out.startswith("2 of 2 images show the board, 108 corners in all")
     assert sorted(one.name for one in (tmp_path / "boards").iterdir()) == ["0001.png", "0002.png"]
     assert main(["detect", "board", str(path), *board, "--frames", "0"]) == 2
-    assert "'0' is no whole number from 1 on" in capsys.readouterr().err
+    assert "'0' is not a whole number of 1 or more" in capsys.readouterr().err
