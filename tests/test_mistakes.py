@@ -99,6 +99,7 @@ def test_a_misspelled_name_of_the_package() -> None:
 # ---- on the command line --------------------------------------------------------------------------------------------
 
 ON_THE_COMMAND_LINE = [
+    ("x" * 300, "see `ceres-cal --help`"),
     ("PHOTO", "a command comes first, such as `ceres-cal run` before photographs"),
     ("calibrat OBS", "there is no command 'calibrat': did you mean 'calibrate'?"),
     ("detect boards x.png", "detect what: did you mean 'detect board'?"),

@@ -97,7 +97,6 @@ class Comparison(Frozen):
         seen: the observations that took part, and `share` of all. as_good: how many standard errors worse is as good.
         start: of everything. there: where the chosen one is at its best.
         passed: the one that was chosen first, where all of the observations make no calibration with it.
-        beyond: longer than any that was tried: what it leaves open counts, and it takes no share from others.
     """
 
     seen: InlierRows
@@ -109,7 +108,6 @@ class Comparison(Frozen):
     chosen: Candidate
     there: Estimate
     passed: Candidate | None = None
-    beyond: tuple[Candidate, ...] = ()
 
     @property
     def worse_than_passed(self) -> float:
@@ -130,10 +128,7 @@ class Comparison(Frozen):
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness:
             return found
-        told = self._possible(least_probability)
-        likely = dict(zip(told, _probabilities(told), strict=True))
-        longer = [one for one in (*told, *self.beyond) if one.extends(self.chosen, self.as_good)]
-        likely |= {one: likely[self.chosen] for one in self.beyond if one in longer}
+        likely, longer = self._likely(least_probability)
         asked = [
             one for one in likely if one is not self.chosen and (one in longer or likely[one] >= least_probability)
         ]
@@ -175,6 +170,16 @@ class Comparison(Frozen):
         # What they say by chance is less by as much as there are more observations than took part.
         share = max(self.share, least_share) / max(left, least_probability)
         return replace(found, weights=tuple(share * one for one in found.weights))
+
+    def _likely(self, least: float) -> tuple[dict[Candidate, float], list[Candidate]]:
+        """The lenses that are possible with their probabilities, and which of them are the chosen one and more. One
+        power more than any that was tried has the chosen one's probability, and takes no share from others.
+        """
+        told = self._possible(least)
+        likely = dict(zip(told, _probabilities(told), strict=True))
+        every = (*told, *one_power_more(self.seen, self.chosen))
+        longer = [one for one in every if one.extends(self.chosen, self.as_good)]
+        return dict.fromkeys(longer, likely[self.chosen]) | likely, longer
 
     def _possible(self, least: float) -> list[Candidate]:
         """The lenses with a formula, without those that another of them refutes, where they are as probable as that:
@@ -309,7 +314,7 @@ def _among(
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
     more = tuple(last_resort(seen, found.chosen, by_most=by_most))
-    found = replace(found, tried=(*found.tried, *more), beyond=tuple(one_power_more(seen, found.chosen)))
+    found = replace(found, tried=(*found.tried, *more))
     # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.
     least = AS_GOOD if by_most else CLEARLY
     clearly = next((one for one in more if one.beats(found.chosen, least)), None)

@@ -127,11 +127,9 @@ def _foreseen(grid: Array) -> Array:
 
 def _shifted(values: Array, axis: int, by: int) -> Array:
     """The values of the neighbours `by` places before; NaN beyond the ends."""
-    moved, there = (
-        np.full_like(values, np.nan),
-        (slice(by, None), slice(-by)) if by > 0 else (slice(by), slice(-by, None)),
-    )
-    moved.swapaxes(0, axis)[there[0]] = values.swapaxes(0, axis)[there[1]]
+    moved = np.full_like(values, np.nan)
+    to, of = (slice(by, None), slice(-by)) if by > 0 else (slice(by), slice(-by, None))
+    moved.swapaxes(0, axis)[to] = values.swapaxes(0, axis)[of]
     return moved
 
 
