@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 
 _UNKNOWN = (
-    "camera {!r}: its views are too frontal to determine phi (95 %: {}). Heights are correlated with phi: places on "
-    "the floor are right, places above it are not. Add boards tilted by 20 degrees, or a prior on height_m"
+    "camera {!r}: its views are too frontal to determine phi (95 %: {}). Heights are correlated with phi: places above "
+    "the floor depend on it, places on the floor do not. Add boards tilted by 20 degrees, or a prior on height_m"
 )
 # Sizes that move a pixel of the image's corner by half the diagonal: a lens in which so many are one standard deviation
 # is none. Where as many equations as numbers leave a coefficient to rounding it is thousands of times that.
