@@ -12,6 +12,7 @@ from photos import shots as script
 from rendering.photograph import photograph
 from rendering.photography import taken_as
 from scenery import field_scene, overhead_pose
+from thorough import partly
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.frozen import replace
@@ -154,7 +155,7 @@ def test_targets_without_lines_at_right_angles() -> None:
 # ---- the search -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", ["quarter", "tilted 20 to 45 degrees"])
+@pytest.mark.parametrize("view", partly(["quarter", "tilted 20 to 45 degrees"], ["quarter"]))
 def test_views_of_any_kind(view: str) -> None:
     shot = auto_script.take_view(view, auto_script.VIEWS[view], 1)
     (found,) = auto_script.searched(iter([shot]))
@@ -183,7 +184,7 @@ def test_a_quarter_turn_that_looks_alike_too() -> None:
         search(near.grey, FIELD, NAMES, Auto())
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("mirrored", partly([False, True], [False]))
 def test_a_field_that_looks_alike_in_no_turn(mirrored: bool) -> None:
     target, scene = lopsided(), small_scene()
     image = photograph(scene, "overhead", "0001", seed=1).image
@@ -220,6 +221,7 @@ def test_pictures_without_a_field_are_misses(kind: str) -> None:
     assert found.followed is None and found.reason
 
 
+@pytest.mark.thorough
 def test_the_real_photograph_without_its_clicks(real_data: Path) -> None:
     """Its lines wander by pixels: no lens is to bend after them."""
     path, target = real_data / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png", script.real_target()
@@ -237,6 +239,7 @@ def test_the_real_photograph_without_its_clicks(real_data: Path) -> None:
 # ---- the whole way --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_from_photographs_alone_to_a_calibration(
     tmp_path: Path, shot: script.Shot, path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -254,6 +254,7 @@ def test_one_process_is_none() -> None:
         pass
 
 
+@pytest.mark.thorough
 def test_advice_is_the_same_over_an_executor() -> None:
     straight = calibrate(simulate(*built_in_scene("ssl-field"), seed=1).observations, Options(lens="radial"))
     promised = advise(straight)

@@ -12,6 +12,7 @@ import pytest
 SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark.py"
 
 
+@pytest.mark.thorough
 def test_quick_run(tmp_path: Path) -> None:
     path = tmp_path / "report.json"
     command = [sys.executable, str(SCRIPT), "--quick", "--json", str(path)]
@@ -34,6 +35,7 @@ def test_quick_run(tmp_path: Path) -> None:
     assert field["rms_px"] == pytest.approx(0.3, abs=0.03)  # 0.293 of 1000 line points
 
 
+@pytest.mark.thorough
 def test_scale_leaves_nothing_behind(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="Dask is an extra: pip install 'ceres-cal[dask]'")
     path, folder = tmp_path / "report.json", tmp_path / "folder"

@@ -146,6 +146,7 @@ def test_corners_stay_good_whatever_the_camera_does(change: str, limit: float, p
     assert rms(error) < limit
 
 
+@pytest.mark.thorough
 def test_large_squares_out_of_focus() -> None:
     """Squares of 120 px, blurred by 8 px: in discs of 20 px there is little but blur."""
     camera = Camera((1440, 1080), 1350.0, (730.0, 534.0), Radial((0.0,), (3,)))

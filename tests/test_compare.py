@@ -27,6 +27,7 @@ def test_equals_differ_nowhere(calibration: Calibration) -> None:
     assert found.holds and found.probability == pytest.approx(1.0)
 
 
+@pytest.mark.thorough
 def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
     """What two calibrations of the same camera differ by, over what they are expected to: 1, and any probability is as
     likely.

@@ -348,6 +348,7 @@ def test_one_line_aside_under_a_tolerance_is_a_whole_in_doubt() -> None:
     assert any("line 'HalfwayLine'" in warning for warning in calibration.warnings)
 
 
+@pytest.mark.thorough
 def test_a_height_measured_after_a_move_is_tested() -> None:
     old, new = calibrate(seen(15.0), RADIAL), seen(14.0, seed=3)
     assert refit(old, new, options=RefitOptions(priors=(height(*RIGHT),))).conflicts == ()

@@ -78,6 +78,7 @@ def test_a_constant_is_set_where_it_is_read() -> None:
     assert done.stdout.split() == ["7.0", "2.5", "0.8"]
 
 
+@pytest.mark.thorough
 def test_figures_are_measured(tmp_path: Path) -> None:
     """Where next to nothing counts as known, more directions are weak; an error is told, not hidden."""
     constant = Constant("posterior.uncertainty", "KNOWN", ("verdicts",))

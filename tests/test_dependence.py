@@ -13,6 +13,7 @@ from accuracy.scenes import CLEAN_NOISE, RADIAL, SSL_PROBLEMS, boards
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import corners
+from thorough import partly
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
@@ -54,7 +55,7 @@ def factors(calibration: Calibration) -> Array:
 # ---- what is found --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("length_m", [0.3, 0.6])
+@pytest.mark.parametrize("length_m", partly([0.3, 0.6], [0.3]))
 def test_a_length_along_lines_is_recovered(length_m: float) -> None:
     """Over eight runs; the grid has factors of two."""
     lengths, shares = [], []
@@ -87,6 +88,7 @@ def test_lines_that_are_each_aside_are_named() -> None:
     assert "errors are correlated along lines" in calibration.uncertainty.widening
 
 
+@pytest.mark.thorough
 def test_what_all_frames_share_does_not_shrink_with_them() -> None:
     """The same errors in six frames of a static camera: as wide as one frame alone, not by the root of six."""
     one = half_a_field(partial(along_lines, length_m=0.5), 3)
@@ -360,7 +362,9 @@ def test_the_spread_of_scores_is_that_over_all_pairs_of_views() -> None:
 # ---- coverage, by small samples -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["lines together over 0.5 m", "ten boards, smooth errors"])
+@pytest.mark.parametrize(
+    "name", partly(["lines together over 0.5 m", "ten boards, smooth errors"], ["ten boards, smooth errors"])
+)
 def test_intervals_hold_where_errors_go_together(name: str) -> None:
     """scripts/accuracy/intervals.py has more runs; without it 62 % and 68 %."""
     found = cover(CASES[name], range(15))

@@ -267,6 +267,7 @@ def test_a_planted_fault_is_named_and_nothing_else(name: str) -> None:
         assert findings[0].log10_p < -2.0
 
 
+@pytest.mark.thorough
 def test_how_large_they_are() -> None:
     (short,) = found("polynomial too short (r^5)", 3).findings
     assert "r^5 explains" in short.sentence.replace(",", "") and "--powers 2,3,5" in short.advice
@@ -317,6 +318,7 @@ def test_model_error_is_said_to_be_outside_of_the_covariance() -> None:
     assert not found("noise of points twice what was stated", 1).model_error
 
 
+@pytest.mark.thorough
 def test_silence_where_nothing_is_wrong() -> None:
     alarms = []
     for number in range(12):
@@ -386,6 +388,7 @@ def test_a_single_frame_cannot_be_held_out() -> None:
 # ---- real photographs -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_two_coefficients_are_too_few_for_the_wide_camera_and_three_enough(gopro_boards: BoardDetections) -> None:
     seen = gopro_boards.observations
     fixed = {"p1": 0.0, "p2": 0.0}

@@ -116,6 +116,7 @@ def test_nothing_of_size_is_known() -> None:
         assert radius.low < 0.5 < radius.high and radius.sd < 0.02  # 12 mm by the height, 1 mm by the length
 
 
+@pytest.mark.thorough
 def test_a_dimension_that_nothing_shows_and_one_that_is_contradicted() -> None:
     observations, _ = solved()
     marks = [name for name in FIELD.point_names if "Mark" not in name]
@@ -187,6 +188,7 @@ def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
     assert min(np.linalg.norm(away, axis=1)) < 0.3
 
 
+@pytest.mark.thorough
 def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     path, observed, out = (str(tmp_path / name) for name in ("odd.png", "field.json", "calibration.json"))
     cv2.imwrite(path, picture())

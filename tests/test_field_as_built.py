@@ -302,6 +302,7 @@ def test_a_part_that_a_field_may_lack_is_said_to_be_missing() -> None:
     assert np.max(np.linalg.norm(away, axis=1)) < 0.05
 
 
+@pytest.mark.thorough
 def test_auto_takes_no_other_target(path: Path) -> None:
     with pytest.raises(NothingShownError, match=rf"no field in any of 1 images; {path}: .*(corners|dimensions)"):
         detect_field([path], ssl_field("A"), Auto())

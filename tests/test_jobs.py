@@ -65,6 +65,7 @@ def test_a_refit_and_a_comparison(said: Said, calibration: Path, tmp_path: Path)
     assert said("compare_two", calibration, now).endswith("explained: False\n")
 
 
+@pytest.mark.thorough
 def test_pyright_accepts_them() -> None:
     pytest.importorskip("basedpyright", reason="pip install 'ceres-cal[dev]'")
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}

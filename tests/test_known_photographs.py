@@ -91,6 +91,7 @@ def test_a_knock_is_found_and_mended(calibration: Calibration) -> None:
     assert movements(calibration, mended)["camera"][1] == pytest.approx(1.077, abs=0.005)
 
 
+@pytest.mark.thorough
 def test_everything_known_is_found_and_what_shows_nothing_is_named(calibration: Calibration, folder: Path) -> None:
     steps: list[tuple[int, int, str]] = []
     images = [NEW, BOARD, folder / "dark.png"]
@@ -154,6 +155,7 @@ def test_wrong_input_is_refused_in_one_line(say: Say, folder: Path) -> None:
         assert message in refused(say(*arguments, "--quiet"))
 
 
+@pytest.mark.thorough
 def test_a_folder_of_photographs_is_kept_up_with(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

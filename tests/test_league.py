@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from accuracy.league import SET_UPS, SetUp, outcome, pairwise
+from thorough import partly
 
 
 def test_each_two_values_come_together() -> None:
@@ -24,7 +25,7 @@ def test_each_value_is_tried() -> None:
     assert [set(values) for values in zip(*SOME, strict=True)] == [set(values) for values in zip(*SET_UPS, strict=True)]
 
 
-@pytest.mark.parametrize("set_up", SOME, ids=str)
+@pytest.mark.parametrize("set_up", partly(SOME, [one for one in SOME if one.lens != "brown" or one.boards]), ids=str)
 def test_an_answer_or_one_honest_line(set_up: SetUp) -> None:
     """No traceback, no warning of NumPy; nothing "known" over 5 sd off, nor wider than it was stated. Five seconds are
     the script's to ask: a test that shares its processors has no clock.

@@ -267,6 +267,7 @@ def test_a_quieter_lens_is_not_left_for_what_it_takes_out() -> None:
     assert found.cameras["camera"].phi == pytest.approx(camera.phi, abs=0.15)  # 825.03
 
 
+@pytest.mark.thorough
 def test_decentring_is_seen_in_a_few_views(sony_boards: BoardDetections) -> None:
     """Halves of 13 views of 24 corners: .9 of what both state; with brown k1 in one of the second 2.2."""
     for seed in (0, 5):
@@ -279,6 +280,7 @@ def test_decentring_is_seen_in_a_few_views(sony_boards: BoardDetections) -> None
         )
 
 
+@pytest.mark.thorough
 def test_a_fisheye_in_few_views_has_a_start_of_its_own(real_data: Path) -> None:
     """From the start with the paper's lens no kind comes near; the paper's was taken, which left 2.5 px."""
     assert real_data.is_dir()
@@ -500,6 +502,7 @@ def test_a_lens_that_no_formula_has_is_seen_in_what_all_others_leave() -> None:
     assert plain is not None and not [one for one in plain.tried if one.label.startswith("spline")]
 
 
+@pytest.mark.thorough
 def test_more_observations_are_asked_where_all_leave_the_same_in_all_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """By some of them rays were off by 5.6 times what was stated, of a full frame of 186 views."""
     monkeypatch.setattr(rough_lenses, "_VIEWS", 60)
@@ -604,6 +607,7 @@ def test_few_observations_keep_to_the_papers_lens() -> None:
     assert any("no lens could be chosen" in words for words in calibration.warnings)
 
 
+@pytest.mark.thorough
 def test_a_few_corners_know_their_place_as_well_as_they_say() -> None:
     """Seven corners, clicked to half a pixel through a lens that is not the paper's."""
     true = Camera((1280, 960), 600.0, (643.0, 476.0), Brown((-0.25, 0.07, 2e-4, -3e-4, 0.0)))

@@ -105,6 +105,7 @@ def floors(calibration: Calibration, name: str) -> tuple[float, float]:
     return float(np.sqrt(np.mean((off / sd) ** 2))), 1e3 * float(np.sqrt(np.mean(sd**2)))
 
 
+@pytest.mark.thorough
 def test_a_camera_that_is_noisier_than_the_others_counts_and_is_known_by_its_own_noise() -> None:
     """At the mean noise of all the noisy one's floor was 2.9 times as far off as was stated, and in 60 % of places
     beyond what holds 95 %; the others stated twice as much as they do now.
@@ -136,6 +137,7 @@ def test_a_camera_of_which_nothing_is_judged_has_no_noise_of_its_own() -> None:
     assert noise.get("c0", 1.0) in (1.0, calibration.fit.of_cameras["c0"])
 
 
+@pytest.mark.thorough
 def test_what_is_stated_as_it_is_stays_so() -> None:
     assert calibrate(noisy(0), Options(noise_scale="stated")).fit.of_cameras == {}
 
@@ -153,6 +155,7 @@ def test_noise_of_cameras_comes_back_from_a_file_and_observations_take_it_once(t
     assert again.as_taken(observations.of_station("c3")).curves.sigma_px[0] == pytest.approx(factors[-1])
 
 
+@pytest.mark.thorough
 def test_a_noisy_camera_that_stands_still_raises_no_alarm() -> None:
     """New observations are judged at the noise that each camera had."""
     verdicts = check(calibrated_together(0), noisy(20))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from accuracy.odd_scenes import BESIDE, MOST_RADII, MOST_SIGMAS, ODD, outcome
+from thorough import partly
 
 # Sigmas of the farthest "known" number, radii of the farthest place: before, and measured since.
 _MENDED = {
@@ -22,9 +23,10 @@ _MENDED = {
 }
 
 
-@pytest.mark.parametrize(("kind", "lens", "seed"), list(_MENDED))
-def test_no_silent_wrong_answer(kind: str, lens: str, seed: int) -> None:
+@pytest.mark.parametrize("scene", partly(_MENDED, [*_MENDED][:6]), ids=str)
+def test_no_silent_wrong_answer(scene: tuple[str, str, int]) -> None:
     """Refused, or no "known" number beyond 5 sd and no place beyond 2.5 radii."""
+    kind, lens, seed = scene
     found = outcome(kind, ODD[kind], lens, seed)
     assert found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
 

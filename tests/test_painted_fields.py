@@ -198,6 +198,7 @@ def test_a_photograph_of_another_league(tmp_path: Path, capsys: pytest.CaptureFi
     assert len(truth) >= 4
 
 
+@pytest.mark.thorough
 def test_a_real_photograph_that_was_stretched(
     real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -240,6 +240,7 @@ def test_sony_boards(sony_boards: BoardDetections) -> None:
     assert abs(plain.station().phi - 702.6) <= 0.5  # 702.58 measured
 
 
+@pytest.mark.thorough
 def test_gopro_boards(gopro_boards: BoardDetections) -> None:
     """OpenCV with three radial coefficients, on its own corners: 0.5235 px and 560.07; some are 2 px and more off."""
     observations = gopro_boards.observations
@@ -261,6 +262,7 @@ def test_gopro_boards(gopro_boards: BoardDetections) -> None:
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.thorough
 def test_quick_form_side_by_side(tmp_path: Path) -> None:
     """By OpenCV as it is here, on the set of data/opencv_left and on two inputs."""
     path = tmp_path / "peers.json"

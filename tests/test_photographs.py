@@ -83,6 +83,7 @@ def test_rings_have_the_size_that_the_model_says() -> None:
     assert whole == pytest.approx(areas[0] + areas[2] - areas[1], rel=2e-5)
 
 
+@pytest.mark.thorough
 def test_board_corners_lie_where_the_model_says() -> None:
     board = checkerboard(9, 6, 0.05)
     stations = {"camera": Station("camera", Pose.identity())}
@@ -171,6 +172,7 @@ def test_covers_are_seen_at_their_height() -> None:
     assert np.hypot(*ball.T) == pytest.approx(posed.phi * BALL_RADIUS_M / (4.0 - BALL_RADIUS_M), rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_light_wear_and_noise_are_as_told() -> None:
     scene = tilted_field(PLAIN)
     bright = photograph(scene, "overhead", "0001").image.astype(float)

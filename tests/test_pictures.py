@@ -189,6 +189,7 @@ def test_what_cannot_be_straightened() -> None:
         straighten(replace(brown, principal_point=(9e4, 0.0)))
 
 
+@pytest.mark.thorough
 def test_gopro_boards_come_out_straight(real_data: Path, gopro_boards: BoardDetections) -> None:
     figures = {row.what: row.value for row in straightness.straight_rows(real_data, gopro_boards, every=2)}
     assert figures["boards, median: rows off straight, rms, px"] < 0.25  # 0.227; OpenCV 0.234, and 10 px before

@@ -96,6 +96,7 @@ def test_a_folder_is_watched(place: Path) -> None:
     assert [event["event"] for event in events[:2]] == ["suspected", "refitted"]
 
 
+@pytest.mark.thorough
 def test_a_week_in_fast_motion(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A move, a folder that is away and a full disk, each with files that are damaged beside good ones."""
     for name, value in (("HEAP", 10), ("KINDS", 3), ("MOVE_EVERY", 30), ("AWAY_EVERY", 20), ("FULL_EVERY", 40)):
@@ -105,6 +106,7 @@ def test_a_week_in_fast_motion(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert figures["files that were lost"] == 0 and "refits that are not one of 1 moves" in figures
 
 
+@pytest.mark.thorough
 def test_a_killed_refit_leaves_a_whole_calibration(place: Path) -> None:
     """Killed at random moments of its life, and, in a loop of nothing but writing, at random moments of that."""
     calibration, rng = place / "calibration.json", random.Random(0)

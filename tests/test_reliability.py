@@ -475,6 +475,7 @@ def test_threads_that_calibrate_at_once(calibration: Calibration) -> None:
         assert len({answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(4)]}) == 1
 
 
+@pytest.mark.thorough
 def test_sigterm_is_as_clean_as_ctrl_c(tmp_path: Path) -> None:
     """No stack of glog's, also in the middle of native work."""
     image, rng = tmp_path / "noise.jpg", np.random.default_rng(0)

@@ -174,6 +174,7 @@ def test_opencv_left_right(real_data: Path) -> None:
 
 
 @pytest.mark.usefixtures("words_alone")
+@pytest.mark.thorough
 def test_opencv_left_right_by_defaults_is_usable(real_data: Path, say: Say, tmp_path: Path) -> None:
     """What may be a thin prism of 4 ± 2 px, beside a spline that leaves 0.006 px of it, moved the principal point by 42
     standard deviations, "cannot be trusted"; heights above the other camera were "known to 9.6 % only".

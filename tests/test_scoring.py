@@ -183,6 +183,7 @@ def test_score_and_compare_as_typed(say: Say, calibration: Calibration, tmp_path
 
 
 @pytest.mark.usefixtures("real_data")
+@pytest.mark.thorough
 def test_ov_plane() -> None:
     """Its own split: scipy leaves 0.482 px in training, and 0.475 px of the test views with poses alone."""
     parts = [ov_plane(name) for name in ("train", "test")]

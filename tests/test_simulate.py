@@ -532,6 +532,7 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 # ---- the sample data ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_sample_data_come_from_the_script(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

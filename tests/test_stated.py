@@ -250,6 +250,7 @@ def test_no_sd_exceeds_its_own_priors(name: str) -> None:
     assert bool(calibration.conflicts) == ("conflict" in name)
 
 
+@pytest.mark.thorough
 def test_two_cameras_from_straight_above() -> None:
     """In one camera's valley the other has no keys; a height stated for one of them says nothing of the other's."""
     cameras, _ = side_by_side(camera("radial-2-3"))

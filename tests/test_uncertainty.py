@@ -20,6 +20,7 @@ from accuracy.odd_scenes import LENSES as ODD_LENSES
 from accuracy.scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
 from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES
+from thorough import partly
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -344,7 +345,7 @@ def test_a_prior_on_phi_is_part_of_its_profile() -> None:
     assert (verdict.low, verdict.high) == pytest.approx((560.0 - 117.6, 560.0 + 117.6), abs=12.0)  # 447, 683 measured
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_no_camera_a_hands_breadth_over_the_floor(seed: int) -> None:
     """At 1 degree a quarter of all least costs lie at a phi of a few px, and so do two cameras over an askew field."""
     for calibration in (
@@ -387,11 +388,12 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name, runs",
-    [("tilt 25 deg", 10), ("tilt 3 deg", 10), ("tilt 1 deg", 10), ("tilt 1 deg, height", 10), ("boards", 10)],
+    "name",
+    partly(["tilt 25 deg", "tilt 3 deg", "tilt 1 deg", "tilt 1 deg, height", "boards"], ["tilt 25 deg", "boards"]),
 )
-def test_intervals_hold_what_they_say(name: str, runs: int) -> None:
+def test_intervals_hold_what_they_say(name: str) -> None:
     """Four standard errors around 0.95, by few runs; accuracy/intervals.py has 500 of each, 0.943 to 0.964 measured."""
+    runs = 10
     found, wider = cover(CASES[name], range(runs)), np.sqrt(60.0 / runs)
     assert found.failed == 0
     mean, error = share(found.parameters)
@@ -525,6 +527,7 @@ def test_the_predicted_seam_is_what_draws_do() -> None:
     assert np.isnan(seam.sd_mm).any() and np.isfinite(seam.sd_mm).sum() > 50  # the middle of the field alone
 
 
+@pytest.mark.thorough
 def test_two_cameras_disagree_as_expected() -> None:
     """What is found over what was expected: 1 where points and stretches are what the calibration says they are."""
     squares = []

@@ -120,6 +120,7 @@ def test_a_rolling_shutter_is_found_and_named() -> None:
         assert abs(phi_off(calibration)) < 3.5  # 2.0 measured; 2.7 and 3.8 before, of three times the error
 
 
+@pytest.mark.thorough
 def test_what_is_taken_off_says_nothing_of_the_board() -> None:
     """It follows what the board seemed to be: one as long as drawn was longer one way, at a probability of 1."""
     bent = Board(views=VIEWS, points_m=2e-4, bow_m=1e-3, heights_m=3e-4)
@@ -140,6 +141,7 @@ def test_too_few_equations_beside_the_views_change_nothing(monkeypatch: pytest.M
     assert {one.kind for one in calibration.as_built} >= {"points", "warp"}
 
 
+@pytest.mark.thorough
 def test_pictures_of_two_cameras_are_no_stabilised_one(real_data: Path) -> None:
     """A real stereo pair in one folder, 13 pictures each: their read-out seems to say most of what is left."""
     pictures = sorted((real_data / "opencv_left_right").glob("*.jpg"))

@@ -84,6 +84,7 @@ def _page_faults() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - start
 
 
+@pytest.mark.thorough
 def test_workers_killed_twice_change_no_bit(
     client: Any, observations: Observations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +153,7 @@ def test_no_scheduler_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--scheduler nonsense://nowhere: no scheduler answers there" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_workers_are_seen_while_the_client_polls(cluster_client: Any) -> None:
     """What the client remembers of its scheduler names no worker for a moment after each of its polls."""
     often = dask.config.set({"distributed.client.scheduler-info-interval": "1ms"})
