@@ -50,18 +50,19 @@ def light(image: Image) -> Array32:
     """
     if image.ndim == 2:
         return image.astype(np.float32)
-    weights = _AS_SEEN if _is_colour_coarse(image) else _OF_MOSAIC
-    return np.asarray(cv2.transform(image.astype(np.float32), weights[None, :]), dtype=np.float32)
+    colours = image.astype(np.float32)
+    seen = np.asarray(cv2.transform(colours, _AS_SEEN[None, :]), dtype=np.float32)
+    every = seen if _is_colour_coarse(colours[..., 0], seen) else cv2.transform(colours, _OF_MOSAIC[None, :])
+    return np.asarray(every, dtype=np.float32)
 
 
-def _is_colour_coarse(image: Image) -> bool:
+def _is_colour_coarse(blue: Array32, seen: Array32) -> bool:
     """Whether the colours (blue beside what eyes see) of an image lack the detail that its light has."""
     kernel, coarse = np.array([1.0, -2.0, 1.0], np.float32), 0.2  # 0.03 to 0.13 of JPEG files, else 0.34 and more
     every = 4  # rows of which one is asked
-    seen = cv2.transform(image.astype(np.float32), _AS_SEEN[None, :])
-    fine, colour = (cv2.sepFilter2D(one, -1, kernel, kernel)[::every] for one in (seen, image[..., 0] - seen))
-    clear = np.abs(fine) >= np.quantile(np.abs(fine), 0.99)
-    return bool(np.mean(np.abs(colour[clear])) < coarse * np.mean(np.abs(fine[clear])))
+    fine, colour = (np.abs(cv2.sepFilter2D(one, -1, kernel, kernel)[::every]) for one in (seen, blue - seen))
+    clear = fine >= np.quantile(fine, 0.99)
+    return bool(np.mean(colour[clear]) < coarse * np.mean(fine[clear]))
 
 
 def read_colour(path: str | Path) -> Image:

@@ -37,8 +37,8 @@ class Nearness(Frozen):
         column, row = (np.round((v + 0.5) / _REDUCED - 0.5) for v in (x, y))
         height, width = self.plane.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)  # False for NaN
-        places = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-        return np.where(inside, self.plane[places], 0.0)
+        rows, columns = (np.where(inside, one, 0.0).astype(np.int32) for one in (row, column))
+        return np.where(inside, self.plane.ravel()[rows * width + columns], np.float32(0.0))
 
 
 def nearness(grey: Array32, width_px: float) -> Nearness:

@@ -85,12 +85,12 @@ def _reliefs(grey: Array32) -> list[tuple[Array32, ...]]:
     return [_relief(np.asarray(plane, np.float32)) for plane in planes]
 
 
-def _of_scales(reliefs: list[tuple[Array32, ...]]) -> Strokes:
-    """See `find_strokes`."""
+def _of_scales(reliefs: list[tuple[Array32, ...]], *, dark: bool = False) -> Strokes:
+    """See `find_strokes`, and those that are darker than the floor."""
     by_scale, (height, width) = [], reliefs[0][0].shape
     size = (width, height)
     for scale, relief in zip(_SCALES, reliefs, strict=True):
-        strokes = _strokes(*_ridge_points(relief))
+        strokes = _strokes(*_ridge_points(relief, dark=dark))
         by_scale.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
     fine, coarse = by_scale
     fine = fine.take(_COARSER * fine.strength >= _strength_beside(fine, coarse, size))
@@ -104,9 +104,8 @@ def strokes_of_signs(grey: Array32) -> tuple[Strokes, Strokes]:
     On fields with light lines dark ones came to 0.92 of their length at most, mostly to 0.2, but on one with dark seams
     to more; on two with dark lines to 6 and 14.
     """
-    bright = _reliefs(grey)
-    dark = [tuple(-planes[k] for k in (0, 1, 2, 3, 5, 4, 7, 6)) for planes in bright]  # the upper eigenvalue is lower
-    return _of_scales(bright), _of_scales(dark)
+    reliefs = _reliefs(grey)
+    return _of_scales(reliefs), _of_scales(reliefs, dark=True)
 
 
 def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:
@@ -128,45 +127,54 @@ def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, in
 
 
 def _relief(grey: Array32) -> tuple[Array32, ...]:
-    """A plane that is smoothed a little, what `_bends` makes of it, and the eigenvalues where it is smoothed more."""
+    """A plane that is smoothed a little, its `_second` derivatives, `_bends` of those, and the derivatives where it is
+    smoothed more.
+    """
     soft = _smoothed(grey, _SIGMA_PX)
-    return soft, *_bends(soft), *_bends(_smoothed(grey, 2.0 * _SIGMA_PX))[3:]
+    second = _second(soft)
+    return soft, *second, *_bends(*second), *_second(_smoothed(grey, 2.0 * _SIGMA_PX))
 
 
-def _ridge_points(relief: tuple[Array32, ...]) -> tuple[Array, Array, Indices]:
-    """Points on ridges: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
-    soft, xx, yy, xy, bend, _, wider, _ = relief
-    strength = np.maximum(-bend, 0.0)
+def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[Array, Array, Indices]:
+    """Points on ridges, or on valleys: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
+    soft, xx, yy, xy, middle, apart, *wide = relief
+    strength = np.maximum(apart + middle if dark else apart - middle, 0.0)
     usual = float(np.median(strength[::3, ::3]))
     # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
     size = (_NEARBY_PX, _NEARBY_PX)
     nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
     nearby = cv2.boxFilter(np.minimum(strength, 2.0 * _NOISE * nearby), cv2.CV_32F, size, normalize=True)
-    limit = np.maximum(_NOISE_NEARBY * nearby, max(_NOISE * usual, 1e-3))
-    ridge = (strength > limit) & (-wider < _WIDEST * strength)
+    ridge = strength > np.maximum(_NOISE_NEARBY * nearby, max(_NOISE * usual, 1e-3))
     ridge[:_BORDER_PX] = ridge[-_BORDER_PX:] = ridge[:, :_BORDER_PX] = ridge[:, -_BORDER_PX:] = False
     rows, columns = np.nonzero(ridge)
-    a, b, c = xx[rows, columns], xy[rows, columns], bend[rows, columns]
-    angle = 0.5 * np.arctan2(2.0 * b, a - yy[rows, columns]) + 0.5 * np.pi  # of the direction that bends most downwards
+    level, off = _bends(*(plane[rows, columns] for plane in wide))
+    thin = (off + level if dark else off - level) < _WIDEST * strength[rows, columns]
+    rows, columns, sign = rows[thin], columns[thin], np.float32(-1.0 if dark else 1.0)
+    a, b, d = (sign * plane[rows, columns] for plane in (xx, xy, yy))
+    angle = 0.5 * np.arctan2(2.0 * b, a - d) + 0.5 * np.pi  # of the direction that bends most
     nx, ny = np.cos(angle), np.sin(angle)
-    gx = 0.5 * (soft[rows, columns + 1] - soft[rows, columns - 1])
-    gy = 0.5 * (soft[rows + 1, columns] - soft[rows - 1, columns])
-    step = -(gx * nx + gy * ny) / c
+    gx = 0.5 * sign * (soft[rows, columns + 1] - soft[rows, columns - 1])
+    gy = 0.5 * sign * (soft[rows + 1, columns] - soft[rows - 1, columns])
+    high = strength[rows, columns]
+    step = (gx * nx + gy * ny) / high
     top = np.maximum(np.abs(step * nx), np.abs(step * ny)) <= 0.6
     mask = np.zeros(soft.shape, np.uint8)
     mask[rows[top], columns[top]] = 1
     joined = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX)))
     _, labels = cv2.connectedComponents(joined, connectivity=8)
     pixels = np.column_stack([columns + step * nx, rows + step * ny])[top]
-    return pixels, -c[top], labels[rows[top], columns[top]].astype(np.int64)
+    return pixels, high[top], labels[rows[top], columns[top]].astype(np.int64)
 
 
-def _bends(soft: Array32) -> tuple[Array32, ...]:
-    """Second derivatives by x, by y and by both, and both of their eigenvalues, the lower one first."""
+def _second(soft: Array32) -> tuple[Array32, ...]:
+    """Second derivatives by x, by y and by both."""
     orders = ((2, 0), (0, 2), (1, 1))
-    xx, yy, xy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in orders)
-    middle, apart = 0.5 * (xx + yy), np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
-    return tuple(map(_single, (xx, yy, xy, middle - apart, middle + apart)))
+    return tuple(_single(np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0) for order in orders)
+
+
+def _bends(xx: Array32, yy: Array32, xy: Array32) -> tuple[Array32, Array32]:
+    """The mean of both eigenvalues of second derivatives, and how far each is from that."""
+    return 0.5 * (xx + yy), np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
 
 
 def _smoothed(grey: Array32, sigma_px: float) -> Array32:

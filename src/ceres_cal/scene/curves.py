@@ -309,15 +309,15 @@ def _between_ends(curve: Curve, there: Array, slack_m: float) -> Mask:
 
 def _sine(one: Curve, other: Curve, there: Array) -> Array:
     """(N,) of the angle at which they cross."""
-    return np.abs(_cross(_way(one, there).T, _way(other, there).T))
+    return np.abs(_cross(_way(one, there), _way(other, there)))
 
 
 def _way(curve: Curve, there: Array) -> Array:
-    """(N, 2) of length 1."""
+    """(2, N) of length 1, (2, 1) where it is the same everywhere."""
     if isinstance(curve, Segment):
-        return np.broadcast_to(np.subtract(curve.end, curve.start)[:2] / curve.length_m, (len(there), 2))
-    out = (there - curve.centre)[:, :2] / curve.radius_m
-    return np.column_stack([-out[:, 1], out[:, 0]])
+        return np.subtract(curve.end, curve.start)[:2, None] / curve.length_m
+    x, y = (there - curve.centre).T[:2] / curve.radius_m
+    return np.array([-y, x])
 
 
 def _cross(one: Array, other: Array) -> Array:

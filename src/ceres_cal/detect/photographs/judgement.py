@@ -67,7 +67,7 @@ def objection(search: FieldSearch, followed: Followed) -> str:
         return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not is_lens(followed.camera):
         return "its lines were not found in any view from above: start from corners"
-    share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
+    share, of_all = explained(search, followed)
     told, as_drawn = coincidence(search, followed), followed.built.names and not followed.built.dimensions
     enough = _EXPLAINED, _OF_ALL if followed.absent else _OF_ALL_IF_WHOLE
     needed = _IF_ANY if told < _BY_ANY else enough
@@ -90,8 +90,8 @@ def is_shown(search: FieldSearch, followed: Followed) -> bool:
         return followed.holds
     if 2 * len({*detected_curves(search, followed), *followed.visible}) <= len(search.grid.curves):
         return False
-    everywhere = explained(search, followed, everywhere=True)
-    return everywhere > _EXPLAINED and explained(search, followed) > explained_if_worn
+    inside, everywhere = explained(search, followed)
+    return everywhere > _EXPLAINED and inside > explained_if_worn
 
 
 def likelihood(followed: Followed) -> float:
@@ -102,29 +102,30 @@ def likelihood(followed: Followed) -> float:
     return float(followed.places * divergence(max(followed.share, BY_CHANCE), BY_CHANCE))
 
 
-def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = False) -> float:
-    """Of the strokes inside the target's outline, or everywhere, that could be its lines, the share that lies on them.
+def explained(search: FieldSearch, followed: Followed) -> tuple[float, float]:
+    """Of the strokes inside the target's outline, and of those everywhere, that could be its lines, the share that lies
+    on them.
 
     Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
     stripes of sun that run otherwise, or are fainter, say nothing against it.
     """
     course_px = 3.0
     strokes, parallel = search.stroke_map.strokes, _parallel(search, followed)
-    course = predict(followed.target, followed.camera, search.grid.curves, course_px)
-    inside = parallel.along | parallel.across
-    if not everywhere:
-        low, high = parallel.outline
-        with np.errstate(invalid="ignore"):
-            inside &= np.all((parallel.middle > low) & (parallel.middle < high), axis=1)
-    if not np.any(inside) or not len(course):
-        return 0.0
-    middle, line = strokes.ends[inside].mean(axis=1), course.pixels
-    squares = np.sum(middle**2, axis=1) + np.min(np.sum(line**2, axis=1) - 2.0 * middle @ line.T, axis=1)
-    on_it, strength = squares < _NEAR_PX**2, strokes.strength[inside]
-    if not np.any(on_it):
-        return 0.0
-    strong = strength > _AS_STRONG * np.median(strength[on_it])
-    return float(np.average(on_it[strong], weights=strokes.length_px[inside][strong]))
+    line = predict(followed.target, followed.camera, search.grid.curves, course_px).pixels
+    everywhere, (low, high) = parallel.along | parallel.across, parallel.outline
+    with np.errstate(invalid="ignore"):
+        inside = everywhere & np.all((parallel.middle > low) & (parallel.middle < high), axis=1)
+    middle, length_px = strokes.ends.mean(axis=1), strokes.length_px
+    apart = np.min(np.sum(line**2, axis=1) - 2.0 * middle @ line.T, axis=1, initial=np.inf)
+    near = np.sum(middle**2, axis=1) + apart < _NEAR_PX**2
+
+    def share(among: Mask) -> float:
+        if not np.any(among & near):
+            return 0.0
+        strong = among & (strokes.strength > _AS_STRONG * np.median(strokes.strength[among & near]))
+        return float(np.average(near[strong], weights=length_px[strong]))
+
+    return share(inside), share(everywhere)
 
 
 class _Parallel(Frozen):

@@ -147,8 +147,9 @@ def _hypotheses(lines: FloorLines, grid: LineGrid) -> Array:
     parts = [_crossed(height_y, place_y, x, grid.across)[:, [0, 2, 1]], _crossed(height_x, place_x, y, grid.along)]
     every = np.concatenate(parts)
     every = every[every[:, 0] > 0.0]
-    cells = np.column_stack([np.log(every[:, 0]), every[:, 1:] / every[:, :1]]) / _CELL
-    return every[np.unique(np.round(cells).astype(np.int64), axis=0, return_index=True)[1]]
+    cells = np.round(np.column_stack([np.log(every[:, 0]), every[:, 1:] / every[:, :1]]) / _CELL)
+    order = np.lexsort(cells.T[::-1])  # as by np.unique, which compares rows one by one
+    return every[order[np.any(np.diff(cells[order], axis=0, prepend=np.nan), axis=1)]]
 
 
 def _pairs(peaks: Array, lines: Array) -> tuple[Array, Array]:
@@ -206,15 +207,17 @@ def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: 
 def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: tuple[Array, Mask]) -> Array:
     tells_px = 40.0  # of a line, as much as one place on it tells
     there, first = places
-    floor = (there.T[:, None] - hypotheses.T[1:, :, None]) / hypotheses[:, 0, None]
-    offsets = np.moveaxis(upright.offsets(np.moveaxis(floor, 0, -1)), -1, 0)
+    # In metres: a ray from the camera may have any length.
+    along, feet = upright.rotation[:, :2] @ there.T, upright.rotation @ hypotheses.T[[1, 2, 0]]
+    offsets = upright.offsets(along.astype(np.float32)[:, None] - feet.astype(np.float32)[:, :, None])
     x, y = stroke_map.centre.astype(np.float32)[:, None, None] + np.float32(stroke_map.unit_px) * offsets
     width, height = stroke_map.image_size
     with np.errstate(invalid="ignore"):
         inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-        step = np.sqrt(sum(np.diff(one, axis=1, prepend=one[:, :1]) ** 2 for one in (x, y)))
-    step = np.where(inside & ~first & np.isfinite(step), np.minimum(step, tells_px), 0.0)
-    near = stroke_map.near.at(x, y)
+        step = np.sqrt((x[:, 1:] - x[:, :-1]) ** 2 + (y[:, 1:] - y[:, :-1]) ** 2)
+    usable = inside[:, 1:] & ~first[1:] & (step < np.inf)
+    step = np.where(usable, np.minimum(step, np.float32(tells_px)), np.float32(0.0))
+    near = stroke_map.near.at(x[:, 1:], y[:, 1:])
     covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
     enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
     return np.where(enough, stroke_map.likelihood(covered, shown), 0.0)

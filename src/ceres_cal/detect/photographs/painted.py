@@ -28,28 +28,32 @@ _LACKS = 0.5
 def _seen(
     grey: Array32,
     target: Target,
-    camera: Camera,
-    curves: Collection[str],
-    share_of_image: float = _REACH,
+    course: Course,
+    share: float = _REACH,
     known: dict[float, float] | None = None,
-) -> tuple[Array, Array]:
-    """Of each of the target's C curves: places in view, and those of them that have paint nearby.
+) -> tuple[Array, Array, Array]:
+    """Of each of the target's C curves: places in view, and those of them that have paint nearby; and how bright what
+    is brightest near each place (N,) of the course is.
 
     Args:
         known: how bright lines laid anywhere are by chance, by their width.
     """
-    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
-    count = len(target.curves)
+    count, size = len(target.curves), (grey.shape[1], grey.shape[0])
     if len(course) < _FEWEST:
-        return np.zeros(count), np.zeros(count)
-    reach_px = 0.5 * share_of_image * float(np.hypot(*camera.image_size))
+        return np.zeros(count), np.zeros(count), np.zeros(len(course))
+    reach_px = 0.5 * share * float(np.hypot(*size))
     width_px, known = float(np.round(np.median(course.width_px))), {} if known is None else known
     if width_px not in known:
-        anywhere = search(grey, _laid_anywhere(camera.image_size, width_px), reach_px)[1]
+        anywhere = search(grey, _laid_anywhere(size, width_px), reach_px)[1]
         known[width_px] = float(np.quantile(anywhere, 1.0 - BY_CHANCE))
-    bright = search(grey, course, reach_px)[1] > known[width_px]
-    places, painted = (np.bincount(course.curve, one, count) for one in (np.ones(len(course)), bright))
-    return places.astype(float), painted.astype(float)
+    bright = search(grey, course, reach_px)[1]
+    every = np.ones(len(course)), bright > known[width_px]
+    places, painted = (np.bincount(course.curve, one, count) for one in every)
+    return places.astype(float), painted.astype(float), bright
+
+
+def _course(target: Target, camera: Camera, curves: Collection[str]) -> Course:
+    return predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
 
 
 def _lacking(target: Target, places: Array, bright: Array) -> set[str]:
@@ -74,17 +78,16 @@ def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
 
 def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
     """These curves without the optional parts of the target that are not in the picture, where the camera sees them."""
-    lacking = _lacking(target, *_seen(grey, target, camera, curves))
+    lacking = _lacking(target, *_seen(grey, target, _course(target, camera, curves))[:2])
     return tuple(name for name in curves if name not in lacking)
 
 
-def _covered(grey: Array32, target: Target, camera: Camera, curves: Collection[str], seen: Mask) -> Array:
-    """(C,) of each of the target's curves the places beside which lies no floor that those have which are seen (C,)."""
+def _covered(grey: Array32, course: Course, bright: Array, seen: Mask) -> Array:
+    """(C,) of each of the target's curves the places beside which lies no floor that those have which are seen (C,), by
+    how bright what is near each place (N,) is.
+    """
     beside_widths = 4.0  # from a line's middle, of its width: past its edges' blur, before its neighbour
-    if not np.any(seen):
-        return np.zeros(len(seen))
-    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
-    paint = search(grey, course, 0.5 * _NEAR * float(np.hypot(*camera.image_size)))[1] * seen[course.curve]
+    paint = bright * seen[course.curve]
     if not np.any(paint > 0.0):
         return np.zeros(len(seen))
     x, y = np.round(course.pixels + beside_widths * course.width_px[:, None] * course.normals).astype(int).T
@@ -98,10 +101,11 @@ def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
     other paint, to be measured; and those that something covers, by what is beside them: no floor that the others have.
     """
-    places, bright = _seen(grey, target, camera, curves, _NEAR)
-    share = np.maximum(bright / np.maximum(places, 1.0), BY_CHANCE)
+    course = _course(target, camera, curves)
+    places, painted, bright = _seen(grey, target, course, _NEAR)
+    share = np.maximum(painted / np.maximum(places, 1.0), BY_CHANCE)
     sure = places * divergence(share, BY_CHANCE) > _SURELY
-    sure |= _covered(grey, target, camera, curves, sure) > 0.5 * np.maximum(places, 1.0)
+    sure |= _covered(grey, course, bright, sure) > 0.5 * np.maximum(places, 1.0)
     return tuple(name for name in curves if sure[target.curve_index[name]])
 
 
@@ -116,7 +120,8 @@ def likelihoods_of_places(
     that are not seen say nothing.
     """
     known: dict[float, float] = {}
-    return [_likelihood(target, *_seen(grey, target, camera, curves, known=known)) for target, camera in places]
+    seen = ((target, _seen(grey, target, _course(target, camera, curves), known=known)) for target, camera in places)
+    return [_likelihood(target, own, painted) for target, (own, painted, _) in seen]
 
 
 def _likelihood(target: Target, places: Array, bright: Array) -> float:

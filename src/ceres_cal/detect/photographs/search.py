@@ -151,7 +151,7 @@ def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[Followed], F
             problem.refused.append(first)
             if seen is None or followed.share > seen.share:
                 seen, reason = followed, against
-        if good and (good[-1].built.names or explained(problem, good[-1]) > _SURE):
+        if good and (good[-1].built.names or explained(problem, good[-1])[0] > _SURE):
             break
     return good, seen, reason
 

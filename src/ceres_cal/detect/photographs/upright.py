@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, replace, rotation_exp
+from ceres_cal.base import AnyArray, Array, Frozen, replace, rotation_exp
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45, -0.6, -0.75)
@@ -64,15 +64,14 @@ class Upright(Frozen):
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(d[:, 2:] < -0.05, d[:, :2] / -d[:, 2:], np.nan)
 
-    def offsets(self, floor: Array) -> Array:
-        """(..., 2) of places (..., 2) on the floor: the other way; NaN behind the camera."""
-        u, v = floor[..., 0], floor[..., 1]
-        across, down, ahead = (u * x + v * y - z for x, y, z in self.rotation.astype(floor.dtype))
+    def offsets(self, rays: AnyArray) -> Array:
+        """(2, ...) of rays (3, ...) of any length in the camera's frame: the other way; NaN behind the camera."""
+        across, down, ahead = rays
         with np.errstate(divide="ignore", invalid="ignore"):
-            ideal = self.phi / np.where(ahead > 0.0, ahead, np.nan) * np.stack([across, down])
+            scale = self.phi / np.where(ahead > 0.0, ahead, np.nan)
             # p = ideal (1 + c p^2): the root that is near ideal for small c.
-            root = np.sqrt(1.0 - 4.0 * self.bend * (ideal[0] ** 2 + ideal[1] ** 2))
-            return np.moveaxis(2.0 * ideal / (1.0 + root), 0, -1)
+            root = np.sqrt(1.0 - 4.0 * self.bend * (across**2 + down**2) * scale**2)
+            return np.asarray(rays[:2] * (2.0 * scale / (1.0 + root)))
 
 
 def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0) -> list[Upright]:
