@@ -183,7 +183,6 @@ _OURS = ("PYTHONPATH", "XDG_CACHE_HOME")
 BARE = {name: value for name, value in os.environ.items() if name not in _OURS}
 
 
-@pytest.mark.thorough
 def test_a_wheel_in_a_clean_environment_calibrates(tmp_path: Path) -> None:
     """What was compiled by scripts/setup is in build/: only what changed since is compiled anew."""
     pytest.importorskip("scikit_build_core")

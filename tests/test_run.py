@@ -129,7 +129,6 @@ def test_a_plan_names_the_first_of_many_photographs() -> None:
 
 
 @pytest.mark.usefixtures("words_alone")
-@pytest.mark.thorough
 def test_a_folder_of_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

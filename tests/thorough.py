@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import pytest
-
-if TYPE_CHECKING:
-    from _pytest.mark import ParameterSet
 
 _T = TypeVar("_T")
 
 
-def partly(values: Iterable[_T], always: Collection[_T]) -> list[ParameterSet]:
+def partly(values: Iterable[_T], always: Collection[_T]) -> list[object]:
     """Each value is one argument; those that are not in `always` take minutes together and tell more of the same."""
     return [pytest.param(one, marks=() if one in always else pytest.mark.thorough) for one in values]

@@ -115,7 +115,7 @@ class ReportArguments(QuietArguments):
 
 def parse_number(text: str, where: str) -> float:
     """A finite number; InputError naming `where`."""
-    return finite(text, InputError(f"{where}: {text.strip()!r} is not a finite number: write it as -0.15 is"))
+    return finite(text, InputError(f"{where}: {text.strip()!r} is not a finite number, such as -0.15"))
 
 
 def parse_numbers(text: str, where: str) -> tuple[float, ...]:

@@ -138,7 +138,8 @@ def _relief(grey: Array32) -> tuple[Array32, ...]:
 def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[Array, Array, Indices]:
     """Points on ridges, or on valleys: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
     soft, xx, yy, xy, middle, apart, *wide = relief
-    strength = np.maximum(apart + middle if dark else apart - middle, 0.0)
+    sign = np.float32(-1.0 if dark else 1.0)
+    strength = np.maximum(apart - sign * middle, 0.0)
     usual = float(np.median(strength[::3, ::3]))
     # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
     size = (_NEARBY_PX, _NEARBY_PX)
@@ -148,8 +149,8 @@ def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[A
     ridge[:_BORDER_PX] = ridge[-_BORDER_PX:] = ridge[:, :_BORDER_PX] = ridge[:, -_BORDER_PX:] = False
     rows, columns = np.nonzero(ridge)
     level, off = _bends(*(plane[rows, columns] for plane in wide))
-    thin = (off + level if dark else off - level) < _WIDEST * strength[rows, columns]
-    rows, columns, sign = rows[thin], columns[thin], np.float32(-1.0 if dark else 1.0)
+    thin = off - sign * level < _WIDEST * strength[rows, columns]
+    rows, columns = rows[thin], columns[thin]
     a, b, d = (sign * plane[rows, columns] for plane in (xx, xy, yy))
     angle = 0.5 * np.arctan2(2.0 * b, a - d) + 0.5 * np.pi  # of the direction that bends most
     nx, ny = np.cos(angle), np.sin(angle)

@@ -308,7 +308,7 @@ def _between_ends(curve: Curve, there: Array, slack_m: float) -> Mask:
 
 
 def _sine(one: Curve, other: Curve, there: Array) -> Array:
-    """(N,) of the angle at which they cross."""
+    """(N,) of the angle at which they cross, (1,) of two straight ones."""
     return np.abs(_cross(_way(one, there), _way(other, there)))
 
 

@@ -29,7 +29,7 @@ def _seen(
     grey: Array32,
     target: Target,
     course: Course,
-    share: float = _REACH,
+    share_of_image: float = _REACH,
     known: dict[float, float] | None = None,
 ) -> tuple[Array, Array, Array]:
     """Of each of the target's C curves: places in view, and those of them that have paint nearby; and how bright what
@@ -41,7 +41,7 @@ def _seen(
     count, size = len(target.curves), (grey.shape[1], grey.shape[0])
     if len(course) < _FEWEST:
         return np.zeros(count), np.zeros(count), np.zeros(len(course))
-    reach_px = 0.5 * share * float(np.hypot(*size))
+    reach_px = 0.5 * share_of_image * float(np.hypot(*size))
     width_px, known = float(np.round(np.median(course.width_px))), {} if known is None else known
     if width_px not in known:
         anywhere = search(grey, _laid_anywhere(size, width_px), reach_px)[1]
