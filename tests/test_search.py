@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from accuracy.as_built import Board, observed
 from scenery import field_scene, overhead_pose
 
 from ceres_cal.base.errors import DegenerateError
@@ -87,6 +88,14 @@ def test_seen_alike_from_two_places() -> None:
     assert judged.level == "no" and "is seen alike from another place" in judged.headline
     assert off_in_sd(calibration) < 1.0  # 0.7
     assert off_in_sd(calibrate(replace(three, priors=(HEIGHT,)), KNOWN)) < 3.0  # 0.4
+
+
+def test_few_boards_tell_nothing_of_a_place_in_the_world() -> None:
+    """Each set of under 300 equations ended with "seen alike from (0.00, 0.00, 0.00) m", and was not trusted for it."""
+    few = observed(Board(views=3, columns=6), 0)[1]
+    calibration = calibrate(few)
+    assert calibration.ambiguities == ()
+    assert "seen alike" not in judge_quality(quality_of(calibration, few)).headline
 
 
 def test_what_is_open_is_named() -> None:

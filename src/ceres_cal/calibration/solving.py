@@ -261,7 +261,8 @@ def known_of(seen: Explained) -> Calibration:
     posterior, alike, remarks = None, dict[str, bool](), tuple[str, ...]()
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)
-        alike = dict(seen_alike(seen.others, seen.end.estimate, posterior.half_width))
+        of_world = seen.problem.sights.of_world
+        alike = dict(seen_alike(seen.others, seen.end.estimate, of_world, posterior.half_width))
         strange = (
             *unusual_pixels(seen.end, seen.problem, posterior),
             *seen_from_behind(seen.end.estimate, seen.problem.observations),

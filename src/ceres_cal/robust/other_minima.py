@@ -13,7 +13,7 @@ minima is the least, nor that there are two.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -260,16 +260,19 @@ def minima_of(
     return shifts, [each / (1.0 + sum(odds)) for each in odds]
 
 
-def seen_alike(others: Sequence[Solution], estimate: Estimate, half_width: float) -> Iterator[tuple[str, bool]]:
-    """A warning for each station that may stand elsewhere, with the likeliest other place, and whether it shows other
-    places on the floor from there: of those, if there are any.
+def seen_alike(
+    others: Sequence[Solution], estimate: Estimate, stations: Iterable[str], half_width: float
+) -> Iterator[tuple[str, bool]]:
+    """A warning for each of these stations that may stand elsewhere, with the likeliest other place, and whether it
+    shows other places on the floor from there: of those, if there are any.
 
     Args:
-        others, half_width: see `minima_of`.
+        stations: that see the world; of boards alone no place on the floor is known. others, half_width: see
+            `minima_of`.
     """
     likely = [one.estimate for one in sorted(others, key=lambda other: other.cost) if 2.0 * one.cost < half_width**2]
-    for name, station in estimate.stations.items():
-        here, camera = station.cam_from_world.position, estimate.camera_at(name)
+    for name in stations:
+        here, camera = estimate.stations[name].cam_from_world.position, estimate.camera_at(name)
         far = _APART * abs(here[2])
         elsewhere = [one.camera_at(name) for one in likely]
         apart = [one for one in elsewhere if _floors_apart_m(camera, one) > far]
