@@ -158,6 +158,16 @@ def test_baseline_and_angle_with_their_sd() -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5  # 0.9
 
 
+def test_few_boards_before_a_pair_are_as_wide_as_they_are_off() -> None:
+    """A weak direction was held with the boards that both see in it, of which no prior speaks: sd of 3 to 490 mm."""
+    off = []
+    for seed in range(4):
+        (pair,) = calibrate(_rig(checkerboard(5, 4, 0.1), 3, seed)).uncertainty.rig
+        assert pair.baseline_sd_m < 4e-3  # 0.7 to 2.8 mm
+        off.append((pair.baseline_m - _BASELINE_M) / pair.baseline_sd_m)
+    assert 0.2 < np.sqrt(np.mean(np.square(off))) < 1.5  # 0.45; 0.03 before
+
+
 def test_opencv_left_right(real_data: Path) -> None:
     """On its own corners cv2.stereoCalibrate, everything free at once, ends at 83.1815 mm and 0.2150 px."""
     board, sides = checkerboard(9, 6, 0.025), []

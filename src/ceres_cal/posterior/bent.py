@@ -254,12 +254,12 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
     """(K, A) directions of some of the keys whose sigma in natural sizes is above BENDING, one sigma long, in the units
     of the keys.
 
-    Structure is not looked at, nor what is not known at all, nor a lens without a formula, which is a sum of what its
-    numbers do.
+    Structure and placements are not looked at, which follow, nor what is not known at all, nor a lens without a
+    formula, which is a sum of what its numbers do.
     """
     sizes, at = natural_sizes(estimate, keys), information.columns(keys)
     sums = {(name, q) for name, one in estimate.cameras.items() for form in one.lens.roughness for q in form.names}
-    plain = np.array([key.kind != "structure" and key[1:3] not in sums for key in keys], dtype=bool)
+    plain = np.array([key.kind in ("camera", "station") and key[1:3] not in sums for key in keys], dtype=bool)
     scaled = information.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
     values, vectors = np.linalg.eigh(np.where(plain[:, None] & plain, scaled, 0.0))
     weak = values > BENDING**2
@@ -318,7 +318,9 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
     """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
     sizes = natural_sizes(estimate, keys)
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
-    held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
+    along = np.flatnonzero(row)
+    own = tuple(keys[column] for column in along)
+    held = GaussianPrior.about(Information(own, np.outer(row[along], row[along])), moved(estimate, keys, step))
     solution = solved_soon(replace(problem, priors=(*problem.priors, held)), estimate)
     if solution is None:
         return None

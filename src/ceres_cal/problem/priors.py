@@ -60,7 +60,13 @@ class GaussianPrior(Frozen):
 
     @classmethod
     def about(cls, information: Information, estimate: Estimate) -> GaussianPrior:
-        """What is known around an estimate."""
+        """What is known around an estimate.
+
+        Raises:
+            ValueError: a number is of a placement, which no prior speaks of.
+        """
+        if any(key.kind == "placement" for key in information.keys):
+            raise ValueError("a prior speaks of cameras, stations and structure, not of placements")
         turning = {key.owner for key in information.keys if key.kind == "station" and key.unit == "rad"}
         rotations = {name: estimate.stations[name].cam_from_world.rotation for name in turning}
         return cls(information, values_of(estimate, information.keys), rotations)
