@@ -21,6 +21,8 @@ from scipy.stats import norm
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.detect.photographs.upright import Upright
+from ceres_cal.detect.registration import REDUCED, Nearness
 from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns, core
 from ceres_cal.problem.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.residuals import camera_optics
@@ -893,6 +895,38 @@ def test_the_equations_of_profiles_are_those_of_their_formula(smear_px: float, l
     sizes = np.linalg.norm(columns, axis=1)
     assert np.max(np.abs(normals[0] - columns @ columns.T) / np.outer(sizes, sizes)) < 1e-6  # 1.2e-8  # 3e-8
     assert np.max(np.abs(rights[0] - columns @ values) / sizes / np.linalg.norm(values)) < 1e-6
+
+
+# ---- strokes --------------------------------------------------------------------------------------------------------
+
+
+def test_how_many_strokes_run_along_a_floor() -> None:
+    """Of any number of them, also far off; none where hardly any run along one of the axes."""
+    rng = np.random.default_rng(2)
+    planes, axes, weights = rng.normal(0.0, 3.0, (3, 77)), rng.normal(0.0, 1.0, (40, 2, 3)), rng.random(77)
+    along = np.exp(-((axes @ planes) ** 2))
+    least, expected = along @ weights, along.max(axis=1) @ weights
+    shares, limit = np.empty(40), float(np.median(least.min(axis=1)))
+    single = np.float32
+    kernels.shares_along(planes.astype(single), weights.astype(single), axes.astype(single), limit, shares)
+    assert shares == pytest.approx(np.where(least.min(axis=1) > limit, expected, 0.0), rel=1e-5)
+
+
+def test_how_much_of_lines_is_near_strokes() -> None:
+    """From where a camera is, and from behind the lines, where it shows none; past the picture none counts."""
+    upright, size, rng = Upright(-0.3, 1.2, np.eye(3), 1.0), (400, 300), np.random.default_rng(3)
+    middle = 0.5 * (np.array(size) - 1.0)
+    pixels = np.column_stack([np.linspace(-20.0, 420.0, 45), np.linspace(50.0, 250.0, 45)])
+    feet = np.array([[0.3, -0.2, 0.1], [0.0, 0.0, 99.0]])
+    along = feet[0] + rng.uniform(1.0, 3.0, 45)[:, None] * upright.rays((pixels - middle) / 250.0)
+    near, joined, sums = Nearness(rng.random((75, 100)).astype(np.float32)), np.arange(45) % 20 > 0, np.empty((2, 3))
+    optics = upright.bend, upright.phi, 250.0, *middle, *size
+    single = along.T.astype(np.float32), joined, feet.astype(np.float32)
+    kernels.lines_near(near.plane, REDUCED, optics, *single, sums)
+    inside = (pixels[:, 0] > -0.5) & (pixels[:, 0] < 399.5)
+    step = np.linalg.norm(np.diff(pixels, axis=0), axis=1) * (inside & joined)[1:]
+    assert sums[0] == pytest.approx([step @ near.at(*pixels[1:].T), step.sum(), inside.mean()], rel=1e-4)
+    assert not sums[1].any()
 
 
 def test_the_normal_distribution_is_told_far_out() -> None:

@@ -158,7 +158,8 @@ def as_a_program() -> None:
     objects = 100_000
     signal.signal(signal.SIGTERM, _terminate)
     gc.set_threshold(objects)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time
+    for threads in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        os.environ.setdefault(threads, "1")  # to begin others, which bring little (base.threads), takes time
     _open_what_is_closed()
     error = 2
     if not os.environ.get("CERES_CAL_DEBUG"):

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices32, Rows
+from ceres_cal.base import Array, Indices32, Rows, dots
 from ceres_cal.scene import Arc, Camera, Target, along_curve, along_track, curve_points, nearest_on_curve
 
 
@@ -45,7 +45,7 @@ def predict(
     number, s = _places(target, camera, np.array(painted, dtype=np.int32), spacing_px, margin_px)
     course = course_at(target, camera, number, s)
     # Where the lens folds over, paint may have one edge only; and what is wider no search is meant for.
-    whole = np.isfinite(course.curvature + np.sum(course.pixels + course.normals, axis=1))
+    whole = np.isfinite(course.curvature + dots(course.pixels, course.normals))
     return course.take(whole & (course.width_px < widest_px))
 
 
@@ -54,14 +54,15 @@ def _places(
 ) -> tuple[Indices32, Array]:
     """Curve (N,) and parameter (N,) of the places; what is projected is projected at once, which spares most of it."""
     pieces = 240  # of a curve, to measure its length in the image
-    low, high = np.array([curve.parameter_range for curve in target.curves.values()]).reshape(-1, 2)[curves].T
-    s = np.linspace(low, high, pieces + 1, axis=1)
-    pixels = _seen(target, camera, np.repeat(curves, pieces + 1), s.ravel()).reshape(*s.shape, 2)
+    low, high = _ends(target)[curves].T
+    s = np.ascontiguousarray(np.linspace(low, high, pieces + 1, axis=1))
+    places = along_track(target.tracks[0][curves][:, None], target.is_arc[curves][:, None], s)
+    x, y = camera.project(places.reshape(-1, 3)).T.reshape(2, *s.shape)
     size = np.array(camera.image_size)
     with np.errstate(invalid="ignore"):
-        near = np.all((pixels > -0.5 * size) & (pixels < 1.5 * size), axis=2)
-    step = np.where(near[:, 1:] & near[:, :-1], np.linalg.norm(np.diff(pixels, axis=1), axis=2), 0.0)
-    length = np.pad(np.cumsum(np.nan_to_num(step), axis=1), ((0, 0), (1, 0)))
+        near = (x > -0.5 * size[0]) & (x < 1.5 * size[0]) & (y > -0.5 * size[1]) & (y < 1.5 * size[1])
+        step = np.where(near[:, 1:] & near[:, :-1], np.sqrt(np.diff(x) ** 2 + np.diff(y) ** 2), 0.0)
+    length = np.concatenate([np.zeros((len(s), 1)), np.cumsum(step, axis=1)], axis=1)
     counts = (length[:, -1] / spacing_px).astype(int)
     chosen = [
         np.interp((np.arange(count) + 0.5) * (along[-1] / count), along, places)
@@ -69,20 +70,20 @@ def _places(
         if count
     ]
     number, s = np.repeat(curves, counts), np.concatenate([np.empty(0), *chosen])
-    there = _seen(target, camera, number, s)
+    there = camera.project(along_track(target.tracks[0][number], target.is_arc[number], s))
     with np.errstate(invalid="ignore"):
         inside = np.all((there > margin_px - 0.5) & (there < size - 0.5 - margin_px), axis=1)
     return number[inside], s[inside]
 
 
-def _seen(target: Target, camera: Camera, number: Indices32, s: Array) -> Array:
-    """Pixels (N, 2) of the middles of curves (N,) at parameters (N,)."""
-    return camera.project(along_track(target.tracks[0][number], target.is_arc[number], s))
+def _ends(target: Target) -> Array:
+    """(C, 2) parameters of where the target's curves begin and end."""
+    return np.array([curve.parameter_range for curve in target.curves.values()]).reshape(-1, 2)
 
 
 def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Course:
     """The course through places that are given by curve (N,) and parameter (N,)."""
-    span = np.array([np.diff(curve.parameter_range)[0] for curve in target.curves.values()])[number]
+    span = np.diff(_ends(target)[number])[:, 0]
     steps = np.array([-2e-3, 0.0, 2e-3, 0.0, 0.0])[:, None] * span
     tracks = np.stack([target.tracks[side][number] for side in (0, 0, 0, 1, -1)]).reshape(-1, 3, 3)
     places = along_track(tracks, np.tile(target.is_arc[number], 5), (s + steps).ravel())
@@ -91,9 +92,9 @@ def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Co
     length = np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     tangent = tangent / length
     normals = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    normals *= np.where(np.sum((left - right) * normals, axis=1) < 0.0, -1.0, 1.0)[:, None]
-    width = np.sum((left - right) * normals, axis=1)
-    bend = np.sum((before - 2.0 * pixels + after) * normals, axis=1) / (0.5 * length[:, 0]) ** 2
+    normals *= np.where(dots(left - right, normals) < 0.0, -1.0, 1.0)[:, None]
+    width = dots(left - right, normals)
+    bend = dots(before - 2.0 * pixels + after, normals) / (0.5 * length[:, 0]) ** 2
     return Course(number, s, pixels, normals, bend, width)
 
 

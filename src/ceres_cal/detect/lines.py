@@ -162,11 +162,14 @@ def _along_normals(grey: Array32, course: Course, steps: Array, shifts_px: Seque
     """(N, S) light at steps (S,) px along the normals, the mean of places shifted so along the line."""
     nx, ny = course.normals.T[..., None]
     x, y = course.pixels[:, 0, None] + steps * nx, course.pixels[:, 1, None] + steps * ny
-    flags, border, light = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE, np.zeros(x.shape)
-    for shift in shifts_px:
-        there = (x + shift * ny).astype(np.float32), (y - shift * nx).astype(np.float32)
-        light += cv2.remap(grey, *there, flags, borderMode=border)
-    return light / len(shifts_px)
+    shape = len(shifts_px), *x.shape
+    there = np.empty((2, *shape), np.float32)
+    for number, shift in enumerate(shifts_px):
+        np.add(x, shift * ny, out=there[0, number], casting="same_kind")
+        np.subtract(y, shift * nx, out=there[1, number], casting="same_kind")
+    map_x, map_y = there.reshape(2, -1, len(steps))
+    light = cv2.remap(grey, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(light.reshape(shape).sum(axis=0, dtype=float) / len(shifts_px))
 
 
 def measure(

@@ -13,20 +13,20 @@ import numpy as np
 from ceres_cal.base import Array, Array32, Frozen, Mask
 from ceres_cal.detect.courses import Course
 
-_REDUCED = 4
+REDUCED = 4
 _NEAR_PX = 8.0
 _TURNS_DEG = np.arange(-7.5, 7.6, 1.25)
 
 
 class Nearness(Frozen):
-    """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, _REDUCED times smaller."""
+    """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, REDUCED times smaller."""
 
     plane: Array32
 
     @property
     def length_px(self) -> float:
         """The length of the lines, with what is near to their ends."""
-        return float(np.sum(self.plane) * _REDUCED**2 / (np.sqrt(2.0 * np.pi) * _NEAR_PX))
+        return float(np.sum(self.plane) * REDUCED**2 / (np.sqrt(2.0 * np.pi) * _NEAR_PX))
 
     def score(self, pixels: Array) -> float:
         """Mean nearness of places (N, 2) px; those outside the image count as far off."""
@@ -34,7 +34,7 @@ class Nearness(Frozen):
 
     def at(self, x: Array, y: Array) -> Array:
         """Nearness of places x, y px of any shape; 0 outside the image."""
-        column, row = (np.round((v + 0.5) / _REDUCED - 0.5) for v in (x, y))
+        column, row = (np.round((v + 0.5) / REDUCED - 0.5) for v in (x, y))
         height, width = self.plane.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)  # False for NaN
         rows, columns = (np.where(inside, one, 0.0).astype(np.int32) for one in (row, column))
@@ -58,7 +58,7 @@ def nearness(grey: Array32, width_px: float) -> Nearness:
 
 def nearness_to(mask: Mask) -> Nearness:
     """How near each pixel is to those of a mask (height, width)."""
-    size = mask.shape[1] // _REDUCED, mask.shape[0] // _REDUCED
+    size = mask.shape[1] // REDUCED, mask.shape[0] // REDUCED
     if not np.any(mask):
         return Nearness(np.zeros(size[::-1], np.float32))
     away = cv2.distanceTransform(1 - mask.astype(np.uint8), cv2.DIST_L2, 3)
@@ -73,7 +73,7 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
     apart_px = 25.0
     scales = (0.92, 1.0, 1.08)
     middle = 0.5 * np.array(image_size)
-    steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * _REDUCED)
+    steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * REDUCED)
     away, scored = course.pixels - middle, []
     for turn, scale in product(np.deg2rad(_TURNS_DEG), scales):
         cosine, sine = scale * np.cos(turn), scale * np.sin(turn)

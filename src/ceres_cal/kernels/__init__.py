@@ -8,6 +8,7 @@ ValueError that says what is needed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Array32, Indices
+from ceres_cal.base.arrays import Array, Array32, Indices, Mask
 
 IN_ORDER, NO_NORMALS = np.empty(0, dtype=np.int64), np.empty((0, 2))
 
@@ -289,6 +290,31 @@ def profile_equations(
         normals, rights: (N, P, P) and (N, P), filled: by b, g and each height, by c, and by these.
     """
     core().profile_equations(distance, values, edges, shapes, heights, free, normals, rights)
+
+
+def shares_along(planes: Array32, weights: Array32, axes: Array32, least: float, shares: Array) -> None:
+    """The share of N strokes that run along either of two axes of a floor, to `shares` (B,); none where no more than
+    `least` run along one of them.
+
+    Args:
+        planes: (3, N) normals of the strokes' planes, over the sine by which one may be off. weights: (N,) in all 1.
+        axes: (B, 2, 3) in the camera's frame.
+    """
+    core().shares_along(planes, weights, axes, least, shares)
+
+
+def lines_near(
+    plane: Array32, reduced: int, optics: Sequence[float], along: Array32, joined: Mask, feet: Array32, sums: Array
+) -> None:
+    """How many px of lines are near strokes, and shown, and the share of the places on them in view, to `sums` (K, 3).
+
+    Args:
+        plane: (H, W) nearness, `reduced` times smaller than the picture. optics: bend and phi of an `Upright`, the
+            length that these are in, px, and the centre and size of the picture, px.
+        along: (3, P) places on the lines, in axes that the camera has. joined: (P,) to the place before it.
+        feet: (K, 3) where the camera is, in the same axes.
+    """
+    core().lines_near(plane, reduced, np.array(optics, np.float32), along, joined, feet, sums)
 
 
 # ---- the solve ------------------------------------------------------------------------------------------------------

@@ -104,12 +104,13 @@ def _with_plain_floats(curve: Curve, *places: str) -> None:
 
 
 def along_track(track: ArrayLike, is_arc: bool | Mask, s: ArrayLike) -> Array:
-    """C(s) on one track (3, 3) or on one track per s (N, 3, 3): (N, 3) m."""
+    """C(s) on one track (3, 3) or on one track per s (N, 3, 3): (N, 3) m; of any shapes that fit each other."""
     tracks, s = np.asarray(track, dtype=float), np.asarray(s, dtype=float)
-    first = np.where(is_arc, np.cos(s), s)
-    second = np.where(is_arc, np.sin(s), 0.0)
+    turns = np.broadcast_to(is_arc, s.shape)
+    first, second = s.copy(), np.zeros(s.shape)
+    first[turns], second[turns] = np.cos(s[turns]), np.sin(s[turns])
     c, a, b = tracks[..., 0, :], tracks[..., 1, :], tracks[..., 2, :]
-    return np.asarray(c + first[:, None] * a + second[:, None] * b)
+    return np.asarray(c + first[..., None] * a + second[..., None] * b)
 
 
 def along_curve(curve: Curve, s: ArrayLike, side: int = 0) -> Array:

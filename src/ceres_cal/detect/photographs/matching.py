@@ -15,8 +15,9 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Mask, Pose, cached_property, replace
 from ceres_cal.detect.photographs.grid import LineGrid, places_along
 from ceres_cal.detect.photographs.upright import Upright
-from ceres_cal.detect.registration import Nearness
+from ceres_cal.detect.registration import REDUCED, Nearness
 from ceres_cal.detect.strokes import Strokes, alone
+from ceres_cal.kernels import lines_near
 
 # Of lines on the floor, in camera heights: how well a straightened stroke tells its place.
 _PEAK = 0.012
@@ -198,26 +199,12 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
 
 def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: tuple[Array, Mask]) -> Array:
     """(K,) of each hypothesis, from 0 to 1."""
-    block = 40_000 // len(places[0])  # as many as stay in the cache
-    blocks = range(0, len(hypotheses), block)
-    parts = [_scored(stroke_map, upright, hypotheses[b : b + block].astype(np.float32), places) for b in blocks]
-    return np.concatenate([np.empty(0), *parts])
-
-
-def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: tuple[Array, Mask]) -> Array:
-    tells_px = 40.0  # of a line, as much as one place on it tells
     there, first = places
+    optics = upright.bend, upright.phi, stroke_map.unit_px, *stroke_map.centre, *stroke_map.image_size
     # In metres: a ray from the camera may have any length.
-    along, feet = upright.rotation[:, :2] @ there.T, upright.rotation @ hypotheses.T[[1, 2, 0]]
-    offsets = upright.offsets(along.astype(np.float32)[:, None] - feet.astype(np.float32)[:, :, None])
-    x, y = stroke_map.centre.astype(np.float32)[:, None, None] + np.float32(stroke_map.unit_px) * offsets
-    width, height = stroke_map.image_size
-    with np.errstate(invalid="ignore"):
-        inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-        step = np.sqrt((x[:, 1:] - x[:, :-1]) ** 2 + (y[:, 1:] - y[:, :-1]) ** 2)
-    usable = inside[:, 1:] & ~first[1:] & (step < np.inf)
-    step = np.where(usable, np.minimum(step, np.float32(tells_px)), np.float32(0.0))
-    near = stroke_map.near.at(x[:, 1:], y[:, 1:])
-    covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
-    enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
-    return np.where(enough, stroke_map.likelihood(covered, shown), 0.0)
+    along, feet = upright.rotation[:, :2] @ there.T, hypotheses[:, [1, 2, 0]] @ upright.rotation.T
+    sums = np.empty((len(hypotheses), 3))
+    near = stroke_map.near
+    lines_near(near.plane, REDUCED, optics, along.astype(np.float32), ~first, feet.astype(np.float32), sums)
+    covered, shown, inside = sums.T
+    return np.where(inside >= _LEAST_IN_VIEW, stroke_map.likelihood(covered, shown), 0.0)

@@ -15,7 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Frozen, replace, rotation_exp
+from ceres_cal.base import Array, Frozen, replace, rotation_exp
+from ceres_cal.kernels import shares_along
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45, -0.6, -0.75)
@@ -63,15 +64,6 @@ class Upright(Frozen):
         d = self.rays(offsets) @ self.rotation
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(d[:, 2:] < -0.05, d[:, :2] / -d[:, 2:], np.nan)
-
-    def offsets(self, rays: AnyArray) -> Array:
-        """(2, ...) of rays (3, ...) of any length in the camera's frame: the other way; NaN behind the camera."""
-        across, down, ahead = rays
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = self.phi / np.where(ahead > 0.0, ahead, np.nan)
-            # p = ideal (1 + c p^2): the root that is near ideal for small c.
-            root = np.sqrt(1.0 - 4.0 * self.bend * (across**2 + down**2) * scale**2)
-            return np.asarray(rays[:2] * (2.0 * scale / (1.0 + root)))
 
 
 def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0) -> list[Upright]:
@@ -128,16 +120,11 @@ def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Arra
 
 def _score(normals: Array, weights: Array, rotations: Array, tolerance: float, least: float) -> Array:
     """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
-    single, block = np.float32, 128  # twice as fast, and good enough for a share; and as many as stay in the cache
-    planes = (normals / (tolerance * np.linalg.norm(normals, axis=1, keepdims=True))).astype(single)
-    axes, weight = rotations[:, :, :2].astype(single), (weights / weights.sum()).astype(single)
-    shares = []
-    for start in range(0, len(axes), block):
-        off = np.moveaxis(axes[start : start + block], 2, 0) @ planes.T  # (2, b, N)
-        along = np.exp(np.negative(np.square(off, out=off), out=off), out=off)
-        least_share = np.minimum(*(along @ weight))
-        shares.append(np.where(least_share > least, np.maximum(*along) @ weight, 0.0))
-    return np.concatenate(shares)
+    planes = normals / (tolerance * np.linalg.norm(normals, axis=1, keepdims=True))
+    shares, axes = np.empty(len(rotations)), np.swapaxes(rotations[:, :, :2], 1, 2)
+    single = np.float32  # twice as fast, and good enough for a share
+    shares_along(planes.T.astype(single), (weights / weights.sum()).astype(single), axes.astype(single), least, shares)
+    return shares
 
 
 def _penalty(optics: Upright) -> float:

@@ -10,6 +10,7 @@
 #include "profiles.hpp"
 #include "saddles.hpp"
 #include "strands.hpp"
+#include "strokes.hpp"
 #include "sums.hpp"
 
 namespace ceres_cal {
@@ -283,6 +284,33 @@ void profile_equations(const Read<N, N>& distance, const Read<N, N>& values, con
     });
 }
 
+void shares_along(const Array<const float, 3, N>& planes, const Array<const float, N>& weights,
+                  const Array<const float, N, 2, 3>& axes, double least, const Filled<N>& shares) {
+    require(weights.size() == planes.shape(1) && shares.size() == axes.shape(0),
+            "planes are (3, N), weights (N,), axes (B, 2, 3), shares (B,)");
+    unlocked([&] {
+        for (int64_t k = 0; k < static_cast<int64_t>(shares.size()); ++k)
+            shares.data()[k] = share_along(whole(weights.size()), planes.data(), weights.data(), row(axes, k),
+                                           row(axes, k) + 3, static_cast<float>(least));
+    });
+}
+
+void lines_near(const Array<const float, N, N>& plane, int reduced, const Array<const float, 7>& optics,
+                const Array<const float, 3, N>& along, const Array<const bool, N>& joined,
+                const Array<const float, N, 3>& feet, const Filled<N, 3>& sums) {
+    require(joined.size() == along.shape(1) && (joined.size() == 0 || !joined.data()[0]) && reduced > 0,
+            "along is (3, P), joined (P,) and not the first");
+    require(sums.shape(0) == feet.shape(0), "feet and sums are (K, 3)");
+    const float* const o = optics.data();
+    unlocked([&] {
+        const Nearby near{plane.data(), static_cast<int64_t>(plane.shape(0)), static_cast<int64_t>(plane.shape(1)),
+                          static_cast<float>(reduced)};
+        Shown shown(near, {o[0], o[1], o[2], o[3], o[4], o[5], o[6]}, whole(joined.size()), along.data(),
+                    joined.data());
+        for (int64_t k = 0; k < static_cast<int64_t>(feet.shape(0)); ++k) shown.add_up(row(feet, k), row(sums, k));
+    });
+}
+
 int64_t strands_left(const Read<N, N>& values, const Bounds& bounds, const Bounds& group, const Read<N, N, N>& rows,
                      const Read<N>& shares, const Filled<N>& logs, const Filled<N, N, N>& left) {
     const size_t shapes = values.shape(0), size = rows.shape(0), strands = rows.shape(1), numbers = rows.shape(2);
@@ -338,6 +366,8 @@ NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("fit_saddles", &fit_saddles);
     m.def("profile_equations", &profile_equations);
     m.def("curve_rows", &find_rows<CurvesGiven, 1>);
+    m.def("shares_along", &shares_along);
+    m.def("lines_near", &lines_near);
     m.def("strands_left", &strands_left);
 }
 
