@@ -538,7 +538,7 @@ def test_errors_without_a_placement_are_those_of_a_solve_without_it() -> None:
     rows = np.array([observations.views[v].placement == out for v in model.equations.view])
     posed = replace(model, score=np.where(rows, model.weight * again.residual, 0.0)).placed_score
     number = int(model.equations.sight[rows][0])
-    predicted = normals.held_out({})[0][number] ** 0.5
+    predicted = normals.held_out([{}])[0][0, number] ** 0.5
     assert np.linalg.norm(posed[rows]) == pytest.approx(predicted, rel=0.02)
     assert predicted > 1.01 * np.linalg.norm(model.left_over[rows])
 
@@ -550,7 +550,7 @@ def test_a_shorter_lens_is_the_longest_with_coefficients_at_0() -> None:
     normals, _ = _normals(observations, calibration)
     keys = [key for key in normals.keys if key.quantity in ("a4", "a5")]
     held = {key: -calibration.station().lens.coefficients[key.quantity] for key in keys}
-    _, step = normals.held_out(held)
+    _, (step,) = normals.held_out([held])
     shorter = calibrate(observations, replace(_PLAIN, lens="radial"))
     there = {key.quantity: value for key, value in zip(normals.keys, step, strict=True)}
     sd = shorter.uncertainty.posterior.sd_of("camera", "camera", "phi")

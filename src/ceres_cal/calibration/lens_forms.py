@@ -197,12 +197,18 @@ def pseudo_bma(squares: Sequence[Array]) -> Array:
         squares: (G,) squared errors of each lens by group.
     """
     each = np.array(squares)
-    signs = np.ones((1, 1))
-    while len(signs) <= each.shape[1]:
-        signs = np.vstack([np.hstack([signs, signs]), np.hstack([signs, -signs])])  # Sylvester's Hadamard matrix
-    more = 0.5 * (1.0 + signs[:, 1 : each.shape[1] + 1]) @ each.T
+    more = _half_samples(each.shape[1]) @ each.T
     likelihoods = np.exp(more.min(axis=1, keepdims=True) - more)
     return np.asarray(np.mean(likelihoods / likelihoods.sum(axis=1, keepdims=True), axis=0))
+
+
+@cache
+def _half_samples(groups: int) -> Array:
+    """(D, G) 1 of the groups that are in a draw, else 0: each in half of them, each two in a quarter."""
+    signs = np.ones((1, 1))
+    while len(signs) <= groups:
+        signs = np.kron([[1.0, 1.0], [1.0, -1.0]], signs)  # Sylvester's Hadamard matrix
+    return np.asarray(0.5 * (1.0 + signs[:, 1 : groups + 1]))
 
 
 def surprise(squares: Array, counts: Array) -> Array:

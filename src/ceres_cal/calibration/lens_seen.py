@@ -65,19 +65,15 @@ class Kind(Frozen):
         return np.inf if self.normals is None else self.normals.least
 
     def candidates(self, *, first: bool) -> Iterator[Candidate]:
-        """The longest lens of the kind and the paper's, or all others."""
-        for form in self.forms:
-            if first == (form is self.forms[0] or form.label == PAPER):
-                yield self._judged(form)
-
-    def _judged(self, form: Form) -> Candidate:
-        """A lens with its errors of prediction."""
-        if self.normals is None:
-            return Candidate(form, self, failed=self.failed)
-        squares, step = self.normals.held_out(self.to_nothing(form))
-        rms_px = self.sigma_px * float(np.sqrt(max(squares.sum(), 0.0) / self.normals.counts.sum()))
-        least = self.normals.squares_at(step)
-        return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step, least)
+        """The longest lens of the kind and the paper's, or all others, with their errors of prediction."""
+        forms = [form for form in self.forms if first == (form is self.forms[0] or form.label == PAPER)]
+        if self.normals is None or not forms:
+            yield from (Candidate(form, self, failed=self.failed) for form in forms)
+            return
+        counts, held_out = self.normals.counts, self.normals.held_out([self.to_nothing(form) for form in forms])
+        for form, squares, step in zip(forms, *held_out, strict=True):
+            rms_px = self.sigma_px * float(np.sqrt(max(squares.sum(), 0.0) / counts.sum()))
+            yield Candidate(form, self, surprise(squares, counts), rms_px, step, self.normals.squares_at(step))
 
     def slopes(self, lenses: OtherLenses) -> Sequence[Array]:
         """How what pixels show moves with its numbers, see `shown_slopes`."""

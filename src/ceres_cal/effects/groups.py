@@ -19,13 +19,13 @@ number of views that would say as much if all said the same.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, cached_property, known_inverses
 from ceres_cal.effects.evidence import DEPENDENCE
-from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, prior_equations
+from ceres_cal.effects.linearised import SINGULAR, Linearised, inverse_root, inverse_roots, prior_equations
 from ceres_cal.observations.sights import Owner, SightKey, Sights
 from ceres_cal.problem import Estimate, Key, Problem, free_keys
 from ceres_cal.problem.reduced import normals_with_residuals, owned_columns, steps_of
@@ -93,36 +93,42 @@ class GroupNormals(Frozen):
         moved = (along @ np.swapaxes(turn, 1, 2))[:, 0] @ axes
         return float(len(moved) * np.mean(moved**2))
 
-    def held_out(self, held: Mapping[Key, float]) -> tuple[Array, Array]:
-        """(G,) squared errors of each group predicted from all others, and the step (K,) to where the least squares
-        are, when some of the numbers are held so far from where they stand.
+    def held_out(self, every: Sequence[Mapping[Key, float]]) -> tuple[Array, Array]:
+        """(F, G) squared errors of each group predicted from all others, and the steps (F, K) to where the least
+        squares are, when some of the numbers are held so far from where they stand, in one way or another.
         """
-        step, root = np.array([held.get(key, 0.0) for key in self.keys]), self.root(held)
-        step -= root @ (root.T @ (self._slope + self._whole @ step))
-        moved = self.normal @ step
-        squares = self.squares + 2.0 * (self.gradient @ step) + moved @ step
-        gradient = (self.gradient + moved) @ root
-        own, rest = self._split(root)
-        without = np.linalg.solve(rest, gradient[:, :, None])[:, :, 0]
-        squares += np.einsum("gk,gk->g", 2.0 * gradient + np.einsum("gkl,gl->gk", own, without), without)
-        return squares, step
+        steps = np.array([[held.get(key, 0.0) for key in self.keys] for held in every])
+        roots = self._roots(every)
+        steps -= (roots @ (np.swapaxes(roots, 1, 2) @ (self._slope + steps @ self._whole)[:, :, None]))[:, :, 0]
+        moved = np.swapaxes(steps @ self.normal, 0, 1)
+        squares = self.squares + 2.0 * steps @ self.gradient.T + np.einsum("fgk,fk->fg", moved, steps)
+        gradient = ((self.gradient + moved) @ roots)[:, :, :, None]
+        own, rest = self._split(roots)
+        without = np.linalg.solve(rest, gradient)
+        squares += np.sum((2.0 * gradient + own @ without) * without, axis=(2, 3))
+        return squares, steps
 
     def root(self, held: Collection[Key], stated: Array | float = 0.0) -> Array:
-        """(K, R) a root of the covariance of the numbers, when some are held.
+        """(K, K) a root of the covariance of the numbers, when some are held.
 
         Args:
             stated: (K, K) information that there is of them besides.
         """
-        free = np.array([i for i, key in enumerate(self.keys) if key not in held], dtype=np.int64)
-        of_free = inverse_root((self._whole + stated)[np.ix_(free, free)], self.sizes[free], SINGULAR)
-        root = np.zeros((len(self.keys), of_free.shape[1]))
-        root[free] = of_free
-        return root
+        return np.asarray(self._roots([held], stated)[0])
 
-    def _split(self, root: Array) -> tuple[Array, Array]:
-        """(G, R, R) each group's share of the information along a root of everything's, and that of all others."""
-        own = root.T @ self.normal @ root
-        return np.asarray(own), np.asarray((1.0 + _RIDGE) * np.eye(root.shape[1]) - own)
+    def _roots(self, every: Sequence[Collection[Key]], stated: Array | float = 0.0) -> Array:
+        """(F, K, K) the same, when these or those are held."""
+        free = np.array([[key not in held for key in self.keys] for held in every])
+        normals = (self._whole + stated) * (free[:, :, None] & free[:, None, :])
+        return np.asarray(inverse_roots(normals, self.sizes, SINGULAR)[0] * free[:, :, None])
+
+    def _split(self, roots: Array) -> tuple[Array, Array]:
+        """(..., G, R, R) each group's share of the information along roots (..., K, R) of everything's, and that of all
+        others.
+        """
+        each = roots[..., None, :, :]
+        own = np.swapaxes(each, -1, -2) @ self.normal @ each
+        return np.asarray(own), np.asarray((1.0 + _RIDGE) * np.eye(own.shape[-1]) - own)
 
     @cached_property
     def _whole(self) -> Array:
