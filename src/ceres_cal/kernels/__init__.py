@@ -150,6 +150,13 @@ def lens_images(optics: Optics, rays: Array, images: Array) -> None:
     core().lens_images(optics, rays, images)
 
 
+def lens_rays(optics: Optics, offsets: Array, longest: float, rays: Array) -> None:
+    """Where offsets (N, 2) from the principal point on square pixels, px, come from, by Newton's method from `rays`
+    (N, 3), unit vectors near there that are moved, by steps of `longest` rad at most; NaN where it does not get there.
+    """
+    core().lens_rays(optics, offsets, longest, rays)
+
+
 def inverse_of_growing(above: Array, width: float, below: Array, limit: float, targets: Array, places: Array) -> None:
     """Where a map that grows from 0 is as large as `targets` (N,), to `places` (N,); NaN where it is not up to `limit`.
 

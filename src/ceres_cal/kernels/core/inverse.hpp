@@ -1,9 +1,11 @@
-// The inverse of a map along a radius that grows: see `scene/lens/planar.py`.
+// Inverses: of a map along a radius that grows, and of a lens by Newton's method. See `scene/lens/planar.py`.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
+
+#include "lens.hpp"
 
 namespace ceres_cal {
 
@@ -76,6 +78,59 @@ class Growing {
     int pieces_, terms_, terms_below_;
     const double *above_, *below_;
     double width_, limit_;
+};
+
+// Rays of a lens on square pixels whose images are some offsets, each sought in the plane that touches its start.
+class Seeking {
+  public:
+    // Steps of the n rays (x, y, z), unit vectors at first, towards the offsets (x, y), no longer than so many radians;
+    // NaN where they do not get there.
+    void find(Lens& lens, int n, const double* offsets, double longest, double* rays) {
+        constexpr int STEPS = 60;                                           // a safeguard: Newton needs 4 to 8
+        constexpr double EXACT = 1e-12, ROUNDING = 1e-15, AT_REST = 1e-13;  // errors that will do, or are the least
+        const int filled = (n + LANES - 1) / LANES * LANES;
+        double error[CHUNK];
+        bool moving[CHUNK];
+        std::fill_n(moving, n, true);
+        for (int i = 0; i < filled; ++i) {
+            const double* ray = rays + 3 * std::min(i, n - 1);
+            chunk_.x[i] = ray[0], chunk_.y[i] = ray[1], chunk_.z[i] = ray[2];
+        }
+        for (int step = 0, left = n; step < STEPS && left > 0; ++step) {
+            lens.project(filled, chunk_, seen_);
+            for (int i = 0; i < n; ++i) {
+                if (!moving[i]) continue;
+                const double *to = offsets + 2 * i, *ray = rays + 3 * i;
+                const double x = seen_.x[i] - to[0], y = seen_.y[i] - to[1];
+                error[i] = std::max(std::abs(x), std::abs(y)) / (lens.phi + std::max(std::abs(to[0]), std::abs(to[1])));
+                // Two directions across the start (Duff and others, JCGT 6, 2017), and the derivatives along them.
+                const double sign = std::copysign(1.0, ray[2]), a = -1.0 / (sign + ray[2]), b = ray[0] * ray[1] * a;
+                const double e[3] = {1.0 + sign * ray[0] * ray[0] * a, sign * b, -sign * ray[0]};
+                const double f[3] = {b, sign + ray[1] * ray[1] * a, -ray[1]};
+                const double xx = seen_.xx[i] * e[0] + seen_.xy[i] * e[1] + seen_.xz[i] * e[2];
+                const double xy = seen_.xx[i] * f[0] + seen_.xy[i] * f[1] + seen_.xz[i] * f[2];
+                const double yx = seen_.yx[i] * e[0] + seen_.yy[i] * e[1] + seen_.yz[i] * e[2];
+                const double yy = seen_.yx[i] * f[0] + seen_.yy[i] * f[1] + seen_.yz[i] * f[2];
+                const double area = xx * yy - xy * yx, p = (yy * x - xy * y) / area, q = (xx * y - yx * x) / area;
+                // Where the map ends it hardly grows, and a whole step would end behind others that lead past it.
+                const double length = std::hypot(p, q), part = std::min(1.0, longest / std::max(length, TINY));
+                chunk_.x[i] -= part * (p * e[0] + q * f[0]);
+                chunk_.y[i] -= part * (p * e[1] + q * f[1]);
+                chunk_.z[i] -= part * (p * e[2] + q * f[2]);
+                moving[i] = error[i] > ROUNDING && (length > AT_REST || error[i] > EXACT);
+                left -= !moving[i];
+            }
+        }
+        for (int i = 0; i < n; ++i) {
+            const bool found = error[i] <= EXACT;
+            double* ray = rays + 3 * i;
+            ray[0] = found ? chunk_.x[i] : NAN, ray[1] = found ? chunk_.y[i] : NAN, ray[2] = found ? chunk_.z[i] : NAN;
+        }
+    }
+
+  private:
+    Rays chunk_;
+    Image seen_;
 };
 
 }  // namespace ceres_cal

@@ -48,6 +48,19 @@ void lens_images(Tuple optics, const Read<N, 3>& rays, const Filled<2, 4, N>& im
     });
 }
 
+void lens_rays(Tuple optics, const Read<N, 2>& offsets, double longest, const Filled<N, 3>& rays) {
+    const int64_t count = static_cast<int64_t>(offsets.shape(0));
+    require(rays.shape(0) == offsets.shape(0), "rays are as many as offsets");
+    const OpticsGiven given(optics);
+    const std::unique_ptr<Lens> made = given.make();
+    unlocked([&] {
+        Seeking sought;
+        for (int64_t first = 0; first < count; first += CHUNK)
+            sought.find(*made, static_cast<int>(std::min<int64_t>(CHUNK, count - first)), row(offsets, first), longest,
+                        row(rays, first));
+    });
+}
+
 void inverse_of_growing(const Read<N, N>& above, double width, const Read<N>& below, double limit,
                         const Read<N>& targets, const Filled<N>& places) {
     const size_t pieces = above.shape(0), terms = above.shape(1);
@@ -350,6 +363,7 @@ bool has_avx2() {
 NB_MODULE(CERES_CAL_MODULE, m) {
     m.def("has_avx2", &has_avx2);
     m.def("lens_images", &lens_images);
+    m.def("lens_rays", &lens_rays);
     m.def("inverse_of_growing", &inverse_of_growing);
     m.def("plane_homographies", &plane_homographies);
     m.def("radial_alignment", &radial_alignment);

@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from ceres_cal.base import AnyArray, Array, Frozen, cached_property
-from ceres_cal.kernels import NOTHING, Optics, inverse_of_growing, lens_images
+from ceres_cal.kernels import NOTHING, Optics, inverse_of_growing, lens_images, lens_rays
 from ceres_cal.scene.lens.base import Lens, unit_rays
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8
@@ -120,23 +120,23 @@ def invert_increasing(profile: Profile, target: Array) -> Array:
     return places
 
 
-def inverted(profile: Profile, target: Array, mapped: Callable[[Array], Array] | None = None) -> Array:
-    """Points (N, 2) whose image is `target`, NaN where none is found.
-
-    Args:
-        mapped: the map of points (N, 2) and its derivatives by their x and y, (2, 3, N); without it the map is along
-            the radius alone. profile: its map along the radius, in the direction in which that ends first.
+def inverted(profile: Profile, target: Array, *, is_round: bool = True) -> Array:
+    """Points (N, 2) whose image along the radius is `target`, NaN where none is; of a map that is not round, by its
+    profile in the direction in which that ends first, where Newton's method may start.
     """
     radius, end = np.hypot(target[:, 0], target[:, 1]), profile.limit
     # Other directions may reach farther than that of the profile: from beyond its rim, start just inside.
     rim = float(profile.value(np.array(end))) if np.isfinite(end) else end
-    start = invert_increasing(profile, radius if mapped is None else np.minimum(radius, rim * (1.0 - 1e-6)))
-    flat = target * np.where(radius > 0.0, start / radius, 1.0)[:, None]
-    return flat if mapped is None else _newton(mapped, flat, target, end)
+    start = invert_increasing(profile, radius if is_round else np.minimum(radius, rim * (1.0 - 1e-6)))
+    return np.asarray(target * np.where(radius > 0.0, start / radius, 1.0)[:, None])
 
 
-def _newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit: float) -> Array:
-    """Points (N, 2) whose image is `target`, from `flat`; NaN where Newton's method does not get there."""
+def newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit: float) -> Array:
+    """Points (N, 2) whose image is `target`, from `flat`; NaN where Newton's method does not get there.
+
+    Args:
+        mapped: the map of points (N, 2) and its derivatives by their x and y, (2, 3, N).
+    """
     longest = 0.1  # step of Newton's method, of the limit
     exact, rounding = 1e-12, 1e-15  # errors that will do, and that nothing makes smaller
     rows, error = np.arange(len(flat)), np.full(len(flat), np.inf)
@@ -217,13 +217,16 @@ class Planar(Lens):
         """Points (N, 2), NaN past the limit."""
         return np.where(np.hypot(flat[:, :1], flat[:, 1:]) <= self._limit, flat, np.nan)
 
+    def _optics(self, phi: float) -> Optics:
+        """On square pixels about the principal point."""
+        return Optics(self, self.formulas, self.form, np.array([phi, 1.0, 0.0, 0.0, *self.values, 0.0]), 1.0)
+
     def _images(self, rays: Array, phi: float) -> Array:
         """(2, 4, N) where rays (N, 3) are measured, px, and the derivatives of that by the ray's x, y and z; also past
         the limit, where the map has folded.
         """
-        intrinsics = np.array([phi, 1.0, 0.0, 0.0, *self.values, 0.0])
         images = np.empty((2, 4, len(rays)))
-        lens_images(Optics(self, self.formulas, self.form, intrinsics, 1.0), rays, images)
+        lens_images(self._optics(phi), rays, images)
         return images
 
     def _distort(self, rays: Array, phi: float) -> Array:
@@ -231,11 +234,16 @@ class Planar(Lens):
         return np.where(np.isnan(inside), np.nan, self._images(rays, phi)[:, 0].T)
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
-        unit = self._unit(phi)
-        mapped = None if self._is_round else self.mapped
-        flat = self._within(inverted(self._profile, offsets / unit, mapped))
-        rays = self._lifted(flat * (unit / phi))
-        return unit_rays(rays[:, :2], rays[:, 2])
+        longest = 0.05  # rad, of a step of Newton's method, or of a limit below 1
+        unit, is_round = self._unit(phi), self._is_round
+        flat = inverted(self._profile, offsets / unit, is_round=is_round)
+        lifted = self._lifted((self._within(flat) if is_round else flat) * (unit / phi))
+        rays = unit_rays(lifted[:, :2], lifted[:, 2])
+        if not is_round:
+            lens_rays(self._optics(phi), offsets, longest * min(1.0, self._limit), rays)
+            inside = np.isfinite(self._within(self._flat(rays) * (phi / unit)))
+            rays = unit_rays(np.where(inside, rays[:, :2], np.nan), rays[:, 2])
+        return rays
 
     def unlimited(self, rays: Array) -> Array:
         """Where rays (N, 3) are measured, (N, 2) at focal length 1, also past the limit, where the map has folded."""
