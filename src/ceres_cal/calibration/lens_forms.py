@@ -207,7 +207,7 @@ def _half_samples(groups: int) -> Array:
     """(D, G) 1 of the groups that are in a draw, else 0: each in half of them, each two in a quarter."""
     signs = np.ones((1, 1))
     while len(signs) <= groups:
-        signs = np.kron([[1.0, 1.0], [1.0, -1.0]], signs)  # Sylvester's Hadamard matrix
+        signs = np.block([[signs, signs], [signs, -signs]])  # Sylvester's Hadamard matrix
     return np.asarray(0.5 * (1.0 + signs[:, 1 : groups + 1]))
 
 

@@ -227,6 +227,9 @@ _NEAR = 4.0
 _KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
 
 
+_NOT_SHOWN = "cannot show all that another lens shows"
+
+
 def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
     """What each camera's lens does, as far as it was observed; over its picture where all it showed was taken out."""
     seen = {name: sights.of_camera(name).about(estimate.cameras[name]).reach_px for name in sights.cameras}
@@ -274,8 +277,10 @@ class InlierRows(Frozen):
             problem, estimate = self._problem(options, start, {}), start
             if not is_solved:
                 estimate = seen_through(estimate, options, self._profiles)
-                self._shown(estimate)
-                estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
+                solution = solve(problem, estimate, precision=_PRECISION, is_near=False)
+                if solution.failed:
+                    raise DegenerateError(_NOT_SHOWN)
+                estimate = solution.estimate
             return self._near_best(forms, problem, estimate)
 
         return _or_failed(near_best, forms, start)
@@ -390,7 +395,7 @@ class InlierRows(Frozen):
         there = residuals(self.sights, estimate, self.end.residuals.feet)
         known = np.isfinite(there.points[self.sights.point_rows]), np.isfinite(there.curves[self.sights.curve_rows])
         if not (known[0].all() and known[1].all()):
-            raise DegenerateError("cannot show all that another lens shows")
+            raise DegenerateError(_NOT_SHOWN)
         return there
 
 

@@ -431,14 +431,18 @@ def smooth_image(equations: Equations, estimate: Estimate) -> Array:
     return np.column_stack(every)
 
 
-def smooth_view(equations: Equations) -> tuple[Array, Array]:
-    """(E, 2) x and y from -1 to 1 over what is seen of each sight, and (E, 2, 5) smooth displacements of it along both
-    axes of the image: polynomials of these but for the constant, which is the pose's.
-    """
-    starts, third = equations.bounds[:-1], 1.0 / 3.0  # the mean of x^2
+def places_in_view(equations: Equations) -> Array:
+    """(E, 2) x and y from -1 to 1 over what is seen of each sight."""
+    starts = equations.bounds[:-1]
     low, high = np.minimum.reduceat(equations.pixel, starts), np.maximum.reduceat(equations.pixel, starts)
     half = np.maximum(np.max(high - low, axis=1), 1.0) / 2.0
-    place = (equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None]
-    x, y = place.T
+    return np.asarray((equations.pixel - ((low + high) / 2.0)[equations.sight]) / half[equations.sight, None])
+
+
+def smooth_view(equations: Equations, place: Array) -> Array:
+    """(E, 2, 5) smooth displacements of each sight along both axes of the image: polynomials of these places (E, 2) but
+    for the constant, which is the pose's.
+    """
+    (x, y), third = place.T, 1.0 / 3.0  # the mean of x^2
     each = np.column_stack([x, y, x**2 - third, x * y, y**2 - third])
-    return place, equations.direction[:, :, None] * each[:, None, :]
+    return np.asarray(equations.direction[:, :, None] * each[:, None, :])

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, replace, student_95, two_digits
-from ceres_cal.effects.columns import SparseColumns, smooth_image, smooth_view
+from ceres_cal.effects.columns import SparseColumns, places_in_view, smooth_image, smooth_view
 from ceres_cal.effects.evidence import DEPENDENCE, LENS_LEAVES, LIKELY, READ_OUT, SMOOTH_ERRORS, RepeatedAmounts
 from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
 from ceres_cal.effects.linearised import Linearised
@@ -357,8 +357,9 @@ class _ReadOut(Frozen):
         boards = np.flatnonzero(np.maximum.reduceat(model.of_private, equations.bounds[:-1]))
         if len(boards) < fewest:
             return None
-        polynomials = smooth_view(equations)[1]
-        rows = np.where(model.used[:, None], model.beyond_private(polynomials[:, :, 1] * model.weight[:, None]), 0.0)
+        place = places_in_view(equations)
+        growing = equations.direction * place[:, 1:] * model.weight[:, None]
+        rows = np.where(model.used[:, None], model.beyond_private(growing), 0.0)
         whole = np.column_stack([rows, model.shared, model.left_over])
         products = np.array(
             [rows[own].T @ whole[own] for own in map(slice, equations.bounds[:-1], equations.bounds[1:])]
@@ -367,7 +368,7 @@ class _ReadOut(Frozen):
         z2 = np.einsum("si,sij,sj->s", score, np.linalg.pinv(told, hermitian=True), score)[boards]
         if np.sum(z2 - 2.0) <= LOUD * np.sqrt(4.0 * len(boards)):
             return None
-        sigma, probability = _sizes_of_views(model, estimate, polynomials, boards[evenly(len(boards), enough)])
+        sigma, probability = _sizes_of_views(model, estimate, place, boards[evenly(len(boards), enough)])
         there = np.isin(np.arange(len(common)), boards)[:, None, None]
         return cls(sigma, probability, probability * sigma**2 * there * (np.swapaxes(common, 1, 2) @ common))
 
@@ -378,13 +379,18 @@ class _ReadOut(Frozen):
         return replace(dependence, inverse_freedom=inverse, read_out_px=likely_px)
 
 
-def _sizes_of_views(model: Linearised, estimate: Estimate, polynomials: Array, views: Indices) -> tuple[float, float]:
-    """Sigma and probability of the read-out of some sights, beside smooth displacements of each, and of all alike."""
+def _sizes_of_views(model: Linearised, estimate: Estimate, place: Array, views: Indices) -> tuple[float, float]:
+    """Sigma and probability of the read-out of some sights, beside smooth displacements of each, and of all alike.
+
+    Args:
+        place: see `places_in_view`.
+    """
     tells = 1e-4  # share of the largest: of directions that tell anything beside the poses
     equations, count = model.equations, len(views)
     number = np.full(len(equations.bounds) - 1, -1)
     number[views] = np.arange(count)
     group, image = number[equations.sight], smooth_image(equations, estimate)
+    polynomials = smooth_view(equations, place)
     each = (image, polynomials[:, :, 1], polynomials.reshape(len(image), -1))
     owners = ((np.zeros_like(group), 1), (group, count), (group, count))
     parts = [

@@ -232,7 +232,7 @@ def make_structure(
     every, sigmas = [name for names, _ in parts for name in names], np.concatenate([sigma_m for _, sigma_m in parts])
     free = np.flatnonzero(sigmas > 0.0)
     order = np.concatenate([free, np.flatnonzero(sigmas == 0.0)]) if dimensions else free
-    names = [every[number] for number in order]
+    names = [every[number] for number in order.tolist()]
     drawn_m, slopes = dimension_slopes(names, targets, dimensions)
     for name, column in zip(dimensions, slopes.T, strict=True):
         if not np.any(column):

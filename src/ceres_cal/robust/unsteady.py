@@ -29,6 +29,7 @@ from ceres_cal.effects import (
     Weights,
     equation_weights,
     make_linear_model,
+    places_in_view,
     posed,
     smooth_image,
     smooth_view,
@@ -220,12 +221,12 @@ def _modes(equations: Equations, *, smooth: bool = True) -> Array:
     turn and a shift of the pose, that grow from row to row; polynomials along both axes of the image, where `smooth`
     asks for them.
     """
-    place, polynomials = smooth_view(equations)
+    place = places_in_view(equations)
     turns = equations.pose * place[:, 1:]
     turns /= np.sqrt(np.maximum(np.einsum("ei,ei->i", turns, turns) / len(place), 1e-300))
-    modes = [equations.intrinsics[:, _CENTRE], polynomials[:, :, 1], turns]
+    modes = [equations.intrinsics[:, _CENTRE], equations.direction * place[:, 1:], turns]
     if smooth:
-        modes.append(polynomials.reshape(len(place), -1))
+        modes.append(smooth_view(equations, place).reshape(len(place), -1))
     return np.hstack(modes)
 
 
@@ -238,8 +239,10 @@ def _seem_displaced(equations: Equations, weights: Weights) -> bool:
     columns *= (weights.inverse_sigma * weights.used)[:, None]
     left = posed(np.array([columns[start:stop].T @ columns[start:stop] for start, stop in pairwise(equations.bounds)]))
     whole_told, scores, squares = left[:, :-1, :-1], left[:, :-1, -1], left[:, -1, -1]
-    read_out = np.linalg.pinv(whole_told[:, 2:, 2:], _TOLD, hermitian=True)
-    taken = np.sum(scores[:, 2:] * np.einsum("vij,vj->vi", read_out, scores[:, 2:]))
+    values, axes = np.linalg.eigh(whole_told[:, 2:, 2:])
+    along = (scores[:, None, 2:] @ axes)[:, 0]
+    known = values > _TOLD * values[:, -1:]
+    taken = np.sum(along[known] ** 2 / values[known])
     told, score = np.maximum(np.diagonal(whole_told, axis1=1, axis2=2)[:, :2], 1e-300), scores[:, :2]
     mean = np.sum(score, axis=0) / np.sum(told, axis=0)
     moved = float(np.sum((score - told * mean) ** 2 / told - 1.0))

@@ -6,6 +6,7 @@ Maps along a radius with value 0 and slope 1 at 0, polynomials and their ratios:
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -37,7 +38,10 @@ def derivative(polynomial: Array) -> Array:
 
 def less(polynomial: AnyArray, other: AnyArray) -> Array:
     """Their difference's coefficients, lowest power first."""
-    return np.asarray(np.polysub(polynomial[::-1], other[::-1])[::-1])
+    difference = np.zeros(max(len(polynomial), len(other)))
+    difference[: len(polynomial)] = polynomial
+    difference[: len(other)] -= other
+    return difference
 
 
 def first_root(polynomial: Array) -> float:
@@ -47,10 +51,14 @@ def first_root(polynomial: Array) -> float:
 
 @lru_cache(maxsize=256)  # a camera that is moved and asked anew has the lens that it had
 def _first_root(polynomial: tuple[float, ...]) -> float:
-    if not np.all(np.isfinite(polynomial)):
+    if not all(map(math.isfinite, polynomial)):
         return np.nan
+    if min(polynomial) >= 0.0:
+        return np.inf
     # The roots of the reversed polynomial are 1 / x: its leading coefficient is 1, however small the last ones are.
-    inverse = np.roots(polynomial)
+    companion = np.eye(len(polynomial) - 1, k=-1)
+    companion[0] = np.negative(polynomial[1:])
+    inverse = np.linalg.eigvals(companion)
     size = np.abs(inverse)
     real = (np.abs(inverse.imag) <= 1e-9 * size) & (inverse.real > 1e-15 * np.max(size, initial=0.0))
     return 1.0 / float(np.max(inverse.real[real])) if np.any(real) else np.inf
@@ -268,28 +276,28 @@ class Decentred(Planar):
     above: ClassVar[tuple[str, ...]]
     below: ClassVar[tuple[str, ...]] = ()
 
-    def _named(self, names: Sequence[str]) -> Array:
+    def _named(self, names: Sequence[str]) -> list[float]:
         known = self.coefficients
-        return np.array([known.get(name, 0.0) for name in names])
+        return [known.get(name, 0.0) for name in names]
 
     @cached_property
-    def _across(self) -> Array:
+    def _across(self) -> list[float]:
         """p1 p2 s1 s2 s3 s4."""
         return self._named(("p1", "p2", "s1", "s2", "s3", "s4"))
 
     @property
     def _is_round(self) -> bool:
-        return not np.any(self._across)
+        return not any(self._across)
 
     @cached_property
     def _profile(self) -> Ratio:
         # In the worst direction decentring takes 3 |p| r^2 off the radius, and a thin prism |s| r^2 and |s'| r^4.
         p1, p2, s1, s2, s3, s4 = self._across
-        above = np.kron(np.append(1.0, self._named(self.above)), (0.0, 1.0))
-        worst = np.array([0.0, 0.0, 3.0 * np.hypot(p1, p2) + np.hypot(s1, s3), 0.0, np.hypot(s2, s4)])
-        if not np.any(self._named(self.below)):
+        above = dense_polynomial(self._named(self.above), range(3, 2 * len(self.above) + 2, 2))
+        worst = np.array([0.0, 0.0, 3.0 * math.hypot(p1, p2) + math.hypot(s1, s3), 0.0, math.hypot(s2, s4)])
+        if not any(under := self._named(self.below)):
             return Ratio(less(above, worst), NOTHING, self._end)
-        below = np.asarray(np.kron(np.append(1.0, self._named(self.below)), (1.0, 0.0))[:-1], dtype=float)
+        below = np.array([1.0, *(part for one in under for part in (0.0, one))])
         return Ratio(less(above, np.convolve(worst, below)), below, self._end)
 
     _end: ClassVar[float] = np.inf

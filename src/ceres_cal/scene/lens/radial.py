@@ -14,7 +14,16 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, Indices, InputError, cached_property
 from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, required_powers, unit_rays
-from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, derivative, horner, invert_increasing, inverted, less, newton
+from ceres_cal.scene.lens.planar import (
+    Ratio,
+    dense_polynomial,
+    derivative,
+    horner,
+    invert_increasing,
+    inverted,
+    less,
+    newton,
+)
 
 
 @dataclass(frozen=True)
