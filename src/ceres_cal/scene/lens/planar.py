@@ -128,9 +128,9 @@ def invert_increasing(profile: Profile, target: Array) -> Array:
     return places
 
 
-def inverted(profile: Profile, target: Array, *, is_round: bool = True) -> Array:
-    """Points (N, 2) whose image along the radius is `target`, NaN where none is; of a map that is not round, by its
-    profile in the direction in which that ends first, where Newton's method may start.
+def along_radius(profile: Profile, target: Array, *, is_round: bool) -> Array:
+    """Points (N, 2) whose image along the radius is `target`, NaN where none is; of a map that is not round, where
+    Newton's method may start, by its profile in the direction in which that ends first.
     """
     radius, end = np.hypot(target[:, 0], target[:, 1]), profile.limit
     # Other directions may reach farther than that of the profile: from beyond its rim, start just inside.
@@ -139,12 +139,15 @@ def inverted(profile: Profile, target: Array, *, is_round: bool = True) -> Array
     return np.asarray(target * np.where(radius > 0.0, start / radius, 1.0)[:, None])
 
 
-def newton(mapped: Callable[[Array], Array], flat: Array, target: Array, limit: float) -> Array:
-    """Points (N, 2) whose image is `target`, from `flat`; NaN where Newton's method does not get there.
+def inverted(profile: Profile, target: Array, mapped: Callable[[Array], Array] | None) -> Array:
+    """Points (N, 2) whose image is `target`, by Newton's method; NaN where it does not get there.
 
     Args:
-        mapped: the map of points (N, 2) and its derivatives by their x and y, (2, 3, N).
+        mapped: the map of points (N, 2) and its derivatives by their x and y, (2, 3, N); None of one along the radius.
     """
+    flat, limit = along_radius(profile, target, is_round=mapped is None), profile.limit
+    if mapped is None:
+        return flat
     longest = 0.1  # step of Newton's method, of the limit
     exact, rounding = 1e-12, 1e-15  # errors that will do, and that nothing makes smaller
     rows, error = np.arange(len(flat)), np.full(len(flat), np.inf)
@@ -243,15 +246,14 @@ class Planar(Lens):
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
         longest = 0.05  # rad, of a step of Newton's method, or of a limit below 1
-        unit, is_round = self._unit(phi), self._is_round
-        flat = inverted(self._profile, offsets / unit, is_round=is_round)
-        lifted = self._lifted((self._within(flat) if is_round else flat) * (unit / phi))
-        rays = unit_rays(lifted[:, :2], lifted[:, 2])
-        if not is_round:
+        unit = self._unit(phi)
+        flat = along_radius(self._profile, offsets / unit, is_round=self._is_round)
+        rays = self._lifted(flat * (unit / phi))
+        rays = unit_rays(rays[:, :2], rays[:, 2])
+        if not self._is_round:
             lens_rays(self._optics(phi), offsets, longest * min(1.0, self._limit), rays)
-            inside = np.isfinite(self._within(self._flat(rays) * (phi / unit)))
-            rays = unit_rays(np.where(inside, rays[:, :2], np.nan), rays[:, 2])
-        return rays
+            flat = self._flat(rays) * (phi / unit)
+        return unit_rays(np.where(np.isfinite(self._within(flat)), rays[:, :2], np.nan), rays[:, 2])
 
     def unlimited(self, rays: Array) -> Array:
         """Where rays (N, 3) are measured, (N, 2) at focal length 1, also past the limit, where the map has folded."""

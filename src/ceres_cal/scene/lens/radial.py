@@ -14,16 +14,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base import Array, Indices, InputError, cached_property
 from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, required_powers, unit_rays
-from ceres_cal.scene.lens.planar import (
-    Ratio,
-    dense_polynomial,
-    derivative,
-    horner,
-    invert_increasing,
-    inverted,
-    less,
-    newton,
-)
+from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, derivative, horner, invert_increasing, inverted, less
 
 
 @dataclass(frozen=True)
@@ -126,9 +117,7 @@ class Radial(Lens):
 
     def _distort(self, rays: Array, phi: float) -> Array:
         profile, ideal = self._profile(phi), rays[:, :2] / ahead(rays)
-        measured = inverted(profile, ideal, is_round=not any(self._across))
-        if any(self._across):
-            measured = newton(partial(self._mapped, phi=phi), measured, ideal, profile.limit)
+        measured = inverted(profile, ideal, partial(self._mapped, phi=phi) if any(self._across) else None)
         return np.where(np.hypot(measured[:, :1], measured[:, 1:]) <= profile.limit, phi * measured, np.nan)
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
