@@ -11,7 +11,17 @@ from ceres_cal.base import Array, Frozen, InputError, Mask, Spread, brief, cache
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import Mixture
-from ceres_cal.problem import Estimate, Information, Key, Layout, layout_of, over, pose_keys, sigma_limits
+from ceres_cal.problem import (
+    Estimate,
+    Information,
+    Key,
+    Layout,
+    layout_of,
+    over,
+    pose_keys,
+    sigma_limits,
+)
+from ceres_cal.problem.quantities import difference
 from ceres_cal.problem.reduced import Eliminated, ReducedInformation
 
 
@@ -198,7 +208,7 @@ class Posterior(Frozen):
     def sd(self) -> Array:
         """(P,) standard deviations in the units of the keys, infinite where unknown."""
         sd = self.spread.sd.copy()
-        for mixture in self._read:
+        for mixture in self._numbers:
             sd[self.information.columns(mixture.keys)] = mixture.sd
         return np.minimum(sd, self.stated_sd)
 
@@ -206,6 +216,41 @@ class Posterior(Frozen):
     def _read(self) -> Iterator[Mixture]:
         """Mixtures, those of single cameras last."""
         yield from (self.mixtures[name] for name in sorted(self.mixtures, key=bool))
+
+    @cached_property
+    def _numbers(self) -> tuple[Mixture, ...]:
+        """The same, where each number is read by itself: a component that is another lens of the same kind has that
+        lens's own phi and height. By what the chosen lens shows likewise phi was known to 0.2 %, 20 standard deviations
+        off, where a coefficient that it has not leaves it open to 5 %.
+        """
+        found = []
+        for mixture in self._read:
+            steps, numbers = mixture.steps.copy(), range(len(self.lenses) if mixture.lenses else 0)
+            off = [self._off(lens, mixture.keys) for lens in numbers]
+            for component, (lens, alike) in mixture.lenses.items():
+                steps[component] = np.where(np.isfinite(off[lens]), steps[alike] + off[lens], steps[component])
+            found.append(replace(mixture, steps=steps))
+        return tuple(found)
+
+    def _off(self, lens: int, keys: Sequence[Key]) -> Array:
+        """(K,) phi and where cameras stand with a lens, from what the chosen one has; NaN of all else: of another kind
+        of lens, of coefficients, which mean another thing beside others, of what is followed, and of stations that no
+        lens by itself places.
+        """
+        chosen, other = self.lenses[0], self.lenses[lens]
+        alike = {name for name, one in other.cameras.items() if one.lens.kind == chosen.cameras[name].lens.kind}
+        placed = {
+            name
+            for name, station in other.stations.items()
+            if station.camera in alike
+            and not np.array_equal(station.cam_from_world.matrix, chosen.stations[name].cam_from_world.matrix)
+        }
+        owners = {("camera", name, "phi") for name in alike}
+        is_own = [key[:3] in owners or (key.kind == "station" and key.owner in placed) for key in keys]
+        at = [i for i, key in enumerate(keys) if is_own[i] and key not in self.followed_phi]
+        off = np.full(len(keys), np.nan)
+        off[at] = difference(other, chosen, [keys[i] for i in at])
+        return off
 
     @cached_property
     def factors(self) -> Array:
@@ -232,7 +277,7 @@ class Posterior(Frozen):
     def bounds_at(self, width: float) -> Array:
         """(P, 2) the same so many standard deviations up, at most three."""
         bounds = width * self.spread.sd[:, None] * (-1.0, 1.0)
-        for mixture in self._read:
+        for mixture in self._numbers:
             bounds[self.information.columns(mixture.keys)] = mixture.bounds(width)
         limit = width * self.stated_sd[:, None]
         return np.clip(bounds, -limit, limit)
