@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ceres_cal.base.arrays import distinct, inverse_of, inverse_root_of, median, medians
+from ceres_cal.base.arrays import AnyArray, distinct, inverse_of, inverse_root_of, median, medians, quantile
 
-SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json"
+AUTO = ["--target", "ssl-b", "--auto", "--facing", "LeftGoalLine=top"]
+SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field"
 
 
 @pytest.mark.parametrize("count", range(1, 9))
@@ -23,6 +24,14 @@ def test_median_is_numpys(count: int) -> None:
 def test_median_of_what_is_not_finite() -> None:
     assert median(np.array([1.0, np.inf, 2.0])) == 2.0 and median(np.array([1.0, np.inf])) == np.inf
     assert np.isnan(median(np.array([1.0, np.nan, 2.0]))) and np.isnan(median(np.zeros(0)))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [1, 2, 3, 40])
+def test_quantile_is_numpys(count: int, kind: type) -> None:
+    values: AnyArray = np.random.default_rng(count).normal(size=count).astype(kind)
+    assert all(quantile(values, share) == np.quantile(values, share) for share in (0.0, 0.25, 0.7, 0.99, 1.0))
+    assert np.isnan(quantile(values[:0], 0.5))
 
 
 def test_distinct_is_numpys_unique() -> None:
@@ -42,15 +51,22 @@ def test_inverses_by_halves_are_numpys(shape: tuple[int, ...]) -> None:
 
 
 def test_they_import_no_masked_arrays() -> None:
-    call = "distinct(np.arange(3)), distinct(np.eye(3), axis=0), median(np.arange(3.0))"
+    call = "distinct(np.arange(3)), distinct(np.eye(3), axis=0), median(np.arange(3.0)), quantile(np.arange(3.0), 0.4)"
     code = f"import sys, numpy as np; from ceres_cal.base.arrays import *; {call}; print('numpy.ma' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
 
 
-@pytest.mark.parametrize("lens", ["auto", "spline"])
-def test_nor_does_a_calibration(tmp_path: Path, lens: str) -> None:
-    command = ["calibrate", str(SAMPLE), "--lens", lens, "-o", str(tmp_path / "calibration.json"), "--quiet"]
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["calibrate", str(SAMPLE / "observations.json"), "--lens", "auto"],
+        ["calibrate", str(SAMPLE / "observations.json"), "--lens", "spline"],
+        ["detect", "field", str(SAMPLE / "photographs/0001.jpg"), *AUTO],
+    ],
+)
+def test_nor_do_commands(tmp_path: Path, words: list[str]) -> None:
+    command = [*words, "-o", str(tmp_path / "made.json"), "--quiet"]
     code = f"import sys; from ceres_cal.cli import main; main({command}); print('numpy.ma' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split()[-1] == "False"

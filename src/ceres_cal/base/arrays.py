@@ -33,7 +33,8 @@ AnyArray = NDArray[Any]
 _Kind = TypeVar("_Kind", bound=np.generic)
 
 
-# `np.median`, and `np.unique` unless it counts, import masked arrays when first called, which takes as long as a solve.
+# `np.median`, `np.quantile`, and `np.unique` unless it counts, import masked arrays when first called, which takes as
+# long as a solve.
 
 
 def distinct(values: NDArray[_Kind], axis: int | None = None) -> NDArray[_Kind]:
@@ -41,7 +42,7 @@ def distinct(values: NDArray[_Kind], axis: int | None = None) -> NDArray[_Kind]:
     return np.asarray(np.unique(values, return_counts=True, axis=axis)[0])
 
 
-def median(values: Array) -> float:
+def median(values: AnyArray) -> float:
     """The middle of some numbers (N,), or between the two in the middle; NaN where one of them is, or none is there."""
     return float(medians(values))
 
@@ -58,7 +59,7 @@ def medians_known(values: Array) -> Array:
     return np.asarray(np.mean(np.take_along_axis(ordered, middle, axis=-1), axis=-1))
 
 
-def medians(values: Array) -> Array:
+def medians(values: AnyArray) -> Array:
     """(...) those of the numbers along the last axis of (..., N)."""
     count = values.shape[-1]
     if not count:
@@ -67,6 +68,17 @@ def medians(values: Array) -> Array:
     ordered = np.partition(values, (low, high, last), axis=-1)  # NaN is the last
     largest = ordered[..., last]
     return np.asarray(np.where(np.isnan(largest), largest, 0.5 * (ordered[..., low] + ordered[..., high])))
+
+
+def quantile(values: AnyArray, share: float) -> float:
+    """What a share of some numbers (N,), none of them NaN, are below: between two of them in proportion."""
+    last = len(values) - 1
+    if last < 0:
+        return np.nan
+    low, high = int(share * last), min(int(share * last) + 1, last)
+    first, second = np.partition(values, (low, high))[[low, high]]
+    part = share * last - low
+    return float(first + part * (second - first) if part < 0.5 else second - (1.0 - part) * (second - first))
 
 
 def rms(values: Array, nothing: float = np.nan) -> float:

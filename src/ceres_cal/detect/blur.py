@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, Rows, replace
+from ceres_cal.base import Array, Indices, Rows, distinct, median, quantile, replace
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import (
     LEAST_BLUR_PX,
@@ -58,7 +58,7 @@ class Blur(Rows):
         in_focus_px = 1.0  # of a lens: what is blurred more in every direction is smeared
         as_smeared = 2.5  # of the Gaussian that suits a smeared line best: the smear that it is
         lens = min(float(np.min(self.blur_px)), in_focus_px)
-        here = float(np.median(self.blur_px[rows]))
+        here = median(self.blur_px[rows])
         smear = as_smeared * np.sqrt(max(here**2 - lens**2, 0.0))
         return EdgeShape(lens if smear > 0.0 else here, self.stretch, float(smear))
 
@@ -153,7 +153,7 @@ def _coma_shape(windows: Windows, course: Course, blur: Blur, rows: Indices, alo
 def _by_direction(angle: Array, bright: Array, rows: Indices) -> list[Indices]:
     """Of these rows those that are surely on paint, sorted by direction, of those that have enough; none of one."""
     sector = np.floor(angle[rows] / np.pi * _SECTORS + 0.5) % _SECTORS
-    own = [_brightest(bright, rows[sector == number]) for number in np.unique(sector)]
+    own = [_brightest(bright, rows[sector == number]) for number in distinct(sector)]
     own = [some for some in own if len(some) >= _FEWEST_IN_SECTOR]
     return own if len(own) > 1 else []
 
@@ -177,7 +177,7 @@ def _brightest(bright: Array, rows: Indices) -> Indices:
     """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction. Where the
     photograph has no bright place, the brightest fifth: half of a negative quantile would be above all of them.
     """
-    fifth = np.quantile(bright[rows], 0.8)
+    fifth = quantile(bright[rows], 0.8)
     return rows[bright[rows] >= min(0.5 * fifth, fifth)]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask
+from ceres_cal.base import Array, Frozen, Indices, Mask, distinct
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.observations import Points
@@ -34,7 +34,7 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points
     on_curve_m = 1e-6
     used = np.zeros(len(lines.course), dtype=bool)
     features, pixels, sigmas = [], [], []
-    shapes, seen = list(target.curves.values()), np.unique(lines.course.curve[lines.found]).tolist()
+    shapes, seen = list(target.curves.values()), distinct(lines.course.curve[lines.found]).tolist()
     for number, point in enumerate(target.point_array):
         curves = [curve for curve in seen if distance_to_curve(shapes[curve], point[None])[0] < on_curve_m]
         branches = [b for curve in curves if (b := _branch(target, camera, lines, curve, point, used)) is not None]

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array32, Image, InputError, Mask, read_bytes, require_room
+from ceres_cal.base import AnyArray, Array32, Image, InputError, Mask, quantile, read_bytes, require_room
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
@@ -61,7 +61,7 @@ def _is_colour_coarse(blue: Array32, seen: Array32) -> bool:
     kernel, coarse = np.array([1.0, -2.0, 1.0], np.float32), 0.2  # 0.03 to 0.13 of JPEG files, else 0.34 and more
     every = 4  # rows of which one is asked
     fine, colour = (np.abs(cv2.sepFilter2D(one, -1, kernel, kernel)[::every]) for one in (seen, blue - seen))
-    clear = fine >= np.quantile(fine, 0.99)
+    clear = fine >= quantile(fine.ravel(), 0.99)
     return bool(np.mean(colour[clear]) < coarse * np.mean(fine[clear]))
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ceres_cal.base import Array, Array32, Indices, Indices32, Mask, Rows, median, medians, medians_known
+from ceres_cal.base import Array, Array32, Indices, Indices32, Mask, Rows, median, medians, medians_known, quantile
 from ceres_cal.detect.blur import blur_of, from_middle, no_blur, with_coma
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
@@ -219,7 +219,7 @@ def measure(
 def _windows(grey: Array32, course: Course, rough_px: Array, beyond_px: float) -> Windows:
     """Windows about where the paint is, roughly, (N,) px along the normals, that reach so far past its border."""
     places = course.pixels + rough_px[:, None] * course.normals
-    usual_length = float(np.quantile(0.5 * course.width_px + beyond_px, 0.9))
+    usual_length = quantile(0.5 * course.width_px + beyond_px, 0.9)
     return cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
 
 

@@ -10,7 +10,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from ceres_cal.base import Array, Array32, Frozen, Mask
+from ceres_cal.base import Array, Array32, Frozen, Mask, median, quantile
 from ceres_cal.detect.courses import Course
 
 REDUCED = 4
@@ -48,7 +48,7 @@ def nearness(grey: Array32, width_px: float) -> Nearness:
     size = 2 * int(np.ceil(width_px) + 2) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     bright = cv2.morphologyEx(soft, cv2.MORPH_TOPHAT, kernel)
-    limit = max(0.3 * float(np.quantile(bright, 0.99)), 4.0 * float(np.median(bright)))
+    limit = max(0.3 * quantile(bright.ravel(), 0.99), 4.0 * median(bright.ravel()))
     mask = (bright > limit).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     kept = stats[:, cv2.CC_STAT_AREA] >= speck_px

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32
+from ceres_cal.base.arrays import Array, Indices, Indices32, distinct, median
 from ceres_cal.detect.courses import Course
 
 _REMAINS = 0.15  # of the error, what is left once it is taken off
@@ -37,7 +37,7 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
     if len(threes) < _FEWEST:
         return aside, aside
     # Standard deviation of the error's amplitude, beforehand: what is wide has edges that are drawn aside alike.
-    prior_px = 0.1 / max(float(np.median(course.width_px)), 1.0)
+    prior_px = 0.1 / max(median(course.width_px), 1.0)
     bends = offset_px[threes] @ _CURVATURE
     for _ in range(_ROUNDS):  # where in the pixel a line lies is where it is drawn but for that
         turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
@@ -51,7 +51,7 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
 def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
     """(N, K) how many places of its curve err as a place does: few where the line wanders through the pixels."""
     measured, alike = np.isfinite(offset_px), np.ones(turns.shape)
-    for number in np.unique(course.curve):
+    for number in distinct(course.curve):
         every = turns[measured & (course.curve == number)]
         squares = np.maximum(np.sum(np.abs(every) ** 2, axis=0), 1e-12)
         alike[course.curve == number] = np.maximum(np.abs(np.sum(every, axis=0)) ** 2 / squares, 1.0)
@@ -62,7 +62,7 @@ def _smooth(curve: Indices32, offset_px: Array) -> Array:
     """(N,) the mean of the places around on the same curve: one place's own error would explain itself."""
     measured, box = np.isfinite(offset_px), np.ones(2 * _AROUND + 1)
     smooth = np.zeros(len(curve))
-    for number in np.unique(curve):
+    for number in distinct(curve):
         rows = np.flatnonzero(curve == number)
         total, count = (np.convolve(one[rows], box)[_AROUND:-_AROUND] for one in (np.nan_to_num(offset_px), measured))
         smooth[rows] = total / np.maximum(count, 1.0)
@@ -76,7 +76,7 @@ def _amplitudes(columns: Array, bends: Array, prior_px: float) -> tuple[Array, A
     amplitude: Array = np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
         left = bends - columns @ amplitude
-        usual = max(float(np.median(np.abs(left))) / 0.6745, least_px)
+        usual = max(median(np.abs(left)) / 0.6745, least_px)
         weighted = columns / (1.0 + (left / (robust * usual)) ** 2)[:, None]
         normal = weighted.T @ columns + (usual / prior_px) ** 2 * np.eye(len(amplitude))
         amplitude = np.asarray(np.linalg.solve(normal, weighted.T @ bends), dtype=float)

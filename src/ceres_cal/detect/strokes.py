@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Array32, Indices, Mask, Rows
+from ceres_cal.base import AnyArray, Array, Array32, Indices, Mask, Rows, median, medians
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6
@@ -123,7 +123,7 @@ def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, in
     share = np.linspace(0.0, 1.0, 5)[:, None, None]
     places = np.round((1.0 - share) * strokes.ends[:, 0] + share * strokes.ends[:, 1]).astype(int)
     x, y = (np.clip(places[..., axis], 0, image_size[axis] - 1) for axis in (0, 1))
-    return np.asarray(np.median(plane[y, x], axis=0), float)
+    return medians(plane[y, x].T).astype(float)
 
 
 def _relief(grey: Array32) -> tuple[Array32, ...]:
@@ -140,31 +140,29 @@ def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[A
     soft, xx, yy, xy, middle, apart, *wide = relief
     sign = np.float32(-1.0 if dark else 1.0)
     strength = np.maximum(apart - sign * middle, 0.0)
-    usual = float(np.median(strength[::3, ::3]))
+    usual = median(strength[::3, ::3].ravel())
     # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
     size = (_NEARBY_PX, _NEARBY_PX)
     nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
     nearby = cv2.boxFilter(np.minimum(strength, 2.0 * _NOISE * nearby), cv2.CV_32F, size, normalize=True)
     ridge = strength > np.maximum(_NOISE_NEARBY * nearby, max(_NOISE * usual, 1e-3))
     ridge[:_BORDER_PX] = ridge[-_BORDER_PX:] = ridge[:, :_BORDER_PX] = ridge[:, -_BORDER_PX:] = False
-    rows, columns = np.nonzero(ridge)
-    level, off = _bends(*(plane[rows, columns] for plane in wide))
-    thin = off - sign * level < _WIDEST * strength[rows, columns]
-    rows, columns = rows[thin], columns[thin]
-    a, b, d = (sign * plane[rows, columns] for plane in (xx, xy, yy))
+    at, width = np.flatnonzero(ridge), ridge.shape[1]
+    level, off = _bends(*(plane.ravel()[at] for plane in wide))
+    at = at[off - sign * level < _WIDEST * strength.ravel()[at]]
+    a, b, d = (sign * plane.ravel()[at] for plane in (xx, xy, yy))
     angle = 0.5 * np.arctan2(2.0 * b, a - d) + 0.5 * np.pi  # of the direction that bends most
     nx, ny = np.cos(angle), np.sin(angle)
-    gx = 0.5 * sign * (soft[rows, columns + 1] - soft[rows, columns - 1])
-    gy = 0.5 * sign * (soft[rows + 1, columns] - soft[rows - 1, columns])
-    high = strength[rows, columns]
+    gx, gy = (0.5 * sign * (soft.ravel()[at + later] - soft.ravel()[at - later]) for later in (1, width))
+    high = strength.ravel()[at]
     step = (gx * nx + gy * ny) / high
     top = np.maximum(np.abs(step * nx), np.abs(step * ny)) <= 0.6
     mask = np.zeros(soft.shape, np.uint8)
-    mask[rows[top], columns[top]] = 1
+    mask.ravel()[at[top]] = 1
     joined = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX)))
     _, labels = cv2.connectedComponents(joined, connectivity=8)
-    pixels = np.column_stack([columns + step * nx, rows + step * ny])[top]
-    return pixels, high[top], labels[rows[top], columns[top]].astype(np.int64)
+    pixels = np.column_stack([at % width + step * nx, at // width + step * ny])[top]
+    return pixels, high[top], labels.ravel()[at[top]].astype(np.int64)
 
 
 def _second(soft: Array32) -> tuple[Array32, ...]:

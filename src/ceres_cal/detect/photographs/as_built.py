@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, CalibrationError, Frozen, Indices, SolutionError, attempt, median, replace
+from ceres_cal.base import Array, CalibrationError, Frozen, Indices, SolutionError, attempt, distinct, median, replace
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.photographs.refit import observations_of, problem_of
 from ceres_cal.effects.evidence import RandomEffects
@@ -168,7 +168,7 @@ def _wander_m(lines: Lines, target: Target, left_px: Array, places: Indices) -> 
 def _places_together(residuals: Array, curve: Indices) -> float:
     """How many neighbouring places count as one: their correlation, summed until it has fallen to nothing."""
     products, pairs = np.zeros(_APART), np.zeros(_APART)
-    for number in np.unique(curve):
+    for number in distinct(curve):
         own = residuals[curve == number]
         for apart in range(min(_APART, len(own))):
             products[apart] += float(own[: len(own) - apart] @ own[apart:])

@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices, Mask, median
+from ceres_cal.base.arrays import Array, Array32, Indices, Mask, distinct, median
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import peaks
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observations_of, refit_camera
@@ -71,7 +71,7 @@ def _lines_beside(grey: Array32, course: Course, reach_px: float) -> list[list[_
     steps, bright = peaks(grey, course, reach_px)
     seen = bright > _FAINT * median(np.max(bright, axis=1))
     beside = []
-    for number in np.unique(course.curve):
+    for number in distinct(course.curve):
         rows = np.flatnonzero(course.curve == number)
         lines = [one for one in _joined(rows, steps, seen) if len(one[0]) >= _LEAST * len(rows)]
         lines.sort(key=lambda line: abs(median(line[1])))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ceres_cal.base import Array32, Frozen, Mask, brief, for_small_matrices, frame_of, replace
+from ceres_cal.base import Array32, Frozen, Mask, brief, distinct, for_small_matrices, frame_of, median, replace
 from ceres_cal.base.errors import (
     CalibrationError,
     ImageProgress,
@@ -170,8 +170,8 @@ def _detections(results: Mapping[str, SearchResult], target: Target, options: Fi
     parts = [_observations(frame_of(path), one, target, options) for path, one in followed.items()]
     searched = {path: result for path, result in results.items() if result.followed is not None and result.ways}
     every = combine(parts)
-    seen = {target.curve_names[number] for number in np.unique(every.curves.feature)}
-    seen |= {target.point_names[number] for number in np.unique(every.points.feature)}
+    seen = {target.curve_names[number] for number in distinct(every.curves.feature)}
+    seen |= {target.point_names[number] for number in distinct(every.points.feature)}
     lengths = [_found(one, next(iter(followed.values()))) for one in options.lengths]
     lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
     priors = {(one.name, one.quantity): one for one in sorted((*every.priors, *lengths), key=lambda one: one.sigma)}
@@ -185,7 +185,7 @@ def _apart_px(one: SearchResult, other: SearchResult) -> float:
     pixels = other.followed.lines.pixels[other.followed.lines.found]
     floor = other.followed.camera.locate(pixels)
     there = one.followed.camera.project(np.column_stack([floor, np.zeros(len(floor))]))
-    return float(np.median(np.nan_to_num(np.linalg.norm(there - pixels, axis=1), nan=np.inf)))
+    return median(np.nan_to_num(np.linalg.norm(there - pixels, axis=1), nan=np.inf))
 
 
 def _of_one_place(results: Mapping[str, SearchResult]) -> dict[str, SearchResult]:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array32
+from ceres_cal.base.arrays import Array32, median, quantile
 from ceres_cal.base.frozen import replace
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
@@ -166,7 +166,7 @@ class Tracker:
         usable = [number for number, course in enumerate(courses) if len(course) >= _FEWEST]
         if not usable:
             return []
-        width = float(np.median(courses[usable[0]].width_px))
+        width = median(courses[usable[0]].width_px)
         near = nearness(self.grey, max(width, 2.0))
         usable.sort(key=lambda number: -near.score(courses[number].pixels))
         if self.free.hints is not None:
@@ -376,7 +376,7 @@ class Tracker:
         if len(course) < _FEWEST:
             return None
         offset, bright = search(self.grey, course, reach_px, 0.6 * reach_px)
-        clear = bright > 0.4 * float(np.quantile(bright, 0.8))
+        clear = bright > 0.4 * quantile(bright, 0.8)
         if np.count_nonzero(clear) < _FEWEST:
             return None
         course, offset = course.take(clear), offset[clear]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ceres_cal.base.arrays import distinct
 from ceres_cal.base.frozen import Frozen, cached_property
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines
@@ -74,7 +75,7 @@ class Followed(Frozen):
     @property
     def lacking(self) -> tuple[str, ...]:
         """Names of the missing curves in view."""
-        return tuple(self.target.curve_names[number] for number in np.unique(self._lacking.curve))
+        return tuple(self.target.curve_names[number] for number in distinct(self._lacking.curve))
 
     @cached_property
     def _lacking(self) -> Course:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, no_such, rotation_log
+from ceres_cal.base import Array, Frozen, InputError, Mask, Pose, distinct, no_such, rotation_log
 from ceres_cal.scene import Arc, Camera, Segment, Target, curve_points, middle_of, size_of, turns_of
 
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
@@ -85,7 +85,7 @@ def offsets_of(target: Target, curves: Collection[str], turn: Array) -> tuple[Ar
     """What a grid calls `along` and `across`, of these curves alone."""
     lines = _segments(target, curves)
     arcs = [curve for name, curve in target.curves.items() if name in curves and isinstance(curve, Arc)]
-    both = [np.unique([*_offsets(lines, turn, axis), *_tangents(arcs, turn[:, axis])]) for axis in (1, 0)]
+    both = [distinct(np.array([*_offsets(lines, turn, axis), *_tangents(arcs, turn[:, axis])])) for axis in (1, 0)]
     return both[0], both[1]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Mask, replace
+from ceres_cal.base import Array, Frozen, Mask, median, replace
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.photographs.candidates import FieldSearch
 from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
@@ -116,13 +116,15 @@ def explained(search: FieldSearch, followed: Followed) -> tuple[float, float]:
     with np.errstate(invalid="ignore"):
         inside = everywhere & np.all((parallel.middle > low) & (parallel.middle < high), axis=1)
     middle, length_px = strokes.ends.mean(axis=1), strokes.length_px
-    apart = np.min(np.sum(line**2, axis=1) - 2.0 * middle @ line.T, axis=1, initial=np.inf)
-    near = np.sum(middle**2, axis=1) + apart < _NEAR_PX**2
+    away = np.sum(line**2, axis=1)
+    parts = np.array_split(middle, 1 + len(middle) // 128)  # what is worked on stays in the cache
+    apart = [np.min(away - 2.0 * some @ line.T, axis=1, initial=np.inf) for some in parts]
+    near = np.sum(middle**2, axis=1) + np.concatenate(apart) < _NEAR_PX**2
 
     def share(among: Mask) -> float:
         if not np.any(among & near):
             return 0.0
-        strong = among & (strokes.strength > _AS_STRONG * np.median(strokes.strength[among & near]))
+        strong = among & (strokes.strength > _AS_STRONG * median(strokes.strength[among & near]))
         return float(np.average(near[strong], weights=length_px[strong]))
 
     return share(inside), share(everywhere)
@@ -185,7 +187,7 @@ def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
     here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
     extent = float(np.max(np.ptp(here, axis=0)))
     away = [np.linalg.norm(turn.inverse.transform(here) - there, axis=1) for turn in search.grid.turns]
-    return min(float(np.median(np.nan_to_num(one, nan=np.inf))) for one in away) < _SAME_FLOOR * extent
+    return min(median(np.nan_to_num(one, nan=np.inf)) for one in away) < _SAME_FLOOR * extent
 
 
 def detected_curves(search: FieldSearch, followed: Followed) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Mask
+from ceres_cal.base.arrays import Array, Array32, Mask, median, quantile
 from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import search
 from ceres_cal.detect.photographs.matching import divergence
@@ -42,10 +42,10 @@ def _seen(
     if len(course) < _FEWEST:
         return np.zeros(count), np.zeros(count), np.zeros(len(course))
     reach_px = 0.5 * share_of_image * float(np.hypot(*size))
-    width_px, known = float(np.round(np.median(course.width_px))), {} if known is None else known
+    width_px, known = float(np.round(median(course.width_px))), {} if known is None else known
     if width_px not in known:
         anywhere = search(grey, _laid_anywhere(size, width_px), reach_px)[1]
-        known[width_px] = float(np.quantile(anywhere, 1.0 - BY_CHANCE))
+        known[width_px] = quantile(anywhere, 1.0 - BY_CHANCE)
     bright = search(grey, course, reach_px)[1]
     every = np.ones(len(course)), bright > known[width_px]
     places, painted = (np.bincount(course.curve, one, count) for one in every)
@@ -92,7 +92,8 @@ def _covered(grey: Array32, course: Course, bright: Array, seen: Mask) -> Array:
         return np.zeros(len(seen))
     x, y = np.round(course.pixels + beside_widths * course.width_px[:, None] * course.normals).astype(int).T
     beside = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)]
-    low, high = np.quantile(beside[paint >= np.median(paint[paint > 0.0])], (_DARKEST, 1.0 - _DARKEST))
+    usual = beside[paint >= median(paint[paint > 0.0])]
+    low, high = quantile(usual, _DARKEST), quantile(usual, 1.0 - _DARKEST)
     other = (beside < low / _ANOTHER) | (beside > high * _ANOTHER)
     return np.asarray(np.bincount(course.curve, other, len(seen)), dtype=float)
 
