@@ -39,15 +39,16 @@ def take_types(instance: Any) -> None:
         InputError: a value has another type; the message names the field.
     """
     of, held = type(instance), vars(instance)
-    for name, kind in _fields(of).items():  # type: ignore[arg-type] # a class has a hash
-        value = getattr(instance, name)  # of a default that a file has not, its class
-        if type(value) is not kind and value is not getattr(of, name, held):  # nor its default
+    for name, kind, default in _fields(of):  # type: ignore[arg-type] # a class has a hash
+        value = held.get(name, default)  # of a default that a file has not, its class
+        if type(value) is not kind and value is not default:
             held[name] = convert(_plain(value), kind, f"{of.__name__}({name}=...)")
 
 
 @cache
-def _fields(of: type) -> dict[str, Any]:
-    return get_type_hints(of)
+def _fields(of: type) -> list[tuple[str, Any, Any]]:
+    """Name, type and default of each."""
+    return [(name, kind, getattr(of, name, _fields)) for name, kind in get_type_hints(of).items()]
 
 
 def _plain(value: Any) -> Any:

@@ -282,10 +282,10 @@ class Picture(Frozen):
 
     def _turned(self, moving: Array, known: Mask) -> Array:
         """(N, 2, K) how much of (N, 2, K) px a turn makes good."""
-        weights = np.repeat(self.weights * known, 2)[:, None]
-        flat = moving.reshape(len(weights), moving.shape[-1])
-        turn = np.linalg.lstsq(weights * self._turns, weights * flat, rcond=None)[0]
-        return np.asarray((self._turns @ turn).reshape(moving.shape))
+        turns, weights = self._turns, np.repeat(self.weights * known, 2)[:, None]
+        flat, weighted = moving.reshape(len(weights), moving.shape[-1]), weights**2 * turns
+        turn = np.linalg.lstsq(weighted.T @ turns, weighted.T @ flat, rcond=None)[0]
+        return np.asarray((turns @ turn).reshape(moving.shape))
 
 
 def image_grid(image_size: tuple[int, int]) -> tuple[Array, Array]:

@@ -64,7 +64,7 @@ def pixel_slopes(camera: Camera, places: Array) -> PixelSlopes:
     rows[known] = shown
     intrinsics, turns, shifts, _ = np.split(rows, [size, size + 3, size + 6], axis=2)
     pose = camera.cam_from_world  # whose translation turns along about the camera
-    return PixelSlopes(intrinsics * scales, turns + np.cross(pose.translation, shifts), shifts @ pose.rotation)
+    return PixelSlopes(intrinsics * scales, turns + shifts @ skew(pose.translation).T, shifts @ pose.rotation)
 
 
 def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:

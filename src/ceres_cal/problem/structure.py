@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, Indices32, InputError, Mask, distinct, no_such, take_types
+from ceres_cal.base import Array, Indices, Indices32, InputError, Mask, no_such, take_types
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
 from ceres_cal.observations.sights import Sights
 from ceres_cal.problem.information import Key
@@ -314,7 +314,7 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
             ("heights", own[:, 2 + len(WARP), None]), ("stretch", own[:, -len(STRETCH) :]),
         )  # fmt: skip
         every = {
-            (name, kind): distinct(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)
+            (name, kind): np.flatnonzero(np.bincount(slots[(slots >= 0) & (slots < structure.own)]))
             for kind, slots in kinds
         }
         numbers |= {of: slots for of, slots in every.items() if len(slots)}

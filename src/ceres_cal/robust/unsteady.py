@@ -216,10 +216,10 @@ def _equations(
     return equations, Weights(weights.inverse_sigma, used, np.ones_like(weights.robust))
 
 
-def _modes(equations: Equations, *, smooth: bool = True) -> Array:
-    """(E, 20) px per px of each coefficient of a view: the principal point's x and y; a shift of the picture, and a
-    turn and a shift of the pose, that grow from row to row; polynomials along both axes of the image, where `smooth`
-    asks for them.
+def _modes(equations: Equations, *, smooth: bool = True) -> list[Array]:
+    """(E, 20) px per px of each coefficient of a view, side by side: the principal point's x and y; a shift of the
+    picture, and a turn and a shift of the pose, that grow from row to row; polynomials along both axes of the image,
+    where `smooth` asks for them.
     """
     place = places_in_view(equations)
     turns = equations.pose * place[:, 1:]
@@ -227,7 +227,7 @@ def _modes(equations: Equations, *, smooth: bool = True) -> Array:
     modes = [equations.intrinsics[:, _CENTRE], equations.direction * place[:, 1:], turns]
     if smooth:
         modes.append(smooth_view(equations, place).reshape(len(place), -1))
-    return np.hstack(modes)
+    return modes
 
 
 def _seem_displaced(equations: Equations, weights: Weights) -> bool:
@@ -235,7 +235,7 @@ def _seem_displaced(equations: Equations, weights: Weights) -> bool:
     or their principal points seem to move by themselves, by moments: their scores have the variance T + T^2 sigma^2.
     Beside what else displaces views they move by less.
     """
-    columns = np.column_stack([_modes(equations, smooth=False), equations.pose, equations.residual])
+    columns = np.column_stack([*_modes(equations, smooth=False), equations.pose, equations.residual])
     columns *= (weights.inverse_sigma * weights.used)[:, None]
     left = posed(np.array([columns[start:stop].T @ columns[start:stop] for start, stop in pairwise(equations.bounds)]))
     whole_told, scores, squares = left[:, :-1, :-1], left[:, :-1, -1], left[:, -1, -1]
@@ -253,7 +253,7 @@ def _seem_displaced(equations: Equations, weights: Weights) -> bool:
 def _of_views(model: Linearised) -> SparseColumns:
     """Of the coefficients of each view, one after the other."""
     equations = model.equations
-    weighted = _modes(equations) * model.weight[:, None]
+    weighted = np.hstack(_modes(equations)) * model.weight[:, None]
     return SparseColumns.of_groups(model, weighted, equations.sight, len(equations.bounds) - 1)
 
 
@@ -302,7 +302,7 @@ def _predicted(
     equations = own.equations
     image_px = max(one.get(_IMAGE, _NONE_PX) for one in sizes.values())
     model = own.with_columns(smooth_image(equations, estimate), image_px / np.sqrt(noise))
-    modes, shared = _modes(equations), model.shared.shape[1]
+    modes, shared = np.hstack(_modes(equations)), model.shared.shape[1]
     beyond = np.where(model.used[:, None], model.beyond_private(modes * model.weight[:, None]), 0.0)
     both = np.column_stack([beyond, model.shared * np.sqrt(noise), model.placed_score])
     parts = pairwise(equations.bounds)
