@@ -337,8 +337,8 @@ def dimension_slopes(
     Raises:
         InputError: a dimension that no target has.
     """
-    place, known = {name: row for row, name in enumerate(offsets)}, dimensions_of(targets)
-    columns = np.zeros((len(offsets), len(dimensions)))
+    known, columns = dimensions_of(targets), np.zeros((len(offsets), len(dimensions)))
+    place = {name: row for row, name in enumerate(offsets)} if dimensions else {}
     for column, name in enumerate(dimensions):
         if name not in known:
             raise InputError(no_such("dimension to solve for", name, known))

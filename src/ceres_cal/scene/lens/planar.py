@@ -249,8 +249,8 @@ class Planar(Lens):
         unit = self._unit(phi)
         flat = along_radius(self._profile, offsets / unit, is_round=self._is_round)
         rays = self._lifted(flat * (unit / phi))
-        rays = unit_rays(rays[:, :2], rays[:, 2])
         if not self._is_round:
+            rays = unit_rays(rays[:, :2], rays[:, 2])
             lens_rays(self._optics(phi), offsets, longest * min(1.0, self._limit), rays)
             flat = self._flat(rays) * (phi / unit)
         return unit_rays(np.where(np.isfinite(self._within(flat)), rays[:, :2], np.nan), rays[:, 2])
