@@ -101,7 +101,7 @@ def rms_and_largest(off: Array) -> tuple[float, float]:
 
 def grid_places(x: Array, y: Array) -> Array:
     """(Y * X, 2) all places of a grid x (X,), y (Y,), row by row."""
-    return np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    return np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
 
 
 def is_diagonal(matrix: Array) -> bool:

@@ -7,6 +7,7 @@ A pose named `cam_from_world` maps world coordinates to camera coordinates, so f
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from math import atan2, hypot
 from typing import ClassVar
 
@@ -168,6 +169,7 @@ class Pose(Frozen):
         return f"Pose(rotation vector ({turn}) rad, translation ({shift}) m)"
 
     @classmethod
+    @cache
     def identity(cls) -> Pose:
         return cls(np.eye(3), np.zeros(3))
 
