@@ -640,3 +640,14 @@ def test_that_no_other_lens_could_be_compared_is_said(monkeypatch: pytest.Monkey
     calibration = calibrate(_seen("radial-2-3", "boards"))
     without = "so the standard deviations do not include what they would say: nothing came out"
     assert f"other lenses could not be compared, {without}" in calibration.warnings
+
+
+def test_lenses_that_ended_in_a_wrong_valley_are_asked_again() -> None:
+    """A wide lens at a tilt of 10 degrees: all with a formula left 2.4 px, and a spline had a phi of 254 px."""
+    wide = Camera((1280, 960), 527.8, (645.2, 493.9), KannalaBrandt((-0.0173, 0.0004, -0.002, 0.0004)))
+    station = Station("overhead", overhead_pose(3.6, 2.4, 3.04, 3.9, -9.6, yaw_deg=47.0))
+    scene = field_scene(ssl_field("A"), {"overhead": wide}, {"overhead": station}, spacing_m=0.3)
+    calibration = calibrate(simulate(scene, Disturbance(0.3, 0.3), 3).observations)
+    camera, posterior = calibration.cameras["overhead"], calibration.uncertainty.posterior
+    assert camera.lens.kind == "kannala-brandt"
+    assert abs(camera.phi - wide.phi) < 3.0 * posterior.sd_of("camera", "overhead", "phi")  # 0.8

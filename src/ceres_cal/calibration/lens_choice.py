@@ -26,7 +26,12 @@ from ceres_cal.base import (
 )
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
-from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort, one_power_more
+from ceres_cal.calibration.lens_comparison import (
+    compared_kinds,
+    explained_by_another,
+    last_resort,
+    one_power_more,
+)
 from ceres_cal.calibration.lens_forms import (
     AS_GOOD,
     AS_GOOD_BESIDE_LENGTHS,
@@ -116,6 +121,13 @@ class Comparison(Frozen):
             return 0.0
         worse = standard_errors(self.chosen.squares, self.passed.squares)
         return worse if worse > self.as_good else 0.0
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether the chosen lens has no formula, and leaves far less than any that has one."""
+        far_less = 0.5  # of their squares: of real lenses without a formula 0.7 and more, beside a wrong valley 0.14
+        of_formulas = min((one.of.least for one in self.tried if not one.form.blank.roughness), default=0.0)
+        return bool(self.chosen.form.blank.roughness) and self.chosen.of.least < far_less * of_formulas
 
     def others(self, posterior: Posterior, options: Options) -> OtherLenses:
         """What other lenses would say, as far as they are probable; nothing beside one without a formula.

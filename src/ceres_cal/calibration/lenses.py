@@ -61,6 +61,11 @@ class ChosenLenses(Frozen):
         return next((one.built for one in self.each.values() if one.built.every), AS_DRAWN)
 
     @property
+    def alone(self) -> set[str]:
+        """Cameras of which a lens without a formula leaves far less than any other."""
+        return {name for name, one in self.each.items() if one.among is not None and one.among.is_alone}
+
+    @property
     def labels(self) -> list[str]:
         """What the lenses are called."""
         return [one.choice.chosen for one in self.each.values()]
