@@ -234,21 +234,16 @@ class Posterior(Frozen):
 
     def _off(self, lens: int, keys: Sequence[Key]) -> Array:
         """(K,) phi and where cameras stand with a lens, from what the chosen one has; NaN of all else: of another kind
-        of lens, of coefficients, which mean another thing beside others, of what is followed, and of stations that no
-        lens by itself places.
+        of lens, of coefficients, which mean another thing beside others, of what is followed, and beside boards that
+        several cameras see: each lens was solved for without the other cameras.
         """
-        chosen, other = self.lenses[0], self.lenses[lens]
+        chosen, other, off = self.lenses[0], self.lenses[lens], np.full(len(keys), np.nan)
+        if any(key.kind == "placement" for key in self.keys):
+            return off
         alike = {name for name, one in other.cameras.items() if one.lens.kind == chosen.cameras[name].lens.kind}
-        placed = {
-            name
-            for name, station in other.stations.items()
-            if station.camera in alike
-            and not np.array_equal(station.cam_from_world.matrix, chosen.stations[name].cam_from_world.matrix)
-        }
-        owners = {("camera", name, "phi") for name in alike}
-        is_own = [key[:3] in owners or (key.kind == "station" and key.owner in placed) for key in keys]
-        at = [i for i, key in enumerate(keys) if is_own[i] and key not in self.followed_phi]
-        off = np.full(len(keys), np.nan)
+        owners = {("station", name) for name, station in other.stations.items() if station.camera in alike}
+        phi = {("camera", name, "phi") for name in alike} - {key[:3] for key in self.followed_phi}
+        at = [i for i, key in enumerate(keys) if key[:2] in owners or key[:3] in phi]
         off[at] = difference(other, chosen, [keys[i] for i in at])
         return off
 
