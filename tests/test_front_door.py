@@ -55,6 +55,15 @@ def test_places_frames_and_what_was_not_seen() -> None:
         Observations.from_points([pixels.T], places, (640, 480))
 
 
+def test_names_from_arrays_are_text() -> None:
+    """`np.array(["left"])[0]` is text to Python, and ended in a TypeError of the file that is made of it."""
+    name, frame = np.array(["left", "0001"])
+    field = ssl_field(np.array(["B"])[0])
+    seen = Observations.from_points({frame: np.ones((len(field.points), 2))}, field, (640, 480), camera=name)
+    assert [type(one) for one in (*seen.cameras, seen.views[0].frame, seen.views[0].camera)] == [str, str, str]
+    assert seen.digest
+
+
 def test_one_pixel_and_metres() -> None:
     camera = TRUE.at(overhead_pose(0.0, 0.0, 4.0, 3.0, 2.0))
     assert camera.locate([640, 480]).shape == (2,)

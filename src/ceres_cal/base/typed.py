@@ -53,14 +53,14 @@ def _fields(of: type) -> list[tuple[str, Any, Any]]:
 
 def _plain(value: Any) -> Any:
     """NumPy's numbers and arrays as Python's, also inside of lists and mappings."""
-    if isinstance(value, str):  # which is most of them
+    if type(value) is str:  # which is most of them; NumPy's text is one, too, that no file takes
         return value
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
     if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
+        return {_plain(name): _plain(entry) for name, entry in value.items()}
     return value
 
 
@@ -85,9 +85,13 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
             for own, one in value.items() if many else ((name, value),):
                 if kinds and not _fits(one, kinds):
                     raise InputError(f"{function.__name__}(): {_wrong(own, one, kinds, function, given)}")
-        return function(*args, **kwargs)
+        return function(*map(_text, args), **{name: _text(value) for name, value in kwargs.items()})
 
     return call
+
+
+def _text(value: Any) -> Any:
+    return str(value) if isinstance(value, np.str_) else value
 
 
 def _meant(given: Mapping[str, Any], known: Mapping[str, Any]) -> str:
