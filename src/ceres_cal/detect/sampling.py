@@ -21,7 +21,8 @@ _ROUNDS, _FEWEST = 5, 20
 _CURVATURE = np.array([1.0, -2.0, 1.0])
 # Across level lines, upright ones, and those along either diagonal, which a sensor of colours draws alike.
 _ACROSS = np.array([(0.0, 1.0), (1.0, 0.0), (0.5**0.5, 0.5**0.5), (0.5**0.5, -(0.5**0.5))])
-_CYCLES = (((0,), (0.5, 1.0, 2.0)), ((1,), (0.5, 1.0, 2.0)), ((2, 3), (0.5**0.5, 2.0**0.5)))  # 1/px
+# Directions, 1/px of the longest wave across them, and how many there are, each half as long as the one before.
+_WAVES = (((0,), 0.5, 3), ((1,), 0.5, 3), ((2, 3), 0.5**0.5, 2))
 
 
 def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px: int) -> tuple[Array, Array]:
@@ -97,8 +98,12 @@ def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
     x, y = np.where(level[:, None], (u, v), (v, u))
     wave = _ACROSS[nearest]
     crossed, share = wave[:, :1] * x + wave[:, 1:] * y, np.sum(wave * normals, axis=1)
-    waves = [(np.isin(nearest, own), cycles) for own, every in _CYCLES for cycles in every]
-    turns = np.zeros((len(course), len(waves)), dtype=complex)
-    for number, (rows, cycles) in enumerate(waves):
-        turns[rows, number] = share[rows] * np.mean(np.exp(2j * np.pi * cycles * crossed[rows]), axis=1)
+    turns = np.zeros((len(course), sum(count for *_, count in _WAVES)), dtype=complex)
+    number = 0
+    for own, cycles, count in _WAVES:
+        rows = np.isin(nearest, own)
+        turn = np.exp(2j * np.pi * cycles * crossed[rows])
+        for _ in range(count):
+            turns[rows, number] = share[rows] * np.mean(turn, axis=1)
+            turn, number = turn * turn, number + 1
     return turns

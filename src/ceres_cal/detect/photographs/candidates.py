@@ -147,7 +147,8 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
         optics = _optics(upright, search.stroke_map)
         seen = lines_seen(upright, search.stroke_map)
         for grid in (search.grid, *search.others):
-            found = [(score, optics.at(pose)) for score, pose in match(upright, search.stroke_map, grid, seen)]
+            matched = match(upright, search.stroke_map, grid, seen, _COMPARABLE)
+            found = [(score, optics.at(pose)) for score, pose in matched]
             drawn |= {id(camera): grid for _, camera in found}
             scored += found
         if scored and max(score for score, _ in scored) > _SURE:
@@ -172,7 +173,8 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
     along, across = offsets_of(search.grid.target, detected, search.grid.turn)
     lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
     optics = _optics(upright, stroke_map)
-    others = [(score, optics.at(pose)) for score, pose in match(upright, stroke_map, search.grid, lines)]
+    matched = match(upright, stroke_map, search.grid, lines, _ALIKE)
+    others = [(score, optics.at(pose)) for score, pose in matched]
     distinct = [camera, *_distinct(others, search.grid.turns, _ALIKE, camera)]
     likely = _likely(search, [(one, search.grid) for one in distinct])
     return [one for one, _ in likely if one is not camera]

@@ -117,8 +117,12 @@ def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
     return FloorLines(*(_peaks(places[rows], weights[rows], float(weights.sum())) for places, rows in parts))
 
 
-def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[tuple[float, Pose]]:
-    """The best hypotheses for these lines: how good each is, and the camera from the target; the best first."""
+def match(
+    upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines, least: float
+) -> list[tuple[float, Pose]]:
+    """The best hypotheses for these lines: how good each is, and the camera from the target; the best first, up to
+    those that have less than `least` of its score.
+    """
     kept = 250
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     scored: list[tuple[float, Array, Array]] = []
@@ -133,7 +137,9 @@ def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorL
     turn = np.eye(3)
     turn[:2, :2] = grid.turn
     return [
-        (score, Pose.looking(turn @ place[[1, 2, 0]], rotation @ turn.T)) for score, place, rotation in scored[:kept]
+        (score, Pose.looking(turn @ place[[1, 2, 0]], rotation @ turn.T))
+        for score, place, rotation in scored[:kept]
+        if score >= least * scored[0][0]
     ]
 
 

@@ -21,15 +21,18 @@ class Growing {
           above_(above),
           below_(below),
           width_(width),
-          limit_(limit) {}
+          limit_(limit),
+          end_(limit < FAR ? at(limit).value : FAR) {}
 
     // x up to the limit where the map is `target`, by Newton safeguarded with bisection; NaN where none is.
     double inverse(double target) const {
-        constexpr double NONE = std::numeric_limits<double>::quiet_NaN(), FAR = std::numeric_limits<double>::infinity();
-        if (!(target >= 0.0 && target < FAR)) return NONE;
+        constexpr double NONE = std::numeric_limits<double>::quiet_NaN();
+        if (!(target >= 0.0 && target < FAR && target <= end_)) return NONE;
         double low = 0.0, high = limit_ < FAR ? limit_ : target, last = FAR;
-        for (int i = 0; i < STEPS && !(limit_ < FAR) && at(high).value < target; ++i) high *= 2.0;
-        if (!(target <= at(high).value)) return NONE;
+        if (!(limit_ < FAR)) {
+            for (int i = 0; i < STEPS && at(high).value < target; ++i) high *= 2.0;
+            if (!(target <= at(high).value)) return NONE;
+        }
         double x = std::min(target, high);
         for (int i = 0; i < STEPS; ++i) {
             const Value there = at(x);
@@ -49,6 +52,7 @@ class Growing {
     }
 
   private:
+    static constexpr double FAR = std::numeric_limits<double>::infinity();
     static constexpr int STEPS = 60;  // a safeguard: Newton needs 4 to 8, bisection 53
     struct Value {
         double value, slope;
@@ -77,7 +81,7 @@ class Growing {
 
     int pieces_, terms_, terms_below_;
     const double *above_, *below_;
-    double width_, limit_;
+    double width_, limit_, end_;  // the last: how large the map is at its limit
 };
 
 // Rays of a lens on square pixels whose images are some offsets, each sought in the plane that touches its start.
