@@ -146,6 +146,17 @@ def test_as_typed(say: Say, tmp_path: Path) -> None:
     assert "--diameter" in refused(say(*detect, "--circles", 0.03))
 
 
+def test_run_takes_a_board_of_circles(say: Say, tmp_path: Path) -> None:
+    """It was refused as a field without painted curves, whose remedy takes chessboards alone."""
+    board, pictures = circle_grid(7, 5, 0.03, 0.02), tmp_path / "pictures"
+    pictures.mkdir()
+    for number, tilt in enumerate((0.3, -0.3, 0.4, -0.2)):
+        write(pictures / f"{number}.png", photograph(seen(board, tilt)[0]))
+    for name in ("--target", "--board"):
+        said = say("run", pictures, name, json.dumps(board.spec), "-o", tmp_path / name[2:], "--quiet")
+        assert said.code == 0 and "The intrinsics can be trusted, to 0." in said.out
+
+
 def test_a_smaller_picture_has_no_grid(tmp_path: Path) -> None:
     blank = replace(CAMERA, image_size=(320, 240))
     image = write(tmp_path / "a.png", np.full(blank.image_size[::-1], 128, np.uint8))

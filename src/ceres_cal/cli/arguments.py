@@ -172,8 +172,15 @@ def parse_board(text: str) -> tuple[int, int, float]:
     return int(parts[0]), int(parts[1]), parse_length(parts[2], f"board {text!r}", "mm") / 1000.0
 
 
+def is_described(text: str) -> bool:
+    """Whether a target is spelled out as `{"kind": ...}`, or in a file."""
+    return text.lstrip().startswith("{") or text.endswith(".json")
+
+
 def board_words(text: str) -> list[str]:
-    """COLUMNSxROWSxMM as `detect board` takes it."""
+    """A board as `detect board` takes it: COLUMNSxROWSxMM, or a target."""
+    if is_described(text):
+        return ["--target", text]
     columns, rows, square_m = parse_board(text)
     return ["--columns", str(columns), "--rows", str(rows), "--square", f"{1e3 * square_m:.9g}mm"]
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal import base, detect, diagnostics, observations, report, scene
 from ceres_cal.base import CalibrationError, InputError, attempt, image_files, no_such
-from ceres_cal.cli.arguments import ReportArguments, parse_board, parse_priors
+from ceres_cal.cli.arguments import ReportArguments, is_described, parse_board, parse_priors
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
@@ -26,16 +26,25 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def is_board(text: str) -> bool:
-    """Whether a target is spelled as a chessboard."""
+def _is_chessboard(text: str) -> bool:
     return re.fullmatch(r"\d+x\d+x.+", text) is not None
+
+
+def is_board(text: str) -> bool:
+    """Whether a target is spelled as a chessboard, or described as what somebody holds up."""
+    return _is_chessboard(text) or (is_described(text) and read_target(text, "field").movable)
+
+
+def read_board(text: str) -> scene.Target:
+    """The board of `--board`: COLUMNSxROWSxMM, or described as for `--target`."""
+    return read_target(text, "board") if is_described(text) else scene.checkerboard(*parse_board(text))
 
 
 def spelled_target(text: str, where: str) -> scene.Target | None:
     """The target that somebody spelled out, as a chessboard such as 9x6x25mm or as `{"kind": ...}`; None for anything
     else, such as a name or a file.
     """
-    if is_board(text):
+    if _is_chessboard(text):
         return scene.checkerboard(*parse_board(text))
     if not text.lstrip().startswith("{"):
         return None
@@ -78,7 +87,7 @@ def require_shown(
 
     least = 0.1  # of the picture's diagonal, that a field is large which can be found
     if board is not None:
-        detect.finder_of(scene.checkerboard(*parse_board(board)))
+        detect.finder_of(read_board(board))
     field = None if target is None else read_target(target, "field")
     for prior in parse_priors(priors, {"station": cameras, "camera": cameras}, Options(lens=lens)):
         bounds: list[Range] = []

@@ -8,12 +8,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from ceres_cal import detect, formats, scene, start
+from ceres_cal import detect, formats, start
 from ceres_cal.base import IMAGE_ENDINGS, Frozen, InputError, NothingShownError, each_camera, images_and_videos, replace
 from ceres_cal.base.words import first_of, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
-from ceres_cal.cli.files import attempted, folder_of_results, is_board, require_shown
+from ceres_cal.cli.files import attempted, folder_of_results, is_board, read_board, require_shown
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
@@ -39,7 +39,8 @@ class RunArguments(QuietArguments):
     )
     not_painted: str = arguments.not_painted_option("lines that this field does not have", beside=("target",))
     board: str | None = arguments.board_option(
-        "a chessboard by its inner corners and the side of a square, such as 9x6x25mm"
+        "a chessboard by its inner corners and the side of a square, such as 9x6x25mm; another board, of circles or "
+        "AprilTags, as --target of `detect board`"
     )
     lens: str = option("as of `calibrate`", "KIND", "auto")
     prior: tuple[str, ...] = arguments.prior_option()
@@ -214,7 +215,7 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
 
 def _is_named_by_chance(board: str | None) -> bool:
     """Whether a board looks the same turned by half a turn, so that each camera may name its corners otherwise."""
-    return board is not None and len(start.symmetries(scene.checkerboard(*arguments.parse_board(board)))) > 1
+    return board is not None and len(start.symmetries(read_board(board))) > 1
 
 
 def _calibrated(

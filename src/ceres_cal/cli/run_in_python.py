@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
-from ceres_cal.base import Images, InputError, checked
+from ceres_cal.base import Images, checked
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.run import RunArguments
@@ -35,7 +35,8 @@ def run(
     Args:
         images: photographs of one camera, a folder of them, or a video; or a folder with such a folder, or a video, for
             each camera. output: folder for everything that is made.
-        target: the field, such as `ssl_field("B")` or "ssl-b". board: a checkerboard, such as "9x6x25mm".
+        target: the field, such as `ssl_field("B")` or "ssl-b". board: such as "9x6x25mm", or a target of circles or
+            AprilTags.
         facing: which way round the field is, such as {"LeftGoalLine": "top"}, of several cameras
             {"left.LeftGoalLine": "top"}. not_painted: lines that it lacks.
         lens: as in `Options`. prior: such as "height_m=4.02:20mm". estimate: dimensions of the field to solve for.
@@ -50,7 +51,7 @@ def run(
         target=json.dumps(target.spec) if isinstance(target, Target) else target,
         facing=tuple(f"{name}={side}" for name, side in (facing or {}).items()),
         not_painted=",".join(not_painted),
-        board=_board_words(board) if isinstance(board, Target) else board,
+        board=json.dumps(board.spec) if isinstance(board, Target) else board,
         lens=lens,
         prior=tuple(prior),
         estimate=tuple(estimate),
@@ -61,9 +62,3 @@ def run(
     )
     COMMANDS["run"].run(given)
     return Calibration.load(given.output / "calibration.json")
-
-
-def _board_words(board: Target) -> str:
-    if board.grid is None or not board.grid.checkered:
-        raise InputError(f"board must be a checkerboard, not of kind {board.kind!r}: use detect_board and calibrate")
-    return f"{board.grid.columns}x{board.grid.rows}x{1e3 * board.grid.spacing_m:.9g}mm"
