@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,21 @@ def file_schemas() -> dict[str, dict[str, Any]]:
     """Name of the shipped file -> schema: of calibrations and of observations."""
     kinds = {"calibration": CalibrationFile, "observations": ObservationsFile}
     schemas = {f"{name}.schema.json": msgspec.json.schema(kind) for name, kind in kinds.items()}
-    plain: dict[str, dict[str, Any]] = msgspec.json.decode(msgspec.json.encode(schemas))  # defaults are tuples
+    plain: dict[str, dict[str, Any]] = _alike(msgspec.json.decode(msgspec.json.encode(schemas)))  # defaults are tuples
     return plain
+
+
+def _alike(part: Any) -> Any:
+    """A part of a schema as every msgspec has it: 0.23 takes the indentation out of docstrings, and names empty
+    defaults.
+    """
+    if isinstance(part, list):
+        return [_alike(one) for one in part]
+    if not isinstance(part, dict):
+        return part
+    kept = {name: _alike(one) for name, one in part.items() if (name, one) != ("default", {})}
+    words = kept.get("description")
+    return {**kept, "description": inspect.cleandoc(words)} if isinstance(words, str) else kept
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -125,7 +125,7 @@ class Comparison(Frozen):
     @property
     def is_alone(self) -> bool:
         """Whether the chosen lens has no formula, and leaves far less than any that has one."""
-        far_less = 0.5  # of their squares: of real lenses without a formula 0.7 and more, beside a wrong valley 0.14
+        far_less = 0.25  # of their squares: of real lenses without a formula 0.4 and more, beside a wrong valley 0.14
         of_formulas = min((one.of.least for one in self.tried if not one.form.blank.roughness), default=0.0)
         return bool(self.chosen.form.blank.roughness) and self.chosen.of.least < far_less * of_formulas
 
