@@ -26,12 +26,7 @@ from ceres_cal.base import (
 )
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
-from ceres_cal.calibration.lens_comparison import (
-    compared_kinds,
-    explained_by_another,
-    last_resort,
-    one_power_more,
-)
+from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort, one_power_more
 from ceres_cal.calibration.lens_forms import (
     AS_GOOD,
     AS_GOOD_BESIDE_LENGTHS,
