@@ -139,16 +139,25 @@ ODD: dict[str, _Maker] = {
     "one board": partial(_boards, most=1),
     "two boards": partial(_boards, most=2),
 }
+
+
+def _above(drawn: _Drawn) -> Scene:
+    return drawn.over_the_field((0.0, 12.0), (6, 30), FIELD.curve_names, drawn.rng.uniform(0.2, 1.0))
+
+
 BESIDE: dict[str, _Maker] = {"5 to 8 points beside lines": _points_beside_lines}
+BY_DEFAULT: dict[str, _Maker] = {"above a field": _above, "three boards": partial(_boards, most=3)}
 
 
-def odd_problem(make: _Maker, lens: str, seed: int) -> Problem:
-    """The same maker, lens and seed give the same problem; each prior's value is the true one."""
+def odd_problem(make: _Maker, lens: str, seed: int, *, is_named: bool = True) -> Problem:
+    """The same maker, lens and seed give the same problem; each prior's value is the true one. A lens that is not named
+    is chosen by default.
+    """
     rng = np.random.default_rng([seed, 13])
     phi, model = LENSES[lens](rng)
     free_centre = bool(rng.random() < 0.7)
     centre = (639.5 + rng.uniform(-15.0, 15.0), 479.5 + rng.uniform(-15.0, 15.0)) if free_centre else (639.5, 479.5)
-    options = Options(lens=lens, free_principal_point=free_centre)
+    options = Options(lens=lens, free_principal_point=free_centre) if is_named else Options()
     scene = make(_Drawn(rng, Camera((1280, 960), phi, centre, model)))
     priors: tuple[Prior, ...] = ()
     if len(scene.placements) == 0 and rng.random() < 0.25:
@@ -183,7 +192,7 @@ class Outcome:
 
 def outcome(kind: str, make: _Maker, lens: str, seed: int) -> Outcome:
     """Calibrate one scene."""
-    problem = odd_problem(make, lens, seed)
+    problem = odd_problem(make, lens, seed, is_named=kind not in BY_DEFAULT)
     rng = np.random.default_rng([seed, 14])
     priors = [replace(p, value=tuple(rng.normal(p.value, p.sigma).tolist())) for p in problem.priors]
     sigma_px = float(rng.choice(NOISES_PX))
@@ -282,10 +291,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser(__doc__, (2000, "scenes"))
     options.add_argument("--first", type=int, default=0, help="seed of the first one (default 0)")
     options.add_argument("--beside", action="store_true", help="only 5 to 8 points beside the lines of a field")
+    options.add_argument(
+        "--defaults", action="store_true", help="only cameras above a field and few boards, no lens named"
+    )
     options.add_argument("--kind", nargs="+", choices=list(ODD), default=list(ODD), help="only these")
     options.add_argument("--worst", type=int, default=12, help="how many of the worst are printed (default 12)")
     given = options.parse_args(arguments)
-    kinds = BESIDE if given.beside else {kind: ODD[kind] for kind in given.kind}
+    kinds = BESIDE if given.beside else BY_DEFAULT if given.defaults else {kind: ODD[kind] for kind in given.kind}
     found = []
     with over_processes(given.jobs):
         for one in over(partial(_one, kinds), range(given.first, given.first + given.runs)):
