@@ -249,7 +249,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
     chosen = choose_lenses(sights, options, start)
     seen, chosen = chosen.first_solved(seen_with)
     too_few = {name for name in seen.leaving_alike if chosen.each[name].choice.share < 1.0}
-    anew = [*chosen.each] if seen.as_built and not chosen.built.every else sorted(too_few | chosen.alone)
+    anew = [*chosen.each] if seen.as_built and not chosen.built.every else sorted(too_few | chosen.far_better)
     if anew:
         # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
         # all views leave in the same places need not show in the few of them that lenses were compared by. Where only a

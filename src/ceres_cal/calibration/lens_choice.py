@@ -118,7 +118,7 @@ class Comparison(Frozen):
         return worse if worse > self.as_good else 0.0
 
     @property
-    def is_alone(self) -> bool:
+    def is_far_better(self) -> bool:
         """Whether the chosen lens has no formula, and leaves far less than any that has one."""
         far_less = 0.25  # of their squares: of real lenses without a formula 0.4 and more, beside a wrong valley 0.14
         of_formulas = min((one.of.least for one in self.tried if not one.form.blank.roughness), default=0.0)

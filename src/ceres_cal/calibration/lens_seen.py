@@ -227,7 +227,11 @@ _NEAR = 4.0
 _KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
 
 
-_NOT_SHOWN = "cannot show all that another lens shows"
+def _found(solution: Solution) -> Solution:
+    """A solve that came to an end; DegenerateError of one that did not."""
+    if solution.failed:
+        raise DegenerateError(f"cannot be solved for: {solution.termination}")
+    return solution
 
 
 def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
@@ -279,8 +283,8 @@ class InlierRows(Frozen):
                 estimate = seen_through(estimate, options, self._profiles)
                 solution = solve(problem, estimate, precision=_PRECISION, is_near=False)
                 if solution.failed:
-                    raise DegenerateError(_NOT_SHOWN)
-                estimate = solution.estimate
+                    self._shown(estimate)  # where that is why, its own words are said
+                estimate = _found(solution).estimate
             return self._near_best(forms, problem, estimate)
 
         return _or_failed(near_best, forms, start)
@@ -356,9 +360,7 @@ class InlierRows(Frozen):
         problem = self._problem(options, start, candidate.of.smoothness)
         if held is not None:
             problem = problem.holding(held.owner, intrinsic_names(start.cameras[held.owner].lens).index(held.quantity))
-        solution = solve(problem, start, precision=at_best, posed=at_best)
-        if solution.failed:
-            raise DegenerateError(f"cannot be solved for: {solution.termination}")
+        solution = _found(solve(problem, start, precision=at_best, posed=at_best))
         if as_promised and 2.0 * solution.cost > self._kept(candidate):
             raise DegenerateError("is not at its best where normal equations have it")
         return solution
@@ -395,7 +397,7 @@ class InlierRows(Frozen):
         there = residuals(self.sights, estimate, self.end.residuals.feet)
         known = np.isfinite(there.points[self.sights.point_rows]), np.isfinite(there.curves[self.sights.curve_rows])
         if not (known[0].all() and known[1].all()):
-            raise DegenerateError(_NOT_SHOWN)
+            raise DegenerateError("cannot show all that another lens shows")
         return there
 
 

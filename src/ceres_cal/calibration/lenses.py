@@ -61,9 +61,9 @@ class ChosenLenses(Frozen):
         return next((one.built for one in self.each.values() if one.built.every), AS_DRAWN)
 
     @property
-    def alone(self) -> set[str]:
+    def far_better(self) -> set[str]:
         """Cameras of which a lens without a formula leaves far less than any other."""
-        return {name for name, one in self.each.items() if one.among is not None and one.among.is_alone}
+        return {name for name, one in self.each.items() if one.among is not None and one.among.is_far_better}
 
     @property
     def labels(self) -> list[str]:
