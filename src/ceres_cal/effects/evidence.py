@@ -367,12 +367,13 @@ class RepeatedAmounts(Frozen):
         """Sigma and probability of each effect by name, beside those of the others that are likely.
 
         Args:
-            stated: others, beside which all of them are.
+            stated: others, beside which all of them are; their numbers come last.
         """
         sweeps, no_change = 2, 0.1  # over the effects, each beside the others; of the logarithm of one of their sigmas
         found: dict[_Name, tuple[float, float]] = {}
         asked: dict[_Name, dict[_Name, float]] = {}
-        score, information = self._beside(np.arange(len(self.score)), stated)
+        own_last = min((of_other[0] for of_other, _ in stated), default=len(self.score))
+        score, information = self._beside(np.arange(own_last), stated)
         where = replace(self, score=score, information=information)
         each = sorted(numbers.items(), key=lambda one: len(one[1]))  # what takes longest is asked when others are known
         for name, own in each * sweeps if self.spare >= _FEWEST else ():
