@@ -12,7 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Frozen, Image, Image8, ImageProgress, InputError, NothingShownError, in_turn
+from ceres_cal.base import AnyArray, Array, Frozen, Image, Image8, ImageProgress, InputError, NothingShownError
+from ceres_cal.base.threads import for_small_matrices, in_turn
 from ceres_cal.base.words import frame_of, no_such, printable
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.partly import NO_PLACE, is_whole, part_of_board
@@ -60,6 +61,7 @@ class BoardDetections(Frozen, eq=True):
     missed: tuple[tuple[str, str], ...]
 
 
+@for_small_matrices()
 def detect_boards(
     images: Sequence[Path],
     board: Target,
