@@ -55,6 +55,15 @@ def test_what_is_seen_along_correlated_edges_is_no_movement(seed: int) -> None:
     assert found.holds and found.probability > 0.1  # 0.54, 0.51 and 0.49
 
 
+def test_two_lines_accuse_no_camera_that_stands_still(calibration: Calibration) -> None:
+    """Where they leave the pose open, or fit a field turned round, the nearest pose that they allow is asked about."""
+    for seed in range(20, 40):
+        found = lines(HOME, seed)
+        two = np.random.default_rng(seed).permutation(np.unique(found.curves.feature))[:2]
+        few = found.part(np.zeros(len(found.points), dtype=bool), np.isin(found.curves.feature, two))
+        assert check(calibration, few)["overhead"].probability > 1e-4  # 1.4e-4; 4 of 20 were below 1e-7, two of them 0
+
+
 def test_small_moves_are_found() -> None:
     for seed in range(5):
         assert not checked(KINDS[0], seed, seed, SMALL_TILT).holds

@@ -26,6 +26,8 @@ _WIDE = (60.0, 12.0)
 _GRID = list(product(np.deg2rad((-24.0, 0.0, 24.0)), repeat=3))
 # m and rad: candidates nearer than this end in one minimum. Nothing changes from half to double.
 _ALIKE = (0.02, 0.01)
+# Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
+_NATS_ALIKE = 10.0
 # A pose fits where that share of the observations lies within so many standard deviations, at a noise of at most so
 # many times that of the calibration: up to 40 % may be wrong. Nothing changes but at a noise of twice: another iris
 # then fits no pose, and is not named.
@@ -112,6 +114,16 @@ def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) 
         around = [pose.turned(turn) for pose in seeds for turn in _GRID]
         candidates = _distinct([*candidates, *_refined(search, around)])
     return candidates
+
+
+def alike(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
+    """Those that explain the observations about as well as the best."""
+    return [one for one in candidates if one.misfit <= candidates[0].misfit + _NATS_ALIKE]
+
+
+def least_moved(candidates: Sequence[PoseCandidate], old: Sequence[Pose]) -> PoseCandidate:
+    """The one of the smallest move."""
+    return min(candidates, key=lambda one: min((sum(movement(one.pose, before)) for before in old), default=0.0))
 
 
 def equations(sight: Sights) -> int:

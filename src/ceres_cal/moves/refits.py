@@ -23,7 +23,16 @@ from ceres_cal.moves.explanations import (
     why_nothing_fits,
     zoomed_search,
 )
-from ceres_cal.moves.poses import PoseSearch, equations, moved_from, moved_words, movement, pose_candidates
+from ceres_cal.moves.poses import (
+    PoseSearch,
+    alike,
+    equations,
+    least_moved,
+    moved_from,
+    moved_words,
+    movement,
+    pose_candidates,
+)
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, loosened, make_plan, refit_problem
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.posterior import OtherLenses, with_other_lenses
@@ -31,8 +40,6 @@ from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting
 from ceres_cal.robust.other_minima import solved_soon
 from ceres_cal.start import Start, what_poses
 
-# Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
-_NATS_ALIKE = 10.0
 # Equations with which a pose is the only one: six numbers, and two that contradict a wrong one. Nothing changes at
 # half of it; at double four corners are refused.
 _UNIQUE = 8
@@ -145,11 +152,9 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
     """The search as it is understood, and the station's pose there."""
     old = old_poses(plan, search)
     candidates = pose_candidates(search, old)
-    fitting = [c for c in candidates if c.fits and c.misfit <= candidates[0].misfit + _NATS_ALIKE]
+    fitting = [one for one in alike(candidates) if one.fits]
     if fitting:
-        # Of explanations that fit alike the one of the smallest move is taken.
-        far = [min((sum(movement(one.pose, before)) for before in old), default=0.0) for one in fitting]
-        pose = fitting[int(np.argmin(far))].pose
+        pose = least_moved(fitting, old).pose
         _require_unique(search, pose, old)
         return search, pose
     if plan.what in ("zoom", "iris", "everything"):

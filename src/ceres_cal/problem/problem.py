@@ -11,7 +11,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, field, replace
 from ceres_cal.observations import Observations, SightKey, Sights
 from ceres_cal.problem.information import Information
-from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, make_layout
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, intrinsic_names, make_layout
 from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.quantities import free_keys, intrinsic_keys
 from ceres_cal.problem.structure import EXACT
@@ -122,8 +122,10 @@ class Problem(Frozen):
                 yield GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own))).given(free)
 
     def knows_lens(self, camera: str, lens: Lens) -> bool:
-        """Whether a posterior states a camera's lens in every direction: how smooth it is, is in there."""
-        rough = {name for form in lens.roughness for name in form.names}
+        """Whether a posterior states all that is free of a camera's lens: how smooth it is, is in there."""
+        every = intrinsic_names(lens)
+        free = {every[number] for number in self.layout.free[camera].tolist()}
+        rough = free.intersection(name for form in lens.roughness for name in form.names)
         return bool(rough) and rough <= self._stated_whole.get(camera, frozenset())
 
     @cached_property
