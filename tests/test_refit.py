@@ -258,6 +258,19 @@ def test_another_zoom_is_found(calibration: Calibration, zoom: float) -> None:
     assert np.max(sigmas_off(result, truth_of(calibration, FAR, camera))) < MOST_SIGMA
 
 
+def test_another_zoom_is_found_where_the_picture_is_noisier(calibration: Calibration) -> None:
+    """What a move alone is taken with, and a warning, is no reason to refuse another zoom: nothing was said to fit."""
+    camera = replace(CAMERA, phi=0.97 * CAMERA.phi)
+    dim = replace(DAY, points_sigma_px=1.8 * DAY.points_sigma_px, curves_sigma_px=1.8 * DAY.curves_sigma_px)
+    found = seen(FAR, dim, 2, camera=camera).observations
+    points = replace(found.points, sigma_px=found.points.sigma_px / 1.8)
+    curves = replace(found.curves, sigma_px=found.curves.sigma_px / 1.8)
+    result = refit(calibration, replace(found, points=points, curves=curves))
+    assert result.refitted is not None and result.refitted.what == "zoom"
+    assert any("the noise is 1." in text for text in result.warnings)
+    assert np.max(sigmas_off(result, truth_of(calibration, FAR, camera))) < MOST_SIGMA
+
+
 def test_another_iris_is_found(calibration: Calibration) -> None:
     camera = replace(CAMERA, lens=Radial((-4.0e-5, 6.3e-7)))
     changed = seen(MOVED, DAY, 3, camera=camera).observations

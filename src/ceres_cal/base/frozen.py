@@ -122,11 +122,10 @@ _T = TypeVar("_T")
 def replace(of: _T, /, **changes: Any) -> _T:
     """`dataclasses.replace`, which does not go through `__init__`: what is the same was given once already."""
     fields: Any = of.__dataclass_fields__  # type: ignore[attr-defined] # every dataclass has them
-    if not changes.keys() <= fields.keys():
-        raise TypeError(f"{type(of).__name__} has no field {', '.join(changes.keys() - fields.keys())}")
+    if unknown := changes.keys() - fields.keys():
+        raise TypeError(f"{type(of).__name__} has no field {', '.join(unknown)}")
     made, held = object.__new__(type(of)), vars(of)
-    given = held if held.keys() == fields.keys() else {name: held[name] for name in fields if name in held}
-    vars(made).update(given, **changes)
+    vars(made).update({name: held[name] for name in fields if name in held}, **changes)
     if hasattr(made, "__post_init__"):
         made.__post_init__()
     return made

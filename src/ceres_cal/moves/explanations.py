@@ -239,15 +239,18 @@ def require_supported(
     if plan.what == "auto" and not stated:  # what absorbs a wrong statement, and another lens, are not taken so easily
         margin, scores = 0.0, {what: score + _SUPPORTED * (what == "everything") for what, score in scores.items()}
     best = next(what for what in quiet if scores[what] <= min(scores.values()) + margin)
-    if best != plan.what and judged(plan, best, results[best]).noise < NOISIER:
+    if best != plan.what:
+        # What is as noisy may be something else; what is no noisier than what was asked for might be is taken as well.
+        if judged(plan, best, results[best]).noisy and (other := _other_explanation(plan, searches)) is not None:
+            raise other
         gain = scores[plan.what] - scores[best]
         raise OtherChangeError(
             f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "
             f"(better by {gain:.0f} nats)",
             best,
         )
-    if best != plan.what or judged(plan, plan.what, result).noise < _TOO_NOISY:
-        return best != plan.what
+    if judged(plan, plan.what, result).noise < _TOO_NOISY:
+        return False
     if not _explains(plan, result):
         return True
     other = _other_explanation(plan, searches)
