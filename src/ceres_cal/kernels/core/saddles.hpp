@@ -47,7 +47,7 @@ class Saddles {
         if (!cut(start, 1)) return;
         const double cost = settle(SETTLED_PX, now);
         std::copy_n(now, SIZE, fitted);
-        fitted[SIZE] = std::sqrt(cost / static_cast<double>(level_.size()));
+        fitted[SIZE] = std::sqrt(cost / static_cast<double>(many_));
         double covariance[SIZE][2] = {{1.0, 0.0}, {0.0, 1.0}};
         factor(0.0), substitute(SIZE, upper_, covariance[0], 2);
         for (int k = 0; k < 2; ++k)
@@ -69,17 +69,22 @@ class Saddles {
               radius <= FARTHEST_PX))
             return false;
         const int64_t middle_x = std::llrint(start[0]), middle_y = std::llrint(start[1]),
-                      half = std::llrint(std::ceil(radius));
-        x_.clear(), y_.clear(), level_.clear();
+                      half = std::llrint(std::ceil(radius)), side = 2 * half + 1;
+        for (auto* one : {&x_, &y_, &level_, &weight_}) one->resize(static_cast<size_t>(side * side + LANES));
+        double *xs = x_.data(), *ys = y_.data(), *levels = level_.data();
+        size_t many = 0;
         for (int64_t y = std::max<int64_t>(middle_y - half, 0); y <= std::min(middle_y + half, picture_.height - 1);
              y += every)
             for (int64_t x = std::max<int64_t>(middle_x - half, 0); x <= std::min(middle_x + half, picture_.width - 1);
                  x += every) {
                 const double dx = static_cast<double>(x) - start[0], dy = static_cast<double>(y) - start[1];
-                if (dx * dx + dy * dy > radius * radius) continue;
-                x_.push_back(static_cast<double>(x)), y_.push_back(static_cast<double>(y));
-                level_.push_back(picture_.levels[picture_.width * y + x]);
+                xs[many] = static_cast<double>(x), ys[many] = static_cast<double>(y);
+                levels[many] = picture_.levels[picture_.width * y + x];
+                many += dx * dx + dy * dy <= radius * radius;  // the next one takes the place of what is outside
             }
+        for (double* one : {xs, ys, levels}) std::fill_n(one + many, LANES, one[many - 1]);
+        std::fill_n(weight_.data(), many, 1.0), std::fill_n(weight_.data() + many, LANES, 0.0);
+        many_ = many;
         std::copy_n(start + SIZE, 2, bend_);
         return true;
     }
@@ -128,30 +133,26 @@ class Saddles {
         double* own[SIZE + 1];
         for (int k = 0; k <= SIZE; ++k) own[k] = rows_[k].value;
         std::fill(normal_.begin(), normal_.end(), 0.0);
-        const size_t many = level_.size();
-        for (size_t start = 0; start < many; start += CHUNK) {
-            const int n = static_cast<int>(std::min<size_t>(many - start, CHUNK));
+        for (size_t start = 0; start < many_; start += CHUNK) {
+            const int n = static_cast<int>(std::min<size_t>(many_ - start, CHUNK) + LANES - 1) / LANES * LANES;
             differentiate(start, n, now);
-            find_products(own, SIZE + 1, (n + LANES - 1) / LANES * LANES, products_);
+            find_products(own, SIZE + 1, n, products_);
             for (int k = 0; k <= SIZE; ++k)
                 for (int j = 0; j <= k; ++j) normal_.data()[STRIDE * k + j] += products_[STRIDE * k + j];
         }
         return at(LEFT, LEFT);
     }
 
-    // The rows of n pixels: derivatives of the model, and what it leaves.
+    // The rows of n pixels, a multiple of LANES: derivatives of the model, and what it leaves.
     void differentiate(size_t start, int n, const double* now) {
-        const int filled = (n + LANES - 1) / LANES * LANES;
-        for (int i = 0; i < filled; ++i) {
-            const size_t k = start + static_cast<size_t>(std::min(i, n - 1));
-            dx_[i] = x_[k] - now[X], dy_[i] = y_[k] - now[Y], left_[i] = level_[k], weight_[i] = i < n ? 1.0 : 0.0;
-        }
+        const double *x = x_.data() + start, *y = y_.data() + start, *level = level_.data() + start;
+        const double *weight = weight_.data() + start, at_x = now[X], at_y = now[Y];
         const double sharp = now[SHARP], c1 = std::cos(now[ANGLE]), s1 = std::sin(now[ANGLE]);
         const double c2 = std::cos(now[ANGLE + 1]), s2 = std::sin(now[ANGLE + 1]), b1 = bend_[0], b2 = bend_[1];
         const double mean = now[MEAN], mean_x = now[MEAN_X], mean_y = now[MEAN_Y];
         const double contrast = now[CONTRAST], contrast_x = now[CONTRAST_X], contrast_y = now[CONTRAST_Y];
-        each(filled, [&](int i) {
-            const double dx = dx_[i], dy = dy_[i], w = weight_[i];
+        each(n, [&](int i) {
+            const double dx = x[i] - at_x, dy = y[i] - at_y, w = weight[i];
             const double l1 = c1 * dx + s1 * dy, a1 = c1 * dy - s1 * dx, t1 = b1 * l1;
             const double l2 = c2 * dx + s2 * dy, a2 = c2 * dy - s2 * dx, t2 = b2 * l2;
             const double d1 = a1 - 0.5 * t1 * l1, d2 = a2 - 0.5 * t2 * l2;
@@ -167,7 +168,7 @@ class Saddles {
             rows_[MEAN][i] = w, rows_[MEAN_X][i] = w * dx, rows_[MEAN_Y][i] = w * dy;
             rows_[CONTRAST][i] = w * shape, rows_[CONTRAST_X][i] = w * shape * dx,
             rows_[CONTRAST_Y][i] = w * shape * dy;
-            rows_[LEFT][i] = w * (left_[i] - mean - mean_x * dx - mean_y * dy - here * shape);
+            rows_[LEFT][i] = w * (level[i] - mean - mean_x * dx - mean_y * dy - here * shape);
         });
     }
 
@@ -185,9 +186,10 @@ class Saddles {
     }
 
     const Picture picture_;
-    std::vector<double> x_, y_, level_, normal_ = std::vector<double>(STRIDE * STRIDE), kept_ = normal_;
+    std::vector<double> x_, y_, level_, weight_, normal_ = std::vector<double>(STRIDE * STRIDE), kept_ = normal_;
+    size_t many_ = 0;
     double bend_[2], products_[STRIDE * STRIDE], upper_[SIZE * SIZE];
-    Lane dx_, dy_, left_, weight_, rows_[SIZE + 1];
+    Lane rows_[SIZE + 1];
 };
 
 }  // namespace ceres_cal
