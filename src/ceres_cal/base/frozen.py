@@ -122,10 +122,11 @@ _T = TypeVar("_T")
 def replace(of: _T, /, **changes: Any) -> _T:
     """`dataclasses.replace`, which does not go through `__init__`: what is the same was given once already."""
     fields: Any = of.__dataclass_fields__  # type: ignore[attr-defined] # every dataclass has them
-    if unknown := changes.keys() - fields.keys():
-        raise TypeError(f"{type(of).__name__} has no field {', '.join(unknown)}")
+    if not changes.keys() <= fields.keys():
+        raise TypeError(f"{type(of).__name__} has no field {', '.join(changes.keys() - fields.keys())}")
     made, held = object.__new__(type(of)), vars(of)
-    vars(made).update({name: held[name] for name in fields if name in held}, **changes)
+    given = held if held.keys() == fields.keys() else {name: held[name] for name in fields if name in held}
+    vars(made).update(given, **changes)
     if hasattr(made, "__post_init__"):
         made.__post_init__()
     return made

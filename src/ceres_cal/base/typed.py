@@ -22,6 +22,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 _MOST_LETTERS = 40  # of a wrong value
 _UNIONS: tuple[Any, ...] = (Union, UnionType)
+_PLAIN, _OF_NUMPY = frozenset((str, bool, int, float, NoneType)), (np.ndarray, np.generic)
 _ALIKE: Mapping[Any, tuple[type, ...]] = {
     float: (numbers.Real,),
     int: (numbers.Integral,),
@@ -53,11 +54,11 @@ def _fields(of: type) -> list[tuple[str, Any, Any]]:
 
 def _plain(value: Any) -> Any:
     """NumPy's numbers and arrays as Python's, also inside of lists and mappings."""
-    if type(value) is str:  # which is most of them; NumPy's text is one, too, that no file takes
+    if type(value) in _PLAIN:  # which is most of them
         return value
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, _OF_NUMPY):  # its text is one of Python's, too, that no file takes
         return value.tolist()
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_plain(entry) for entry in value]
     if isinstance(value, Mapping):
         return {_plain(name): _plain(entry) for name, entry in value.items()}
