@@ -85,14 +85,12 @@ def solve_as_built(
     solver: Solver,
     built: Built,
     views: OfViews | None = None,
-    left_out: frozenset[tuple[str, Kind]] = frozenset(),
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
     """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
 
     Args:
         problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
             drawn as `built`. solver: of some of the observations, see `compete`. views: what was taken off.
-        left_out: targets and kinds that are as drawn.
     """
     observations, options, stated = problem.observations, problem.options, end.estimate.structure
 
@@ -106,10 +104,11 @@ def solve_as_built(
         return structure.carrying(there.whole, end.estimate.structure)
 
     drawn = _freed(end, problem, freed(built)) if built.every else end
-    now = estimate_as_built(problem, drawn, left_out)
-    told = {(one.target, one.kind): one.probability for one in _beside_views(now.every, drawn, stated, views)}
-    if unlikely := frozenset(of for of, probability in told.items() if probability < LIKELY):
-        return solve_as_built(problem, end, explanations, solver, built, views, left_out | unlikely)
+    now, told, left_out = estimate_as_built(problem, drawn), dict[tuple[str, Kind], float](), frozenset[Any]()
+    while any((one.target, one.kind) not in told for one in now.every):
+        told |= {(one.target, one.kind): one.probability for one in _beside_views(now.every, drawn, stated, views)}
+        if left_out := frozenset(of for of, probability in told.items() if probability < LIKELY):
+            now = estimate_as_built(problem, drawn, left_out)
     if not now.every:
         if built.every:
             end, explanations = compete(problem, solved(now), solver)
