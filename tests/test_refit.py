@@ -258,6 +258,19 @@ def test_another_zoom_is_found(calibration: Calibration, zoom: float) -> None:
     assert np.max(sigmas_off(result, truth_of(calibration, FAR, camera))) < MOST_SIGMA
 
 
+def test_few_clicks_accuse_no_lens(calibration: Calibration) -> None:
+    """Five clicks of a camera that stands still: 7 of 20 said another zoom or iris, and up to 3 m of it."""
+    changed = 0
+    for seed in range(20):
+        found = seen(HOME, DAY, seed).observations
+        five = np.random.default_rng(seed).permutation(len(found.points))[:5]
+        clicks = np.isin(np.arange(len(found.points)), five)
+        result = refit(calibration, found.part(clicks, np.zeros(len(found.curves), dtype=bool)))
+        assert result.refitted is not None
+        changed += result.refitted.what != "pose"
+    assert changed <= 1  # 1, of whose clicks one is a stray
+
+
 def test_another_zoom_is_found_where_the_picture_is_noisier(calibration: Calibration) -> None:
     """What a move alone is taken with, and a warning, is no reason to refuse another zoom: nothing was said to fit."""
     camera = replace(CAMERA, phi=0.97 * CAMERA.phi)
