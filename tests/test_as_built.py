@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from accuracy import accuracy
@@ -19,13 +20,13 @@ from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.effects.effect import AsBuilt
 from ceres_cal.effects.smoothness import with_smoothness
-from ceres_cal.observations import Prior, gather_sights
+from ceres_cal.observations import Observations, Prior, gather_sights
 from ceres_cal.problem import problem_of
 from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.problem.structure import Tolerance, make_structure, numbers_by_kind
 from ceres_cal.robust.as_built import AS_DRAWN, shifts_as_drawn
 from ceres_cal.robust.robust import solve_robustly
-from ceres_cal.scene.targets import checkerboard
+from ceres_cal.scene.targets import checkerboard, circle_grid
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.initialise import initialise
 
@@ -167,6 +168,24 @@ def test_a_photographed_board_is_not_sheared(sony_boards: BoardDetections) -> No
     assert as_built.fit.points_rms_px < 0.8 * drawn.fit.points_rms_px  # 0.72 measured
     assert of_kind(as_built, "points").rms_m < 1e-4  # 0.05 mm measured
     assert phi_of(as_built) == pytest.approx(phi_of(drawn), abs=5.0)  # 2.1 px measured
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_points_in_another_order_are_no_inaccurate_board(is_reversed: bool) -> None:
+    """Where circles of uneven rows are listed from the last to the first, a grid half a step aside explained them."""
+    grid, rng, shown = circle_grid(8, 11, 0.02, 0.012, asymmetric=True), np.random.default_rng(0), list[np.ndarray]()
+    places, matrix = grid.point_array, np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 480.0], [0.0, 0.0, 1.0]])
+    while len(shown) < 12:
+        turn = rng.normal(0.0, 0.35, 3)
+        middle = np.array([*rng.uniform(-0.12, 0.12, 2), rng.uniform(0.45, 0.8)])
+        shift = middle - cv2.Rodrigues(turn)[0] @ places.mean(axis=0)
+        pixels = cv2.projectPoints(places, turn, shift, matrix, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))[0][:, 0]
+        if np.all((pixels > 0.0) & (pixels < [1279.0, 959.0])):
+            shown.append((pixels[::-1] if is_reversed else pixels) + rng.normal(0.0, 0.1, pixels.shape))
+    observations = Observations.from_points(shown, grid, (1280, 960))
+    calibration = calibrate(observations)
+    remedies = [*calibration.warnings, *(one.advice for one in diagnose(calibration, observations).findings)]
+    assert sum("check the order of its points" in one for one in remedies) == (2 if is_reversed else 0)
 
 
 def test_files_have_it(tmp_path: Path) -> None:

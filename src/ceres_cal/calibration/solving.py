@@ -37,6 +37,7 @@ from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import (
     AS_DRAWN,
     Built,
+    misnamed,
     require_measured,
     shifts_as_drawn,
     solve_as_built,
@@ -257,7 +258,11 @@ def known_of(seen: Explained) -> Calibration:
         seen = replace(seen, end=settled.end)
     explanations = settled.explanations if settled else seen.explanations
     effects = seen.effects
-    warnings = (*(one.warning for one in explanations), *(one.warning for one in effects if one.is_solved))
+    warnings = (
+        *(one.warning for one in explanations),
+        *(one.warning for one in effects if one.is_solved),
+        *misnamed(seen.as_built, seen.problem.observations.targets),
+    )
     posterior, alike, remarks = None, dict[str, bool](), tuple[str, ...]()
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)

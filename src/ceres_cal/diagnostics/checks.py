@@ -17,6 +17,7 @@ from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects import Amount, AsBuilt, Case, EffectEstimate, Finding, Linearised, Selection, Words
 from ceres_cal.effects.table.targets import feature_of
 from ceres_cal.problem.structure import numbers_by_kind
+from ceres_cal.robust.as_built import is_another
 from ceres_cal.robust.noise import LARGER, Inliers
 from ceres_cal.scene.curves import nearest_on_track
 
@@ -283,7 +284,11 @@ and how many tests are made of a case: they share the rate of false alarms with 
 def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:
     """The finding of an effect that the calibration found by itself, and has in it."""
     case, structure = tested.case, tested.case.estimate.structure
-    numbers = numbers_by_kind(structure, case.problem.observations.targets)[one.target, one.kind]
+    targets = case.problem.observations.targets
+    numbers = numbers_by_kind(structure, targets)[one.target, one.kind]
+    advice = "none is needed; a flat, exact target needs fewer views"
+    if is_another(one, targets[one.target]):
+        advice = "check the order of its points, and its kind, columns, rows and dimensions"
     offsets = np.zeros(len(structure.offsets) + 1)
     offsets[numbers] = structure.values[numbers]
     shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)
@@ -294,7 +299,7 @@ def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:
     return Finding(
         kind, "observations", feature_of(structure.names[most]) if alone else one.target, None,
         f"{one.target} is not as drawn: {one.words}, most of all {structure.names[most]} by "
-        f"{1e3 * offsets[most]:+.2f} mm; it was solved for", "none is needed; a flat, exact target needs fewer views",
+        f"{1e3 * offsets[most]:+.2f} mm; it was solved for", advice,
         effect.px, effect.mm, effect.px / case.noise_px(tested.selection.model.left_over, rows),
         (Amount("sigma", 1e3 * one.sigma_m, 0.0, "mm"),), float(np.log10(max(1.0 - one.probability, 1e-300))),
         effect.observations,
