@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ceres_cal import base, detect, formats, moves, report
+from ceres_cal import base, detect, formats, moves, report, scene
 from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace, short
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch, whole
@@ -238,7 +238,7 @@ def _compare(
 ) -> Document:
     files.require_output(picture, [a, b], "pictures are", ".svg")
     first, second = files.read_calibration(a), files.read_calibration(b)
-    if not (over_image or without_turn or all(target.movable for target in first.targets.values())):
+    if scene.still(first.targets) and not (over_image or without_turn):
         return _over_field(first, second, arguments.metres(height_mm), station, picture)
     if picture is not None or station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")

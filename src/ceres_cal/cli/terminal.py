@@ -49,11 +49,6 @@ def coloured(text: str) -> str:
     return _TITLE.sub(_title, text)
 
 
-def error(text: str) -> str:
-    """What went wrong."""
-    return f"{_RED}{text}{_PLAIN}"
-
-
 def _title(found: re.Match[str]) -> str:
     title = found[1].rstrip()
     colour = _YELLOW if title in _DOUBTFUL else _BOLD
@@ -284,7 +279,7 @@ def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
 def _fail(message: str, exit_code: int, as_json: bool) -> int:
     line = " ".join(message.splitlines())
     said = f"ceres-cal: {line}"
-    print(error(said) if in_colour(sys.stderr) else said, file=sys.stderr)
+    print(f"{_RED}{said}{_PLAIN}" if in_colour(sys.stderr) else said, file=sys.stderr)
     if as_json:
         import json
 

@@ -190,10 +190,7 @@ def groups_of(sights: Sights) -> Iterator[ObservationGroups]:
 
 def _features(observations: Observations, owner: Indices, frames: Indices) -> FeatureGroups:
     """Of features by owner (V,) of their views, -1 for none; of single frames only curves."""
-    columns = (observations.points, observations.curves)
-    view, feature = (
-        np.concatenate([getattr(column, name) for column in columns]).astype(np.int64) for name in ("view", "feature")
-    )
+    view, feature = (column_of(observations, name).astype(np.int64) for name in ("view", "feature"))
     is_curve = np.arange(len(view)) >= len(observations.points)
     takes_part = (owner[view] >= 0) & (is_curve | (frames[view] > 1))
     targets = {name: number for number, name in enumerate(observations.targets)}  # each counts its features from 0

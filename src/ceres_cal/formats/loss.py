@@ -37,8 +37,7 @@ def field_error_mm(
 
 def field_box(targets: Mapping[str, scene.Target]) -> Box | None:
     """x and y of a grid over what does not move; None where everything does."""
-    still = {name: target for name, target in targets.items() if not target.movable}
-    return posterior.field_grid(still) if still else None
+    return posterior.field_grid(targets) if scene.still(targets) else None
 
 
 def field_pixels(camera: scene.Camera, box_m: Box) -> Array:

@@ -17,6 +17,7 @@ from ceres_cal.formats.ssl_cameras import CameraIds, as_before, to_cameras, to_e
 from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import geometry_from_bytes, to_bytes
 from ceres_cal.formats.yaml_files import read_yaml, yaml_text
+from ceres_cal.scene import still
 
 
 def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any]) -> tuple[dict[str, Any], Exported]:
@@ -25,7 +26,7 @@ def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any
     Raises:
         InputError: neither a field in the calibration nor before.
     """
-    targets = {name: target for name, target in request.calibration.targets.items() if not target.movable}
+    targets = still(request.calibration.targets)
     if "field" in before:
         size = dict(before["field"])
         targets = targets or {"field": target_of(size)}

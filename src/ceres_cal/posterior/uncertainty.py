@@ -20,7 +20,7 @@ from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import PLACEMENT_QUANTITIES, Estimate, Key, natural_sizes, sigma_limits, values_of
 from ceres_cal.robust.stated import Conflict
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene.targets import Target, still
 
 if TYPE_CHECKING:
     from ceres_cal.posterior.seam import RigPair
@@ -335,7 +335,7 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
         InputError: there is nothing that does not move.
     """
     grid = 36  # steps along the longer side
-    box = [target.box for target in targets.values() if not target.movable]
+    box = [target.box for target in still(targets).values()]
     if not box:
         raise InputError("no field to draw a map of: give x_m and y_m")
     low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)

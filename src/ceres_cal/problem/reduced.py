@@ -160,11 +160,10 @@ class _InformationSums:
             eliminated.append(self._eliminate(own))
         for number in np.delete(np.arange(len(sights)), alone):
             sight = sights[int(number)]
-            for pose, normals in self._normals(sight):
-                self._add(sight.key, pose[0], {kind: normal[0] for kind, normal in normals.items()})
+            self._add(sight.key, normals_of(sight, self._problem, self._estimate))
         if self._problem.elsewhere is not None:
             for (key, kind), normal in self._problem.elsewhere.normals(self._problem, self._estimate).items():
-                self._add(key, self._estimate.pose_stack([key])[0], {kind: normal})
+                self._add(key, {kind: normal})
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors, pull = self._problem.priors_at(self._estimate), np.zeros(len(self._keys))
         known = Information.nothing(self._keys).beside_all(prior.information for prior in priors)
@@ -183,9 +182,8 @@ class _InformationSums:
         return self._columns.get((kind, name), np.empty(0, dtype=np.int64))
 
     def _normals(self, sights: Sights) -> Iterator[tuple[Array, dict[int, Array]]]:
-        """cam_from_frame (n, 3, 4) of a camera's sights, and normal equations (n, K, K) by kind: of points (0) and of
-        curves (1), where there are any; in batches. K is [free intrinsics in the units of the files | structure | left
-        perturbation of the pose: turn, shift].
+        """cam_from_frame (n, 3, 4) of a camera's sights, and normal equations (n, K, K) by kind, see `normals_of`; in
+        batches.
         """
         kernel_of = {
             kind: _kernel_normals(own, self._problem, self._estimate)
@@ -246,9 +244,9 @@ class _InformationSums:
                 sums[kind] -= flat.T @ left.reshape(rows, size)
             self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 
-    def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
+    def _add(self, key: SightKey, normals: Mapping[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
-        steps, everywhere = steps_of(key, pose, self._estimate, self._columns)
+        steps, everywhere = steps_of(key, self._estimate.pose_stack([key])[0], self._estimate, self._columns)
         own = len(steps) - 6  # which are shared themselves; the pose's steps follow
         chain = steps[own:, own:]
         for kind, normal in normals.items():

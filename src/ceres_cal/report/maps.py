@@ -16,6 +16,7 @@ from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.quality import Material, image_border, paint_of
 from ceres_cal.report.residual_pictures import counts_of_parts, number_of, owner_suffix
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
+from ceres_cal.scene import still
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -262,8 +263,7 @@ def comparison_svg(comparison: Agreement, before: Calibration) -> str:
     """The map of one station's differences as a file of its own, over the field as the first calibration sees it."""
     assert comparison.change is not None
     (over,) = comparison.change.maps
-    fields = [target for target in before.targets.values() if not target.movable]
     label = f"{comparison.name}, {at_height(over.height_m)}: difference, mm ({over.mean_mm:.2f} on average)"
     grid, camera = (over.x_m, over.y_m), before.stations[comparison.name]
-    drawing = field_drawing(grid, over.errors_mm, label, camera, over.height_m, fields)
+    drawing = field_drawing(grid, over.errors_mm, label, camera, over.height_m, still(before.targets).values())
     return canvas.to_svg(*drawing, canvas.WIDE_IN, "comparison", whole_file=True)

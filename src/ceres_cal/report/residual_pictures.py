@@ -21,6 +21,7 @@ from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.findings import summary_table
 from ceres_cal.report.quality import Material, paint_of
 from ceres_cal.report.scale import spoken
+from ceres_cal.scene import still
 from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -189,7 +190,7 @@ def lines_in_image(material: Material, camera: str) -> dict[str, Array]:
     if not seen:
         return {}
     posed = material.calibration.estimate.camera_at(seen[0])
-    targets = {name: one for name, one in material.calibration.targets.items() if not one.movable}
+    targets = still(material.calibration.targets)
     names = [f"{target}/{curve}" for target, one in targets.items() for curve in one.curves]
     lines = [posed.project(curve) for curve in paint_of(targets.values())]
     with np.errstate(invalid="ignore"):

@@ -17,7 +17,7 @@ from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.detect.photographs.refit import CAMERA, ROBUST, FreeIntrinsics, PointHints, refit_camera
 from ceres_cal.observations import Prior
 from ceres_cal.problem import Weighting, intrinsic_names
-from ceres_cal.scene import Camera, Radial, Target, curve_points
+from ceres_cal.scene import Camera, Radial, Target, curve_points, require_features
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.start.search import searched
 from ceres_cal.start.sightlines import Beforehand, Sightlines
@@ -48,12 +48,7 @@ class Clicks(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def require_names(self, target: Target) -> None:
         """Raise InputError where a target has no such point or curve."""
-        for name in self.points:
-            if name not in target.point_index:
-                raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
-        for name, *_ in self.curves:
-            if name not in target.curve_index:
-                raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+        require_features(target, self.points, (name for name, *_ in self.curves))
 
 
 def load_clicks(path: str | Path) -> Clicks:

@@ -31,10 +31,10 @@ from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import SearchResult, SeveralWaysError, search
 from ceres_cal.detect.strokes import Strokes, strokes_of_signs
-from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Prior, View, combine
+from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Prior, View, combine, joined
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
-from ceres_cal.scene import Camera, Target
+from ceres_cal.scene import Camera, Target, require_features
 
 TARGET_NAME = "field"
 Start = Camera | Clicks | Auto
@@ -253,9 +253,7 @@ def require_findable(
         InputError: a name that the target does not have, no painted curve, a target in another unit, or a length that
             no painted line shows.
     """
-    for name in curves or ():
-        if name not in target.curves:
-            raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    require_features(target, curves=curves or ())
     painted = tuple(n for n, curve in target.curves.items() if curve.width_m > 0.0 and (curves is None or n in curves))
     if not painted:
         raise InputError(
@@ -377,7 +375,7 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     curves, beside = _curves(lines, lines.found & ~used, options.edges), followed.beside
     if beside is not None:
         aside = _curves(beside, beside.found, options.edges)
-        curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
+        curves = joined([curves, aside])
     priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
     # Dimensions may be others, or look so by a lens that is none of ours; and where lines lie aside, so may the whole.
     # Beyond what is usual a calibration says that this is contradicted.

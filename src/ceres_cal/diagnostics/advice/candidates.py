@@ -13,7 +13,7 @@ from ceres_cal.problem import Estimate, Information, Key, Problem, Weighting, la
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import equations_of, residuals
 from ceres_cal.problem.structure import Tolerance, make_structure
-from ceres_cal.scene import Arc, Camera, Target, checkerboard, curve_points, custom
+from ceres_cal.scene import Arc, Camera, Target, checkerboard, curve_points, custom, still
 from ceres_cal.simulate import Scene, ViewPlan, board_pose, simulate, well_inside
 
 POLE_M, POLE_SIGMA_M = 1.0, 0.005
@@ -223,7 +223,7 @@ def poles(search: CandidateSearch) -> Iterator[Measurement]:
     cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]
     x, y = (np.arange(np.ceil(a[0] / grid_m), a[-1] / grid_m + 1e-9) * grid_m for a in (grid.x_m, grid.y_m))
     places = [("", float(a), float(b)) for a in x for b in y]
-    for _, target in still(search.ground.targets):
+    for target in still(search.ground.targets).values():
         places += [(name, a, b) for name, (a, b, z) in target.points.items() if z == 0.0]
     tops = np.array([(a, b, top) for _, a, b in places])
     for number in np.flatnonzero(np.all([well_inside(one, tops) for one in cameras], axis=0)).tolist():
@@ -298,14 +298,9 @@ def boards(search: CandidateSearch) -> Iterator[Measurement]:
 # ---- the field's own curves -----------------------------------------------------------------------------------------
 
 
-def still(targets: Mapping[str, Target]) -> Iterator[tuple[str, Target]]:
-    """The targets that lie in the world."""
-    yield from ((name, target) for name, target in targets.items() if not target.movable)
-
-
 def lines(search: CandidateSearch) -> Iterator[Measurement]:
     """Each curve of the field that the image shows, observed densely in one more frame."""
-    for name, target in still(search.ground.targets):
+    for name, target in still(search.ground.targets).items():
         for curve in target.curves:
             stretch = _seen_stretch(search, target, curve)
             if stretch is not None:
@@ -336,7 +331,7 @@ def _lines_words(taken: Sequence[Measurement]) -> str:
 def frames(search: CandidateSearch) -> Iterator[Measurement]:
     """More frames of the field, as it was observed: its curves, or its points where no curves were."""
     names = tuple(f"advised_{number:02d}" for number in range(1, _FRAMES + 1))
-    for name, target in still(search.ground.targets):
+    for name, target in still(search.ground.targets).items():
         if search.curves_observed and target.curves:
             plan = ViewPlan(names, search.station, name, None, (), None, _FRAME_SPACING_M)
             what = f"every line, a point each {1e3 * _FRAME_SPACING_M:.0f} mm"

@@ -12,11 +12,11 @@ from ceres_cal.base import ROBOT_TOP_M, Frozen, brief, checked, each, for_small_
 from ceres_cal.base.errors import InputError, StepProgress
 from ceres_cal.base.words import short
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement, still
+from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, Ground, Measurement
 from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Information, Weighting
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene.targets import Target, still
 
 _LARGER, _LESS = 0.5, 0.2
 """Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
@@ -150,7 +150,7 @@ def promised(
 def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
     """What to add to, and the outlook: both of the numbers that a measurement at this station can tell of."""
     known = calibration.uncertainty
-    if not any(still(calibration.targets)):
+    if not still(calibration.targets):
         raise InputError("advice is about a map of a field, and there is none: nothing that was observed stands still")
     today = known.map_sd_mm(station, height_m)
     if not np.any(today.sd_mm >= 0.0):

@@ -9,13 +9,13 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, first_of, replace
+from ceres_cal.base import Array, Indices, Mask, first_of, replace
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.effects.evidence import FLOOR_OFF
 from ceres_cal.observations import Observations
 from ceres_cal.problem.structure import STRETCH, WARP, dimension_slopes, dimensions_of
-from ceres_cal.scene.targets import Arc, Segment
+from ceres_cal.scene.targets import Arc, Segment, still
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
 # Nothing changes from half to double.
@@ -37,10 +37,14 @@ def _offsets(places: slice, case: Case, *, curves: bool = False) -> Iterator[Eff
     solved = (own >= 0) & (own < case.estimate.structure.own)
     rows = (equations.is_curve == curves) & (slot >= 0) & ~solved
     numbers, group = grouped(slot, rows)
-    counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
-    group = np.where(counts[group] >= fewest, group, -1)
     names = tuple(feature_of(structure.names[number]) for number in numbers)
-    yield EffectColumns(equations.built[:, places], group, names)
+    yield EffectColumns(equations.built[:, places], _with_enough(group, case.model.used, fewest), names)
+
+
+def _with_enough(group: Indices, used: Mask, fewest: int) -> Indices:
+    """The groups (E,), -1 for none, without those of which fewer equations are used."""
+    counts = np.bincount(group[(group >= 0) & used], minlength=int(group.max(initial=-1)) + 2)
+    return np.where(counts[group] >= fewest, group, -1)  # -1 finds the last count, which is 0
 
 
 def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
@@ -203,15 +207,14 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
     span = 2 * int(np.abs(cell).max(initial=0)) + 1
     key = (np.maximum(target, 0) * span + cell[:, 0] + span // 2) * span + cell[:, 1] + span // 2
     numbers, group = grouped(key, target >= 0)
-    counts = np.bincount(group[(group >= 0) & case.model.used], minlength=len(numbers) + 1)
-    group = np.where((group >= 0) & (counts[group] >= fewest_at_place), group, -1)
     subjects = []
     for number in numbers.tolist():
         rest, y = divmod(number, span)
         of, x = divmod(rest, span)
         at = [(place - span // 2) * cell_m for place in (x, y)]
         subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
-    yield EffectColumns(_moved(case, 2)[:, None], group, tuple(subjects))
+    enough = _with_enough(group, case.model.used, fewest_at_place)
+    yield EffectColumns(_moved(case, 2)[:, None], enough, tuple(subjects))
 
 
 def _of_place(evidence: Evidence) -> Words:
@@ -224,7 +227,7 @@ def _of_place(evidence: Evidence) -> Words:
 def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
     """(E,) which target that is part of the world each equation shows, -1 for a movable one; and their names."""
     observations = case.problem.observations
-    names = tuple(name for name, target in observations.targets.items() if not target.movable)
+    names = tuple(still(observations.targets))
     number = {name: place for place, name in enumerate(names)}
     of_view = np.array([number.get(view.target, -1) for view in observations.views], dtype=np.int64)
     return np.asarray(of_view[case.equations.view]), names

@@ -6,7 +6,7 @@ file describes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from inspect import signature
 from pathlib import Path
@@ -320,6 +320,19 @@ def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, T
         features = sum(len(target.points) + len(target.curves) for target in targets.values())
         require_size(features, f"{where}targets up to {name!r}")
     return targets
+
+
+def still(targets: Mapping[str, Target]) -> dict[str, Target]:
+    """Those that lie in the world, as a field does."""
+    return {name: target for name, target in targets.items() if not target.movable}
+
+
+def require_features(target: Target, points: Iterable[str] = (), curves: Iterable[str] = ()) -> None:
+    """Raise InputError where a target has no such point or curve."""
+    for kind, names, known in (("point", points, target.point_index), ("curve", curves, target.curve_index)):
+        for name in names:
+            if name not in known:
+                raise InputError(f"{kind} {name!r} is not one of the target's: `ceres-cal targets` lists the names")
 
 
 def target_named(name: str) -> Target | None:
