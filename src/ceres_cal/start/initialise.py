@@ -111,8 +111,8 @@ def _initialised(
         )
         for key, pose, camera in posed.others
     )
-    keys = tuple(sights.keys[number] for number in posed.numbers.tolist())
-    return Start(estimate, posed.phi_from, others=others, keys=keys, poses=posed.poses), posed.places
+    start = Start(estimate, posed.phi_from, others=others, keys=posed.keys(sights), poses=posed.poses)
+    return start, posed.places
 
 
 class PosedSights(Frozen):
@@ -132,6 +132,15 @@ class PosedSights(Frozen):
     places: dict[int, CameraPlace]
     others: tuple[tuple[SightKey, Array, Camera], ...]
     open: dict[int, tuple[str, ...]]
+
+    def keys(self, sights: Sights) -> tuple[SightKey, ...]:
+        """(K) of the sights that were posed."""
+        return tuple(sights.keys[number] for number in self.numbers.tolist())
+
+    def by_key(self, sights: Sights) -> dict[SightKey, Pose]:
+        """cam_from_frame of each."""
+        each = zip(self.keys(sights), self.poses, strict=True)
+        return {key: Pose(pose[:, :3], pose[:, 3]) for key, pose in each}
 
 
 def posed_sights(sights: Sights, options: Options, *, may_search: bool = True) -> PosedSights:

@@ -76,20 +76,15 @@ def _board_poses(observations: Observations) -> dict[SightKey, Pose]:
     """cam_from_target of every sight of a symmetric board at a placement that several stations show."""
     sights = gather_sights(observations)
     target_of = {SightKey(view.camera, view.station, view.placement): view.target for view in observations.views}
-    symmetric = [
-        number
-        for number, key in enumerate(sights.keys)
+    symmetric = {
+        key
+        for key in sights.keys
         if key.placement not in (None, *sights.seen_once) and len(symmetries(observations.targets[target_of[key]])) > 1
-    ]
+    }
     if not symmetric:
         return {}
-    posed = posed_sights(sights, _START)
-    wanted = set(symmetric)
-    return {
-        sights.keys[number]: Pose(pose[:, :3], pose[:, 3])
-        for number, pose in zip(posed.numbers.tolist(), posed.poses, strict=True)
-        if number in wanted
-    }
+    posed = posed_sights(sights, _START).by_key(sights)
+    return {key: pose for key, pose in posed.items() if key in symmetric}
 
 
 def symmetries(target: Target) -> list[Pose]:

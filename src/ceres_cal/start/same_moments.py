@@ -12,7 +12,7 @@ import numpy as np
 
 from ceres_cal.base import Array, CalibrationError, Pose, SolutionError, attempt, counted, median
 from ceres_cal.effects.evidence import LEAST_PX
-from ceres_cal.observations import Observations, SightKey, gather_sights
+from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem import Estimate, Options, Problem
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.start.initialise import posed_sights
@@ -147,12 +147,8 @@ def _moments(observations: Observations) -> Iterator[_Moments]:
     posed = attempt(lambda: posed_sights(sights, Options(lens="radial")))
     if isinstance(posed, CalibrationError):
         return
-    poses: dict[SightKey, Pose] = {
-        sights.keys[number]: Pose(pose[:, :3], pose[:, 3])
-        for number, pose in zip(posed.numbers.tolist(), posed.poses, strict=True)
-    }
     boards: dict[str, dict[str, Pose]] = {}
-    for key, pose in poses.items():
+    for key, pose in posed.by_key(sights).items():
         if key.placement is not None:
             boards.setdefault(key.station, {})[key.placement] = pose
     first, *others = boards or [""]

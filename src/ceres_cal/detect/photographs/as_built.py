@@ -145,13 +145,11 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     bent = model.with_columns(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
     misfit = float(bent.left_over @ bent.left_over) / max(bent.spare, 1)
     noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / together)
-    names = tuple(dimensions_of(seen.targets))
-    drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
+    _, moves = dimension_slopes(structure.names, seen.targets, dimensions_of(seen.targets))
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     effects = RandomEffects.of(normal / noise, slope / noise, determined * float(np.trace(normal)) / noise)
-    shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m, target.usual_aside_m)
     wander_m = _wander_m(lines, target, bent.left_over * sigma[equations.observation], equations.observation)
-    return replace(shape.explained(), wander_m=wander_m)
+    return replace(_explained(effects, owner, moves[there], target), wander_m=wander_m)
 
 
 def _wander_m(lines: Lines, target: Target, left_px: Array, places: Indices) -> float:
@@ -183,68 +181,56 @@ def _curve_of(name: str) -> str:
     return name.partition("/")[2].partition(".")[0]
 
 
-class _CurveNumbers(Frozen):
-    """What is left of the curves' Q numbers once the camera followed, and what moves them.
+def _explained(effects: RandomEffects, owner: Array, moves: Array, target: Target) -> FieldAsBuilt:
+    """The set of curves and dimensions of most evidence.
 
-    Attributes:
-        effects: these numbers as random effects. owner: (Q,) names of curves. moves: (Q, D) of the dimensions, whose
-            values (D,) are `lengths`. usual_m: by how much a curve lies aside that does.
+    Args:
+        effects: Q numbers of curves, as they are left once the camera followed. owner: (Q,) names of the curves.
+        moves: (Q, D) of the numbers by the target's dimensions.
     """
-
-    effects: RandomEffects
-    owner: Array
-    moves: Array
-    names: tuple[str, ...]
-    lengths: Array
-    usual_m: float
-
-    def explained(self) -> FieldAsBuilt:
-        """The set of curves and dimensions of most evidence."""
-        curves = list(dict.fromkeys(self.owner.tolist()))
-        moving = [int(d) for d in np.flatnonzero(np.any(self.moves != 0.0, axis=0))]
-        roots = [self.usual_m * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
-        roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
-        chosen, scatter_m = self._searched(roots)
-        together = np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)])
-        mean, sd = self.effects.amounts(together, scatter_m)
-        aside, dimensions, sds, at = {}, {}, {}, 0
-        for number in chosen:
-            size = roots[number].shape[1]
-            values, own = mean[at : at + size], sd[at : at + size]
-            at += size
+    curves, drawn, usual_m = list(dict.fromkeys(owner.tolist())), dict(target.dimensions), target.usual_aside_m
+    moving = {name: column for name, column in zip(drawn, moves.T, strict=True) if np.any(column != 0.0)}
+    roots = [usual_m * np.eye(len(owner))[:, owner == name] for name in curves]
+    roots += [_OTHER * drawn[name] * column[:, None] for name, column in moving.items()]
+    names, (chosen, scatter_m) = [*curves, *moving], _searched(effects, roots, usual_m)
+    together = np.hstack([np.empty((len(owner), 0)), *(roots[n] for n in chosen)])
+    mean, sd = effects.amounts(together, scatter_m)
+    aside, dimensions, sds, at = {}, {}, {}, 0
+    for number in chosen:
+        name, size = names[number], roots[number].shape[1]
+        values, own = mean[at : at + size], sd[at : at + size]
+        at += size
+        if number < len(curves):
             worst = int(np.argmax(np.abs(values)))
-            if number < len(curves):
-                aside[curves[number]] = self.usual_m * float(values[worst])
-                sds[curves[number]] = self.usual_m * float(own[worst])
-                continue
-            d = moving[number - len(curves)]
-            name = self.names[d].partition("/")[2]
-            dimensions[name] = float(self.lengths[d] * (1.0 + _OTHER * values[0]))
-            sds[name] = float(self.lengths[d] * _OTHER * own[0])
-        drawn = {name.partition("/")[2]: float(length) for name, length in zip(self.names, self.lengths, strict=True)}
-        scatter_m *= scatter_m > _SCATTER[0] * self.usual_m
-        return FieldAsBuilt(aside, dimensions, sds, drawn, tuple(curves), self.usual_m, scatter_m)
+            aside[name] = usual_m * float(values[worst])
+            sds[name] = usual_m * float(own[worst])
+        else:
+            dimensions[name] = drawn[name] * (1.0 + _OTHER * float(values[0]))
+            sds[name] = drawn[name] * _OTHER * float(own[0])
+    scatter_m *= scatter_m > _SCATTER[0] * usual_m
+    return FieldAsBuilt(aside, dimensions, sds, drawn, tuple(curves), usual_m, scatter_m)
 
-    def _searched(self, roots: Sequence[Array]) -> tuple[list[int], float]:
-        """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
-        width = max((root.shape[1] for root in roots), default=1)
-        padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
-        modes = self.effects.modes(np.array(padded).reshape(len(roots), len(self.owner), width))
-        beam: list[frozenset[int]] = [frozenset()]
-        scatters_m = _SCATTER * self.usual_m
-        best, most, scatter_m = frozenset[int](), -np.inf, float(scatters_m[0])
-        for _ in range(_MOST + 1):
-            sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
-            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), scatters_m)[:, 0]
-            score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
-            order = np.argsort(-score)
-            if score[order[0]] > most:
-                best, most = beam[order[0]], float(score[order[0]])
-                scatter_m = float(scatters_m[np.argmax(evidence[order[0]])])
-            if len(beam[0]) - len(best) >= _IN_VAIN:
-                break
-            kept = [beam[row] for row in order[:_BEAM]]
-            beam = list({one | {n} for one in kept for n in range(len(roots)) if n not in one})
-            if not beam:
-                break
-        return sorted(best), scatter_m
+
+def _searched(effects: RandomEffects, roots: Sequence[Array], usual_m: float) -> tuple[list[int], float]:
+    """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
+    width = max((root.shape[1] for root in roots), default=1)
+    padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
+    modes = effects.modes(np.array(padded).reshape(len(roots), len(effects.turn), width))
+    beam: list[frozenset[int]] = [frozenset()]
+    scatters_m = _SCATTER * usual_m
+    best, most, scatter_m = frozenset[int](), -np.inf, float(scatters_m[0])
+    for _ in range(_MOST + 1):
+        sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
+        evidence = effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), scatters_m)[:, 0]
+        score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
+        order = np.argsort(-score)
+        if score[order[0]] > most:
+            best, most = beam[order[0]], float(score[order[0]])
+            scatter_m = float(scatters_m[np.argmax(evidence[order[0]])])
+        if len(beam[0]) - len(best) >= _IN_VAIN:
+            break
+        kept = [beam[row] for row in order[:_BEAM]]
+        beam = list({one | {n} for one in kept for n in range(len(roots)) if n not in one})
+        if not beam:
+            break
+    return sorted(best), scatter_m
