@@ -17,13 +17,12 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.detect import boards
 from ceres_cal.detect.boards import BoardDetections, detect_boards, right_handed
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.markers import CharucoSpec
 from ceres_cal.detect.partly import is_whole, part_of_board
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.targets import Target, checkerboard, rings
+from ceres_cal.scene.targets import Target, charuco, checkerboard, rings
 
 BOARD = checkerboard(7, 6, 0.03)
 CAMERA = Camera((480, 360), 450.0, (243.3, 177.8), Radial((1e-4, 7e-7)))
@@ -106,7 +105,7 @@ def write(path: Path, image: AnyArray) -> Path:
 
 def test_corners_are_good_to_a_hundredth_of_a_pixel(tmp_path: Path, picture: Array, truth: Array) -> None:
     path = write(tmp_path / "a.png", photograph(picture))
-    points = detect_boards([path], BOARD, corners="saddle").observations.points
+    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
     assert np.array_equal(points.feature, np.arange(42))
     error = points.pixels - truth
     assert np.all(np.abs(error.mean(axis=0)) < 0.003)  # (0.0000, 0.0007)
@@ -230,7 +229,7 @@ def test_sony_photographs(
     if corner_fit == "opencv":
         seen: list[tuple[int, int, str]] = []
         images, board = sorted((real_data / "boofcv_sony_chess").glob("*.jpg")), checkerboard(4, 6, 0.03)
-        detections = detect_boards(images, board, corners="opencv", progress=lambda *done: seen.append(done))
+        detections = detect_boards(images, board, corner_fit="opencv", progress=lambda *done: seen.append(done))
         assert seen == [(i, 13, path.name) for i, path in enumerate(images, start=1)]
     assert len(detections.found) == 13 and not detections.missed
     assert len(detections.observations.points) == 13 * 24
@@ -310,7 +309,7 @@ def test_a_part_that_has_several_places_on_the_board_is_refused(tmp_path: Path) 
     with pytest.raises(InputError, match=r"more than one place on it|no place on it|corners found"):
         detect_boards([cut], BOARD)
     with pytest.raises(InputError, match="no chessboard of 7 x 6"):  # OpenCV sees whole boards alone
-        detect_boards([write(tmp_path / "a.png", _moved_aside(220, 0)[0])], BOARD, corners="opencv")
+        detect_boards([write(tmp_path / "a.png", _moved_aside(220, 0)[0])], BOARD, corner_fit="opencv")
 
 
 def test_a_part_of_a_board_is_no_whole_one(picture: Array, truth: Array) -> None:
@@ -392,7 +391,7 @@ def test_depth_and_colour_change_nothing(tmp_path: Path, picture: Array) -> None
     paths = [write(tmp_path / f"{name}.png", image) for name, image in images.items()]
     paths.append(write(tmp_path / "float.tiff", images["colour"].astype(np.float32) / 255.0))
     assert read_grey(paths[3]).dtype == np.uint16
-    pixels = detect_boards(paths, BOARD, corners="saddle").observations.points.pixels.reshape(5, 42, 2)
+    pixels = detect_boards(paths, BOARD, corner_fit="saddle").observations.points.pixels.reshape(5, 42, 2)
     assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.00005
 
 
@@ -415,25 +414,24 @@ def test_a_noted_rotation_is_ignored(tmp_path: Path, picture: Array) -> None:
 def test_any_size_of_image(width: int, limit: float, picture: Array, truth: Array, tmp_path: Path) -> None:
     how = cv2.INTER_AREA if width < 480 else cv2.INTER_CUBIC
     path = write(tmp_path / "a.png", cv2.resize(photograph(picture), (width, width * 3 // 4), interpolation=how))
-    points = detect_boards([path], BOARD, corners="saddle").observations.points
+    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
     assert np.max(np.abs(points.pixels - ((truth + 0.5) * width / 480 - 0.5))) < limit
 
 
 def test_dark_images(tmp_path: Path, picture: Array, truth: Array) -> None:
     """Eleven grey levels in all: OpenCV's newer detector is blind there, the older one is not."""
     path = write(tmp_path / "a.png", photograph(picture) // 16)
-    points = detect_boards([path], BOARD, corners="saddle").observations.points
+    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
     assert rms(points.pixels - truth) < 0.03  # 0.009
 
 
 # ---- ChArUco --------------------------------------------------------------------------------------------------------
 
-CHARUCO_BOARD = checkerboard(7, 5, 0.04)
-CHARUCO = CharucoSpec("DICT_4X4_50", 0.03)
+CHARUCO = charuco(7, 5, 0.04, 0.03, "DICT_4X4_50")
 
 
 @pytest.fixture(scope="module")
-def charuco() -> tuple[Image8, Array]:
+def markered() -> tuple[Image8, Array]:
     """OpenCV's own drawing of the board, in perspective, and its corners (35, 2)."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawing = cv2.aruco.CharucoBoard((8, 6), 0.04, 0.03, dictionary).generateImage(
@@ -450,18 +448,18 @@ def charuco() -> tuple[Image8, Array]:
     return image, cv2.perspectiveTransform(corners[None], from_drawing)[0]
 
 
-def test_charuco_corners(tmp_path: Path, charuco: tuple[Image8, Array]) -> None:
-    image, truth = charuco
-    points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, corners=CHARUCO).observations.points
+def test_charuco_corners(tmp_path: Path, markered: tuple[Image8, Array]) -> None:
+    image, truth = markered
+    points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO).observations.points
     assert np.array_equal(points.feature, np.arange(35))
     assert rms(points.pixels - truth) < 0.02  # 0.009; OpenCV's own corners 0.05
 
 
-def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image8, Array]) -> None:
-    image, truth = charuco
+def test_charuco_may_be_partly_seen(tmp_path: Path, markered: tuple[Image8, Array]) -> None:
+    image, truth = markered
     image = image.copy()
     image[:, 330:] = 128
-    observations = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, corners=CHARUCO).observations
+    observations = detect_boards([write(tmp_path / "a.png", image)], CHARUCO).observations
     points = observations.points
     assert 10 <= len(points) < 25  # 15
     assert {"0,0", "0,4"} <= set(corner_names(observations)) and "6,0" not in corner_names(observations)
@@ -477,14 +475,28 @@ def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image8, Array
     ],
 )
 def test_charuco_too_little_seen(
-    right: int, below: int, reason: str, tmp_path: Path, charuco: tuple[Image8, Array]
+    right: int, below: int, reason: str, tmp_path: Path, markered: tuple[Image8, Array]
 ) -> None:
-    whole = write(tmp_path / "a.png", charuco[0])
-    part = np.full_like(charuco[0], 128)
-    part[:below, :right] = charuco[0][:below, :right]
-    detections = detect_boards([write(tmp_path / "b.png", part), whole], CHARUCO_BOARD, corners=CHARUCO)
+    whole = write(tmp_path / "a.png", markered[0])
+    part = np.full_like(markered[0], 128)
+    part[:below, :right] = markered[0][:below, :right]
+    detections = detect_boards([write(tmp_path / "b.png", part), whole], CHARUCO)
     assert detections.found == (str(whole),)
     assert detections.missed == ((str(tmp_path / "b.png"), reason),)
+
+
+def test_markers_in_other_places_are_another_board(tmp_path: Path, markered: tuple[Image8, Array]) -> None:
+    path = write(tmp_path / "a.png", markered[0])
+    for board in (charuco(8, 6, 0.04, 0.03, "DICT_4X4_50"), charuco(7, 5, 0.04, 0.03, "DICT_4X4_50", legacy=True)):
+        with pytest.raises(InputError, match="though markers of its dictionary: check columns, rows and legacy"):
+            detect_boards([path], board)
+
+
+def test_a_board_with_markers_that_is_said_to_have_none(tmp_path: Path, markered: tuple[Image8, Array]) -> None:
+    with pytest.raises(
+        InputError, match=r"it shows markers of DICT_4X4_50: a board with markers is of kind charuco or"
+    ):
+        detect_boards([write(tmp_path / "a.png", markered[0])], checkerboard(8, 6, 0.04))
 
 
 # ---- what is said ---------------------------------------------------------------------------------------------------
@@ -522,20 +534,19 @@ def test_no_board_at_all(tmp_path: Path, picture: Array) -> None:
 
 
 @pytest.mark.parametrize(
-    "board, charuco_spec, message",
+    "board, message",
     [
-        (rings([0.1, 0.2]), None, "kind 'rings'"),
-        (checkerboard(2, 5, 0.03), None, "3 inner corners a side or more, not 2 x 5"),
-        (CHARUCO_BOARD, CharucoSpec("DICT_9X9", 0.03), "unknown marker dictionary 'DICT_9X9'"),
-        (CHARUCO_BOARD, CharucoSpec("Dictionary", 0.03), "unknown marker dictionary 'Dictionary'"),
-        (CHARUCO_BOARD, CharucoSpec("DICT_4X4_50", 0.04), r"marker_m must be between 0 and the square's 0\.04 m"),
-        (checkerboard(11, 9, 0.04), CHARUCO, "has 50 markers, but a board of 12 x 10 squares needs 60"),
+        (rings([0.1, 0.2]), "kind 'rings'"),
+        (checkerboard(2, 5, 0.03), "3 inner corners a side or more, not 2 x 5"),
+        (charuco(7, 5, 0.04, 0.03, "DICT_9X9"), "unknown marker dictionary 'DICT_9X9'"),
+        (charuco(7, 5, 0.04, 0.03, "Dictionary"), "unknown marker dictionary 'Dictionary'"),
+        (charuco(11, 9, 0.04, 0.03, "DICT_4X4_50"), "has 50 markers, but a board of 12 x 10 squares needs 60"),
     ],
 )
-def test_wrong_targets(board: Target, charuco_spec: CharucoSpec | None, message: str, tmp_path: Path) -> None:
+def test_wrong_targets(board: Target, message: str, tmp_path: Path) -> None:
     black = write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))
     with pytest.raises(InputError, match=message):
-        detect_boards([black], board, corners=charuco_spec or "opencv")
+        detect_boards([black], board)
 
 
 @pytest.mark.parametrize("size", [(1, 60_000), (60_000, 1), (40, 30_000), (1, 1), (7, 7)])

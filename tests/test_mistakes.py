@@ -70,7 +70,6 @@ IN_PYTHON: list[tuple[Mistake, str]] = [
     (lambda c, o: cc.detect_field("x.png", FIELD, facing={"LeftGoalLine": "up"}), "there is no side 'up': choose one"),
     (lambda c, o: cc.detect_field("x.png", FIELD, not_painted=["Halfway"]), "did you mean 'HalfwayLine'?"),
     (lambda c, o: cc.detect_board("nowhere/", BOARD), "nowhere/: no such file"),
-    (lambda c, o: cc.detect_board("x.png", BOARD, charuco="DICT_4X4_50"), "charuco and marker_m belong together"),
     (lambda c, o: cc.export(c, "opencvv", "camera.yml"), "there is no export format 'opencvv': did you mean 'opencv'?"),
     (lambda c, o: cc.Calibration.load(SAMPLE), "it holds observations, where a calibration must be given"),
     (lambda c, o: any_cc.Calibration.load(None), "path must be a path, not NoneType"),

@@ -73,7 +73,7 @@ def _rows(
         raise SystemExit(f"{real_folder() / pattern}: there are no such photographs")
     least, most_px, phi, off = kept
     for corners in ("opencv", "saddle"):
-        detections = detect_boards(images, checkerboard(*board), corners=corners)
+        detections = detect_boards(images, checkerboard(*board), corner_fit=corners)
         calibration = calibrate(detections.observations, options)
         found = len(detections.found)
         yield Row(name, f"{corners}: boards found in {len(images)} photographs", found, least=least)

@@ -51,6 +51,7 @@ from ceres_cal.scene.targets import Marker as Marker
 from ceres_cal.scene.targets import Segment as Segment
 from ceres_cal.scene.targets import Target as Target
 from ceres_cal.scene.targets import april_grid as april_grid
+from ceres_cal.scene.targets import charuco as charuco
 from ceres_cal.scene.targets import checkerboard as checkerboard
 from ceres_cal.scene.targets import circle_grid as circle_grid
 from ceres_cal.scene.targets import custom as custom

@@ -31,9 +31,6 @@ def detect_board(
     camera: str = "camera",
     station: str | None = None,
     corner_fit: str = "saddle",
-    charuco: str | None = None,
-    marker_m: float | None = None,
-    legacy: bool = False,
     frames: int = 30,
     folder: str | PathLike[str] | None = None,
     progress: ImageProgress | None = None,
@@ -41,25 +38,22 @@ def detect_board(
     """Find a board in photographs or videos of one camera: `detect_board("photographs/", checkerboard(9, 6, 0.025))`.
 
     Args:
-        images: photographs, folders, patterns or videos. board: a checkerboard, circle grid, AprilGrid or markers.
+        images: photographs, folders, patterns or videos. board: a checkerboard, ChArUco board, circle grid,
+            AprilGrid or markers.
         camera, station: names in the observations; the station's is that of the camera by default.
         corner_fit: "saddle", which also measures boards partly out of the picture, or "opencv".
-        charuco: OpenCV's dictionary of a ChArUco board, such as "DICT_4X4_50"; marker_m: side of its markers, m.
-        legacy: the ChArUco board was made with OpenCV before 4.6. frames: how many to take out of each video.
+        frames: how many to take out of each video.
         folder: where these are kept; by default they are not.
         progress: called after each image with (steps done, steps in all, file name).
 
     Raises:
         InputError: an image cannot be read, or no image shows the board.
     """
-    if (charuco is None) != (marker_m is None):
-        raise InputError("charuco and marker_m belong together: give both or neither")
-    corners = corner_fit if charuco is None or marker_m is None else detect.CharucoSpec(charuco, marker_m, legacy)
-    detect.finder_of(board, corners)  # or says what does not fit, before any video is read
+    detect.finder_of(board, corner_fit)  # or says what does not fit, before any video is read
     photographs, videos = images_and_videos(images)
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         photographs += detect.frames_of_videos(videos, frames, Path(place), progress)
-        return detect.detect_boards(photographs, board, camera, station, corners, progress)
+        return detect.detect_boards(photographs, board, camera, station, corner_fit, progress)
 
 
 @checked

@@ -151,7 +151,7 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
     """
     if any(view.placement is None and not observations.targets[view.target].movable for view in observations.views):
         return
-    boards = {name for name, target in observations.targets.items() if target.kind == "checkerboard"}
+    boards = {name for name, target in observations.targets.items() if target.grid and target.grid.checkered}
     posed = [view for view in observations.views if view.target in boards and view.placement in estimate.placements]
     for name in estimate.cameras:
         own = [view for view in posed if view.camera == name]

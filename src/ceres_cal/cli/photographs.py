@@ -201,9 +201,8 @@ def _run_board(args: BoardArguments) -> Document:
     require_observations_output(args.output, [*images, *videos])
     from ceres_cal.functions import detect_board
 
-    same = ("camera", "station", "corner_fit", "charuco", "legacy", "frames")
-    how: dict[str, Any] = {name: getattr(args, name) for name in same}
-    how |= {"marker_m": args.marker, "folder": args.output.parent}
+    how: dict[str, Any] = {name: getattr(args, name) for name in ("camera", "station", "corner_fit", "frames")}
+    how |= {"folder": args.output.parent}
     with ProgressBar(args.silent) as bar:
         detections = detected(
             args.timeout, partial(detect_board, args.images, _board(args), **how, progress=bar.update)
@@ -212,7 +211,7 @@ def _run_board(args: BoardArguments) -> Document:
     return _document(detections, args.output)
 
 
-_OF_A_BOARD = ("columns", "rows", "square", "april_grid", "gap", "circles", "diameter")
+_OF_A_BOARD = ("columns", "rows", "square", "april_grid", "gap", "circles", "diameter", "charuco", "marker")
 
 
 def _board(args: BoardArguments) -> scene.Target:
@@ -224,10 +223,13 @@ def _board(args: BoardArguments) -> scene.Target:
         raise InputError("--columns N and --rows N, or --target TARGET: say what the board is")
     if sum(size is not None for size in (args.square, args.circles, args.april_grid)) != 1:
         raise InputError("--square M, --circles M or --april-grid M, by the kind of board: give one of them")
+    if args.charuco is not None:
+        if args.square is None:
+            raise InputError("--charuco is for a board of squares: give --square M")
+        marker_m = args.marker or 0.0  # which comes with it
+        return scene.charuco(args.columns, args.rows, args.square, marker_m, args.charuco, legacy=args.legacy)
     if args.square is not None:
         return scene.checkerboard(args.columns, args.rows, args.square)
-    if args.charuco is not None:
-        raise InputError("--charuco is for a board of squares: give --square M")
     if args.april_grid is not None:
         return scene.april_grid(args.columns, args.rows, args.april_grid, args.gap or 0.0)
     distance, diameter = args.circles or 0.0, args.diameter or 0.0

@@ -4,7 +4,6 @@ from ceres_cal.detect.boards import finder_of as finder_of
 from ceres_cal.detect.images import encoded as encoded
 from ceres_cal.detect.images import read_colour as read_colour
 from ceres_cal.detect.images import read_grey as read_grey
-from ceres_cal.detect.markers import CharucoSpec as CharucoSpec
 from ceres_cal.detect.median import MOST_PICTURES as MOST_PICTURES
 from ceres_cal.detect.median import Merged as Merged
 from ceres_cal.detect.median import merged as merged

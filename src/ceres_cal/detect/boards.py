@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,15 +22,13 @@ from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
 
-if TYPE_CHECKING:
-    from ceres_cal.detect.markers import CharucoSpec
-
 CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
-_COUNTED = {"checkerboard": "inner corners", "circle-grid": "circles", "april-grid": "tags"}
+_CHECKERED = ("checkerboard", "charuco")
+_COUNTED = {**dict.fromkeys(_CHECKERED, "inner corners"), "circle-grid": "circles", "april-grid": "tags"}
 _HINTS = {
-    "checkerboard": " (count the corners between squares, not the squares)",
+    **dict.fromkeys(_CHECKERED, " (count the corners between squares, not the squares)"),
     **dict.fromkeys(("circle-grid", "april-grid", "markers"), ""),
 }
 # Of (width + height)^2, the share that counts as pixels: more than there are from sides of 1 : 14 on, longer than any
@@ -69,10 +67,10 @@ def detect_boards(
     board: Target,
     camera: str = "camera",
     station: str | None = None,
-    corners: CharucoSpec | str = "saddle",
+    corner_fit: str = "saddle",
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
-    """Chessboard or ChArUco corners, or those of markers, of one camera's images.
+    """Corners of a chessboard, a ChArUco board or markers, or centres of circles, of one camera's images.
 
     Each image is one view; its frame is the file's stem, its placement too (with as much of the folders as tells
     equal stems apart) unless the target is the world, as markers on the floor are. Corners are named so that the
@@ -87,31 +85,33 @@ def detect_boards(
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
             file is ignored: intrinsics belong to the pixels as the sensor has them, not to how a viewer turns them.
-        board: a target of kind checkerboard, circle-grid, april-grid or markers.
+        board: a target of kind checkerboard, charuco, circle-grid, april-grid or markers. All but a checkerboard and
+            circles may be partly seen.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
-        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "saddle"
-            fits a blurred saddle to each corner, as with markers always: about four times more precise on rendered
-            boards (0.005 px against 0.02), and without cornerSubPix's shift towards the middle of its window; boards
-            may reach out of the picture, as long as it tells which corners are seen. "opencv" measures with
-            cornerSubPix, as the peers do, so that results compare; boards are seen whole.
+        corner_fit: of a checkerboard, one of CORNER_FITS: "saddle" fits a blurred saddle to each corner, as of other
+            boards always: about four times more precise on rendered boards (0.005 px against 0.02), and without
+            cornerSubPix's shift towards the middle of its window; boards may reach out of the picture, as long as it
+            tells which corners are seen. "opencv" measures with cornerSubPix, as the peers do, so that results
+            compare; boards are seen whole.
         progress: called after each image.
 
     Raises:
-        InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
-            small, or the markers do not fit it.
+        InputError: an image cannot be read or has another size (each named), the target is no board or too small, or
+            OpenCV has no such markers.
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    find = finder_of(board, corners)
+    find = finder_of(board, corner_fit)
     placements = _placement_names(paths) if board.movable else dict.fromkeys(paths)
     # OpenCV's marker detectors keep a state that threads would share.
-    side_by_side = board.kind == "checkerboard" and isinstance(corners, str)
-    size, grids, missed = _find_all(paths, find, in_turn if side_by_side else map, progress)
+    each = in_turn if board.kind == "checkerboard" else map
+    size, grids, missed = _find_all(paths, find, each, progress)
     refuting = [one for one in missed if NO_PLACE in one[1]]
     if len(grids) <= len(refuting):  # what few images show of a board that others refute is no such board
         missed = [*refuting, *(one for one in missed if one not in refuting)]
-        reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}"
+        seen = _markers_instead(board, Path(missed[0][0]))
+        reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}{seen}"
         raise NothingShownError(f"no {_what(board)} {reason}", tuple(missed))
     views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
@@ -161,8 +161,21 @@ def _find_all(
     return size, grids, missed
 
 
-def finder_of(board: Target, corners: CharucoSpec | str = "saddle") -> Finder:
-    """What finds a board in an image; InputError for no board, too small a one, or markers that do not fit it."""
+def _markers_instead(board: Target, path: Path) -> str:
+    """What to say where a chessboard was not found and markers are."""
+    if board.kind != "checkerboard":
+        return ""
+    from ceres_cal.detect.markers import dictionary_shown
+
+    shown = dictionary_shown(_as_8_bit(read_grey(path)))
+    kinds = (
+        "a board with markers is of kind charuco or april-grid (`ceres-cal targets charuco` says how to describe it)"
+    )
+    return f"; it shows markers of {shown}: {kinds}" if shown else ""
+
+
+def finder_of(board: Target, corner_fit: str = "saddle") -> Finder:
+    """What finds a board in an image; InputError for no board, too small a one, or unknown markers."""
     if board.kind == "circle-grid":
         from ceres_cal.detect.circles import measured_circles
 
@@ -179,22 +192,35 @@ def finder_of(board: Target, corners: CharucoSpec | str = "saddle") -> Finder:
     if board.grid is None or not board.grid.checkered:
         known = " or ".join(map(repr, _HINTS))
         raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind {known}")
-    return _corner_finder(board.grid, corners)
-
-
-def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
-    if isinstance(corners, str) and corners not in CORNER_FITS:
-        raise InputError(no_such("corner fit", corners, CORNER_FITS))
-    columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
+    columns, rows = board.grid.columns, board.grid.rows
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
-    if isinstance(corners, str):
-        return lambda image: _measured_chessboard(image, columns, rows, corners)
-    from ceres_cal.detect.markers import charuco_detector
+    if board.kind == "charuco":
+        return _charuco_finder(board, board.grid)
+    if corner_fit not in CORNER_FITS:
+        raise InputError(no_such("corner fit", corner_fit, CORNER_FITS))
+    return lambda image: _measured_chessboard(image, columns, rows, corner_fit)
 
-    detector = charuco_detector(corners, columns, rows, square_m)
-    margin = 0.5 * (1.0 - corners.marker_m / square_m)  # white around a marker, in squares
-    return lambda image: _measured_charuco(image, detector, columns, rows, margin)
+
+def _charuco_finder(board: Target, grid: Grid) -> Finder:
+    from ceres_cal.scene.targets.charuco_boards import opencv_board
+
+    detector = cv2.aruco.CharucoDetector(opencv_board(board.spec))
+    margin = 0.5 * (1.0 - board.spec["marker_m"] / grid.spacing_m)  # white around a marker, in squares
+    # The disc around a corner must end before the markers on both sides of it begin.
+    reach = min(REACH, float(np.sqrt(2.0)) * margin)
+
+    def find(image: Image) -> Array | str:
+        corners, ids, _, markers = detector.detectBoard(_as_8_bit(image))
+        if ids is None or len(ids) == 0:
+            doubt = "" if markers is None else ", though markers of its dictionary: check columns, rows and legacy"
+            return f"no ChArUco corners found{doubt}"
+        every = np.full((grid.rows * grid.columns, 2), np.nan)
+        every[ids.ravel()] = corners.reshape(-1, 2)
+        seen = _enough(every.reshape(grid.rows, grid.columns, 2))
+        return seen if isinstance(seen, str) else _enough(measure_saddles(image, seen, reach).grid)
+
+    return find
 
 
 def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str) -> Array | str:
@@ -313,20 +339,6 @@ def _scales(shape: tuple[int, ...]) -> list[float]:
     last = [2.0] if pixels <= _SMALL_PX else []
     every = (*first, min(1.0, (_MOST_PX / pixels) ** 0.5), *last)
     return [scale for scale in every if scale * min(shape) >= _LEAST_SIDE_PX]
-
-
-def _measured_charuco(
-    image: Image, detector: cv2.aruco.CharucoDetector, columns: int, rows: int, margin: float
-) -> Array | str:
-    corners, ids, _, _ = detector.detectBoard(_as_8_bit(image))
-    if ids is None or len(ids) == 0:
-        return "no ChArUco corners found"
-    grid = np.full((rows * columns, 2), np.nan)
-    grid[ids.ravel()] = corners.reshape(-1, 2)
-    # The disc around a corner must end before the markers on both sides of it begin.
-    reach = min(REACH, float(np.sqrt(2.0)) * margin)
-    seen = _enough(grid.reshape(rows, columns, 2))
-    return seen if isinstance(seen, str) else _enough(measure_saddles(image, seen, reach).grid)
 
 
 def _placing(found: Array | str) -> Array | str:

@@ -4,8 +4,6 @@ Corners of a dark square are no saddles: blur rounds them off inwards. So the li
 (`profiles`), and a line, which a lens may bend a little, goes through it. In rendered pictures (sides of 45 to 96 px,
 blur of 0.4 to 1.5 px, noise of 2 grey levels) corners are off by 0.02 to 0.03 px, rms per coordinate; OpenCV's by 0.17
 to 0.32 px with its best refinement.
-
-ChArUco boards: checkerboards with markers in their bright squares, by which a part of one tells its corners.
 """
 
 from __future__ import annotations
@@ -13,21 +11,32 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ceres_cal.base import Array, Array32, Frozen, Image, Image8, InputError
+from ceres_cal.base import Array, Array32, Image, Image8, InputError
 from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
 from ceres_cal.scene.targets import Target
+from ceres_cal.scene.targets.charuco_boards import dictionary_of
 from ceres_cal.scene.targets.marker_targets import CORNERS
 
 _FAR = 4.0  # medians beyond which a place on a side shows something else
 _FEWEST_PLACES = 5
+_DICTIONARIES = (
+    *(tuple(f"DICT_{bits}_{count}" for count in (50, 100, 250, 1000)) for bits in ("4X4", "5X5", "6X6", "7X7")),
+    ("DICT_ARUCO_ORIGINAL",),
+    ("DICT_APRILTAG_36h11",),
+)
+"""What boards are printed with; the smaller ones of a row are the first markers of its last one."""
 
 
-def dictionary_of(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of that name; InputError where it has none."""
-    code = getattr(cv2.aruco, name, None)
-    if not name.startswith("DICT_") or not isinstance(code, int):
-        raise InputError(f"unknown marker dictionary {name!r}: name one of OpenCV's, such as DICT_4X4_50")
-    return cv2.aruco.getPredefinedDictionary(code)
+def dictionary_shown(levels: Image8) -> str:
+    """The dictionary, the smallest, that has most of the markers in an image; "" where few or none are seen."""
+    few = 3  # what lies beside a chessboard, or its squares, now and then looks like one
+    best = ""
+    for names in _DICTIONARIES:
+        _, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(names[-1])).detectMarkers(levels)
+        seen = np.unique([] if numbers is None else numbers)
+        if len(seen) > few:
+            few, best = len(seen), next(name for name in names if len(dictionary_of(name).bytesList) > seen[-1])
+    return best
 
 
 def markers_finder(target: Target) -> cv2.aruco.ArucoDetector:
@@ -125,36 +134,3 @@ def _crossings(quad: Array, sides: Array) -> Array:
         normals = np.array([outward[before], outward[corner]])
         corners[corner] = quad[corner] + np.linalg.solve(normals, [ends[before], begins[corner]])
     return corners
-
-
-# ---- in the squares of a board --------------------------------------------------------------------------------------
-
-
-class CharucoSpec(Frozen, eq=True):
-    """The markers of a ChArUco board; its squares are those of the checkerboard target.
-
-    Attributes:
-        dictionary: OpenCV's name of the marker dictionary, such as "DICT_4X4_50".
-        marker_m: side of a marker. Best at most 0.8 of a square: a corner needs some white towards the markers.
-        legacy_pattern: made with OpenCV before 4.6, which began boards of an even number of rows otherwise.
-    """
-
-    dictionary: str
-    marker_m: float
-    legacy_pattern: bool = False
-
-
-def charuco_detector(charuco: CharucoSpec, columns: int, rows: int, square_m: float) -> cv2.aruco.CharucoDetector:
-    """What finds the corners of a checkerboard with markers; InputError where these do not fit it."""
-    dictionary = dictionary_of(charuco.dictionary)
-    if not 0.0 < charuco.marker_m < square_m:
-        raise InputError(f"marker_m must be between 0 and the square's {square_m} m, not {charuco.marker_m}")
-    needed = (columns + 1) * (rows + 1) // 2
-    if len(dictionary.bytesList) < needed:
-        raise InputError(
-            f"{charuco.dictionary} has {len(dictionary.bytesList)} markers, but a board of {columns + 1} x {rows + 1} "
-            f"squares needs {needed}: name the dictionary that was printed"
-        )
-    board = cv2.aruco.CharucoBoard((columns + 1, rows + 1), square_m, charuco.marker_m, dictionary)
-    board.setLegacyPattern(charuco.legacy_pattern)
-    return cv2.aruco.CharucoDetector(board)

@@ -39,15 +39,15 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
     paper = Paper(
         (-2.0 * grid.spacing_m, -2.0 * grid.spacing_m),
         ((grid.columns + 1) * grid.spacing_m, (grid.rows + 1) * grid.spacing_m),
-        partial(_squares, grid),
+        partial(checkered, grid),
     )
     return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper)
 
 
-def _squares(grid: Grid) -> Iterator[Shape]:
-    """The dark ones: that between "0,0" and "1,1", and so on, one more each way beyond the outer corners."""
+def checkered(grid: Grid, parity: int = 0) -> Iterator[Shape]:
+    """The dark squares, one more each way beyond the outer corners: that between "0,0" and "1,1" has parity 0."""
     for row, column in product(range(-1, grid.rows), range(-1, grid.columns)):
-        if (row + column) % 2 == 0:
+        if (row + column) % 2 == parity:
             yield Shape((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
 
 

@@ -286,6 +286,7 @@ FIELDS = {path.stem: path for path in _FIELDS}
 _MODULES = {
     **dict.fromkeys(FIELDS, "painted_fields"),
     **dict.fromkeys(("tape-grid", "checkerboard", "circle-grid", "april-grid"), "grids"),
+    "charuco": "charuco_boards",
     "markers": "marker_targets",
     "rings": "ring_sheets",
     "custom": "custom_targets",
