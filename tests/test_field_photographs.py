@@ -125,7 +125,7 @@ def test_a_moved_camera_draws_no_line_aside(turned: bool) -> None:
     if turned:
         course = replace(course, normals=-course.normals, curvature=-course.curvature)
     found = measure(np.asarray(cv2.blur(picture, (1, 7)), np.float32), course, 3.0)
-    assert found.share > 0.9
+    assert np.mean(found.found) > 0.9
     assert abs(np.nanmean(found.offset_px)) < 0.03  # 0.00 px; 0.3 px where the search is half a step aside
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 from photos import shots as script
 from photos import straightness
 from scenery import overhead_pose
@@ -223,9 +224,10 @@ def test_a_top_view_s_pixel_shows_its_place(lens: str, height_m: float) -> None:
 )
 def test_plans_go_there_and_back(place: tuple[float, float], mm_per_px: float, corner: tuple[float, float]) -> None:
     grid = TopViewGrid(corner, (100, 80), mm_per_px / 1000.0, 0.0)
-    assert grid.places(grid.pixels([place])) == pytest.approx(np.array([place]), abs=1e-9)
+    assert grid.places(_shown_at(grid, [place])) == pytest.approx(np.array([place]), abs=1e-9)
     x0, y0, x1, y1 = grid.area_m
-    assert grid.pixels([(x0, y1), (x1, y0)]) == pytest.approx(np.array([(-0.5, -0.5), (99.5, 79.5)]), abs=1e-6)
+    corners = _shown_at(grid, [(x0, y1), (x1, y0)])
+    assert corners == pytest.approx(np.array([(-0.5, -0.5), (99.5, 79.5)]), abs=1e-6)
 
 
 def test_a_top_view_of_a_photograph_has_the_field_where_it_is(shot: script.Shot) -> None:
@@ -240,7 +242,7 @@ def test_a_top_view_of_a_photograph_has_the_field_where_it_is(shot: script.Shot)
     ):
         steps = np.arange(-0.06, 0.0601, 0.0025)
         places = np.array([x, y]) + steps[:, None] * np.array(across)
-        bright = _levels(grey, grid.pixels(places))
+        bright = _levels(grey, _shown_at(grid, places))
         weight = np.maximum(bright - np.median(bright), 0.0)
         if weight.max() > 40.0:  # a robot may stand there, and worn paint is dark
             assert np.sum(weight * steps) / np.sum(weight) == pytest.approx(0.0, abs=0.004)  # 1 mm
@@ -303,6 +305,12 @@ def test_the_real_field_s_overlay_lies_on_the_paint(tigers_field: tuple[Path, Fi
         beside = 2.0 * left - middle, 2.0 * right - middle
         paint, *carpet = (_levels(grey, pixels[inside]) for pixels in (middle, *beside))
         assert np.mean(paint > np.maximum(*carpet) + 20.0) > 0.75, name  # 0.9: seams, and crossing lines
+
+
+def _shown_at(grid: TopViewGrid, places_m: ArrayLike) -> Array:
+    """(N, 2) px of a top view that show places (N, 2) m."""
+    steps = (np.asarray(places_m, dtype=float) - grid.corner_m) * [1.0, -1.0]
+    return np.asarray(steps / grid.m_per_px - 0.5)
 
 
 def _levels(grey: Array, pixels: Array) -> Array:

@@ -18,8 +18,8 @@ from ceres_cal.calibration.file import (
     CalibrationFile,
     Fit,
     LensChoice,
+    PriorFile,
     Refitted,
-    RefittedFile,
     Rejected,
     StationFile,
     options_from_json,
@@ -85,7 +85,7 @@ class Calibration(Frozen):
     digest: str
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
-    refitted: Refitted | None = None
+    refitted: Refitted[GaussianPrior] | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choices: Mapping[str, LensChoice] = field(default_factory=dict)
     as_built: tuple[AsBuilt, ...] = ()
@@ -252,7 +252,7 @@ class Calibration(Frozen):
 
     @cached_property
     def _file(self) -> CalibrationFile:
-        estimate = self.estimate
+        estimate, about = self.estimate, self.refitted
         return CalibrationFile(
             format=FORMAT,
             version=VERSION,
@@ -265,7 +265,7 @@ class Calibration(Frozen):
             structure_m=dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
             options=options_to_json(self.options),
             posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
-            refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
+            refitted=None if about is None else about.with_prior(PriorFile.of(about.prior)),
             notes=dict(self.notes) or msgspec.UNSET,
             **{name: getattr(self, name) for name in _ALIKE},
         )
@@ -276,7 +276,7 @@ class Calibration(Frozen):
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
         estimate = data.estimate(targets, options)
-        known, told = every_key(estimate), data.posterior
+        known, told, about = every_key(estimate), data.posterior, data.refitted
         posterior = None if told is None else told.posterior(known)
         if told is not None and posterior is not None and (told.profiles or told.bends):
             from ceres_cal.posterior.files import as_mixtures
@@ -287,7 +287,7 @@ class Calibration(Frozen):
             targets,
             options=options,
             posterior=posterior,
-            refitted=None if data.refitted is None else data.refitted.refitted(known),
+            refitted=None if about is None else about.with_prior(about.prior.prior(known)),
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE} | {"lens_choices": data.chosen_lenses},
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from functools import cache
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 import numpy as np
@@ -154,13 +154,17 @@ class Fit(Frozen, eq=True):
         return float((total / max(self.points + self.curves, 1)) ** 0.5)
 
 
-class Refitted(Frozen):
+_P = TypeVar("_P")
+_Q = TypeVar("_Q")
+
+
+class Refitted(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unknown_fields=True):
     """How a calibration came from an earlier one.
 
     Attributes:
         what: was free, one of `moves.WHAT`. moved: stations whose poses were sought.
         explanation: what the observations say has happened, in words.
-        prior: what was known beforehand of everything that was carried over.
+        prior: what was known beforehand of everything that was carried over; in a file as that has it.
         scales: noise scales of points and curves of the calibration before.
         digests: of the observations that are in the prior.
     """
@@ -168,9 +172,13 @@ class Refitted(Frozen):
     what: str
     moved: tuple[str, ...]
     explanation: str
-    prior: GaussianPrior
+    prior: _P
     scales: tuple[float, float]
     digests: tuple[str, ...]
+
+    def with_prior(self, prior: _Q) -> Refitted[_Q]:
+        """The same with the prior in its other form."""
+        return Refitted(self.what, self.moved, self.explanation, prior, self.scales, self.digests)
 
 
 @cache
@@ -245,26 +253,6 @@ class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
         return GaussianPrior.about(information, Estimate(cameras, stations, {}, structure))
 
 
-class RefittedFile(msgspec.Struct, forbid_unknown_fields=True):
-    """How a calibration came from an earlier one."""
-
-    what: str
-    moved: tuple[str, ...]
-    explanation: str
-    prior: PriorFile
-    scales: tuple[float, float]
-    digests: tuple[str, ...]
-
-    @classmethod
-    def of(cls, refitted: Refitted) -> RefittedFile:
-        """As a file has it."""
-        return cls(**{**vars(refitted), "prior": PriorFile.of(refitted.prior)})
-
-    def refitted(self, known: Collection[Key]) -> Refitted:
-        """What the file says; InputError where the prior's numbers do not fit, or are none of those known."""
-        return Refitted(**{**msgspec.structs.asdict(self), "prior": self.prior.prior(known)})
-
-
 class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     """A calibration; `lens_choice` is that of all cameras, in files of before."""
 
@@ -289,7 +277,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     digest: str
     versions: dict[str, str]
     posterior: PosteriorFile | None = None
-    refitted: RefittedFile | None = None
+    refitted: Refitted[PriorFile] | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choices: dict[str, LensChoice] = {}
     lens_choice: LensChoice | msgspec.UnsetType | None = msgspec.UNSET

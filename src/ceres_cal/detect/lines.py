@@ -59,7 +59,7 @@ class Lines(Rows):
         course: the places looked at.
         found: (N,) where paint was measured.
         offset_px: (N,) how far along the normal from the course's place the paint's middle lies; NaN where not found.
-        sigma_px: (N,) standard deviation of it. contrast: (N,) grey levels.
+        sigma_px: (N,) standard deviation of it.
         blur_px: standard deviation of the picture's blur, lens, pixel and motion together.
         stretch: the paint's width over what the target says, as far as the blur lets it be seen.
         coma_px: standard deviation of how far coma may still draw all of them outwards, growing with the square of the
@@ -70,7 +70,6 @@ class Lines(Rows):
     found: Mask
     offset_px: Array
     sigma_px: Array
-    contrast: Array
     blur_px: float
     stretch: float
     coma_px: float = 0.0
@@ -93,11 +92,6 @@ class Lines(Rows):
         """
         away = self.offset_px + 0.5 * side * self.stretch * self.course.width_px
         return np.asarray(self.course.pixels + away[:, None] * self.course.normals)
-
-    @property
-    def share(self) -> float:
-        """Of the places looked at, the share where paint was found."""
-        return float(np.mean(self.found)) if len(self.found) else 0.0
 
 
 def search(
@@ -188,7 +182,7 @@ def measure(
         course, clear, blur = course.take(alone), clear[alone], blur.take(alone)
         if not len(course):
             none = np.empty(0)
-            return Lines(course, np.empty(0, dtype=bool), none, none, none, 1.0, 1.0)
+            return Lines(course, np.empty(0, dtype=bool), none, none, 1.0, 1.0)
         rough, bright = search(grey, course, reach_px, 0.5 * reach_px, blur.blur_px)
         windows = _windows(grey, course, rough, beyond)
         blur = blur_of(windows, course, bright, blur)
@@ -213,7 +207,7 @@ def measure(
     sigma = np.hypot(_as_scattered(_threes(course, found), offset, fits.sigma_px), open_px)
     found = _goes_on(course, found, offset, sigma)
     offset = np.where(found, offset, np.nan)
-    return Lines(course, found, offset, sigma, contrast, blur.usual_px, blur.stretch, coma_px)
+    return Lines(course, found, offset, sigma, blur.usual_px, blur.stretch, coma_px)
 
 
 def _windows(grey: Array32, course: Course, rough_px: Array, beyond_px: float) -> Windows:

@@ -29,7 +29,7 @@ class Mislabelled(Frozen):
     Attributes:
         is_curve, view: of all of them. feature, instead: index of the label and of the feature that fits, among the
             target's. rows: (K,) rows. distance_px: (K,) from the feature that fits.
-        tried: how many of this view and label were looked at. log_p: of so many by chance.
+        log_p: of so many by chance.
     """
 
     is_curve: bool
@@ -38,7 +38,6 @@ class Mislabelled(Frozen):
     instead: int
     rows: Indices
     distance_px: Array
-    tried: int
     log_p: float
 
 
@@ -119,7 +118,7 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
         log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
         groups.append(
             Mislabelled(
-                is_curve, view, int(label), int(instead), rows[chosen], away[chosen], int(tried.sum()), log_p
+                is_curve, view, int(label), int(instead), rows[chosen], away[chosen], log_p
             )
         )  # fmt: skip
     return groups

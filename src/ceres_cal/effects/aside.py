@@ -293,8 +293,7 @@ class Explanation(Frozen):
     Attributes:
         name: of the group. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
             lies aside, the median. log_odds: natural logarithm of the odds that it does not belong.
-        remedy: what to look at. instead: what the next best explanation says. other: the estimate of the less
-            probable one of the two.
+        remedy: what to look at. other: the estimate of the less probable explanation.
     """
 
     name: str
@@ -302,7 +301,6 @@ class Explanation(Frozen):
     aside_px: float
     log_odds: float
     remedy: str
-    instead: str
     other: Estimate
 
     @property

@@ -206,10 +206,6 @@ class Ends(Frozen):
         """(2 B, K) by how much the ends are farther off, in standard deviations' worth of half a direction each."""
         return np.asarray((self.ends - self.steps) / (self.half_width * np.sqrt(2.0)))
 
-    def widened(self, information: Information) -> Information:
-        """Information about some of the keys with the excesses as variances of their own."""
-        return information.widened(over(self.excesses, self.keys, information.keys))
-
     def beside(self, stated: Information) -> Ends:
         """With ends no farther than what was stated lets them be."""
         if not np.any(stated.matrix):

@@ -15,7 +15,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Finding
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.posterior import FieldMap, Verdict
-from ceres_cal.report.quality import FaultyMap, Quality
+from ceres_cal.report.quality import Quality
 from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.targets.target import PAINT_WANDERS
 
@@ -244,11 +244,12 @@ def reaches(quality: Quality) -> tuple[Reach, ...]:
         return ()
     times = paint_over_usual(quality)
     return tuple(
-        reach(height, [maps[number] for maps in quality.faulty_maps], times) for number, height in enumerate(HEIGHTS_M)
+        reach(height, [maps[number][0] for maps in quality.faulty_maps], times)
+        for number, height in enumerate(HEIGHTS_M)
     )
 
 
-def reach(height_m: float, maps: Sequence[FieldMap | FaultyMap], times: float) -> Reach:
+def reach(height_m: float, maps: Sequence[FieldMap], times: float) -> Reach:
     """A corner of the picture beyond the paint, of which little is known, is named and does not condemn the rest."""
     radii = np.concatenate([one.radius_95_mm.ravel() for one in maps])
     places = np.concatenate([one.places for one in maps])[~np.isnan(radii)]

@@ -31,40 +31,13 @@ if TYPE_CHECKING:
     from ceres_cal.posterior.seam import Disagreement
 
 
-class FaultyMap(Struct, frozen=True, eq=False):
-    """A map of a station at one height, and by how much faults move its places.
-
-    Attributes:
-        of: the map. moved_mm: (Y, X). left_mm: what the faults do besides to what was observed, root mean square.
-    """
-
-    of: FieldMap
-    moved_mm: Array
-    left_mm: float
-
-    @property
-    def places(self) -> Array:
-        """As those of the map."""
-        return self.of.places
-
-    @property
-    def radius_95_mm(self) -> Array:
-        """(Y, X) with the faults counted."""
-        within = 2.0  # times its root mean square, how far what a fault leaves reaches
-        return np.asarray(np.sqrt(self.of.radius_95_mm**2 + self.moved_mm**2 + (within * self.left_mm) ** 2))
-
-    @property
-    def sigmas(self) -> float:
-        """By how many standard deviations the faults move places, root mean squares over what is known; else 0."""
-        known = np.isfinite(self.of.sd_mm) & np.isfinite(self.moved_mm)
-        sd = float(np.sqrt(np.sum(self.of.sd_mm[known] ** 2)))
-        return float(np.sqrt(np.sum(self.moved_mm[known] ** 2))) / sd if sd > 0.0 else 0.0
-
-
-def faulty_map(
+def with_faults(
     known: Uncertainty, of: FieldMap, step: JointStep | None, faults: Sequence[Finding], doubtful_mm: float
-) -> FaultyMap:
-    """A map with faults counted: what a camera has besides displaces the image, and moves its numbers."""
+) -> tuple[FieldMap, float]:
+    """A map whose radii have faults counted, and by how many standard deviations these move its places, root mean
+    squares over what is known: what a camera has besides displaces the image, and moves its numbers.
+    """
+    within = 2.0  # times its root mean square, how far what a fault leaves reaches
     moved_mm = np.zeros(of.shape)
     if step is not None and step.causes:
         pixels = visible_pixels(known.estimate, of.station, of.places, of.height_m)
@@ -72,10 +45,13 @@ def faulty_map(
         slopes = locate_slopes(known.estimate, own, of.station, pixels, of.height_m)
         displaced = step.displaced(known.estimate.stations[of.station].camera, pixels)
         back = known.estimate.camera_at(of.station).locate(pixels - displaced, of.height_m)
-        moved = back - of.places + slopes @ _steps(step, own)
-        moved_mm = 1e3 * np.linalg.norm(moved, axis=1).reshape(of.shape)
+        by_m = back - of.places + slopes @ _steps(step, own)
+        moved_mm = 1e3 * np.linalg.norm(by_m, axis=1).reshape(of.shape)
     others = [fault.effect_mm for fault in faults if not _is_of_camera(fault)]
-    return FaultyMap(of, np.hypot(moved_mm, doubtful_mm), float(np.sqrt(np.nansum(np.square(others)))))
+    moved_mm, left_mm = np.hypot(moved_mm, doubtful_mm), within * float(np.sqrt(np.nansum(np.square(others))))
+    told = np.isfinite(of.sd_mm) & np.isfinite(moved_mm)
+    moved, sd = (float(np.sqrt(np.sum(one[told] ** 2))) for one in (moved_mm, of.sd_mm))
+    return replace(of, radius_95_mm=np.sqrt(of.radius_95_mm**2 + moved_mm**2 + left_mm**2)), moved / sd if sd else 0.0
 
 
 def _is_of_camera(fault: Finding) -> bool:
@@ -187,12 +163,12 @@ class Quality(Frozen):
         return None if self.diagnosis is None else self.diagnosis.step
 
     @cached_property
-    def faulty_maps(self) -> tuple[tuple[FaultyMap, ...], ...]:
-        """The maps with faults counted, of each placed station, at HEIGHTS_M."""
+    def faulty_maps(self) -> tuple[tuple[tuple[FieldMap, float], ...], ...]:
+        """The maps `with_faults`, of each placed station, at HEIGHTS_M."""
         if self.uncertainty is None:
             return ()
         return tuple(
-            tuple(faulty_map(self.uncertainty, one, self._step, self.faults, self.doubtful_mm) for one in maps)
+            tuple(with_faults(self.uncertainty, one, self._step, self.faults, self.doubtful_mm) for one in maps)
             for maps in self.maps.values()
         )
 
@@ -214,7 +190,7 @@ class Quality(Frozen):
             return 0.0
         if not self.faulty_maps:
             return sigmas_of_cameras(self.uncertainty, self._step)
-        return max(one.sigmas for maps in self.faulty_maps for one in maps)
+        return max(sigmas for maps in self.faulty_maps for _, sigmas in maps)
 
     @cached_property
     def observed_px(self) -> float:

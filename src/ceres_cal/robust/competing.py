@@ -203,14 +203,12 @@ class _Competition:
             odds, rival = offsets.odds(place, places)
             own = groups.among([number]) & self._taking_part
             other = (end if odds > 0.0 else without).estimate
-            instead = "it belongs"
             if rival is not None and abs(odds) < DOUBTFUL:
-                in_its_place = int(chosen[rival])
-                instead = f"the whole of {groups.name(in_its_place)} does not belong"
-                rivals = self._without(groups, tuple(in_its_place if one == number else one for one in numbers))
+                in_its_place = tuple(int(chosen[rival]) if one == number else one for one in numbers)
+                rivals = self._without(groups, in_its_place)
                 other = other if rivals is None or odds < 0.0 else rivals.estimate
             aside_px = float(medians_known(lengths[own]))
-            explanations.append(Explanation(groups.name(number), own, aside_px, odds, groups.remedy, instead, other))
+            explanations.append(Explanation(groups.name(number), own, aside_px, odds, groups.remedy, other))
         rows, least = groups.among(numbers) & self._taking_part, min(one.log_odds for one in explanations)
         further = offsets.next(places)
         further = None if further is None else int(chosen[further])

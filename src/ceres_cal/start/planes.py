@@ -43,7 +43,6 @@ class PlaneSight(Frozen):
         pixels: (2 N + L, 2), as the sight has them.
     """
 
-    sight: Sights
     height_m: float
     points: Array
     lines: Array
@@ -81,7 +80,6 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
     normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
     points = sight.points[on, :2]
     return PlaneSight(
-        sight,
         height,
         points,
         np.vstack([point_lines(points), np.column_stack([normal, -np.sum(normal * c, axis=1)])]),

@@ -67,10 +67,6 @@ class Session:
     def state(self) -> State:
         return self._now.state
 
-    @property
-    def found(self) -> Found | None:
-        return self._now.found
-
     def target(self, state: State) -> scene.Target | None:
         """The field that is looked for, with the dimensions that were changed."""
         if not state.target:

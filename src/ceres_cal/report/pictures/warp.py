@@ -141,11 +141,6 @@ class TopViewGrid(Struct, frozen=True):
         steps = (np.asarray(pixels, dtype=float) + 0.5) * self.m_per_px
         return np.asarray(self.corner_m + steps * [1.0, -1.0])
 
-    def pixels(self, places_m: ArrayLike) -> Array:
-        """Places (N, 2) on the plane, m -> pixels (N, 2) of the top view; nothing is cut off."""
-        steps = (np.asarray(places_m, dtype=float) - self.corner_m) * [1.0, -1.0]
-        return np.asarray(steps / self.m_per_px - 0.5)
-
 
 def make_grid(area_m: tuple[float, float, float, float], m_per_px: float, height_m: float = 0.0) -> TopViewGrid:
     """The grid of pixels over an area.
