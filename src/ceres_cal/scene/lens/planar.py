@@ -10,9 +10,10 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from ceres_cal.base import AnyArray, Array, Frozen, cached_property
 from ceres_cal.kernels import NOTHING, Optics, inverse_of_growing, lens_images, lens_rays
@@ -64,7 +65,7 @@ def _first_root(polynomial: tuple[float, ...]) -> float:
     return 1.0 / float(np.max(inverse.real[real])) if np.any(real) else np.inf
 
 
-class Profile(Protocol):
+class Profile(Frozen):
     """A map along a radius: value 0 and slope 1 at 0, growing up to its limit.
 
     Attributes:
@@ -72,53 +73,33 @@ class Profile(Protocol):
             goes on. below: (Q,) a polynomial that they are divided by; empty for none.
     """
 
-    @property
-    def limit(self) -> float: ...
-    @property
-    def pieces(self) -> Array: ...
-    @property
-    def width(self) -> float: ...
-    @property
-    def below(self) -> Array: ...
-    def value(self, x: Array) -> Array: ...
-
-
-class Ratio(Frozen):
-    """p(x) / q(x): a profile of two polynomials, lowest power first, q(0) = 1; without the second, p alone.
-
-    Attributes:
-        above, below: p and q, empty for none. end: it is asked for up to there.
-    """
-
-    above: Array
+    pieces: Array
     below: Array
-    end: float = np.inf
-    width: ClassVar[float] = 1.0
-
-    @property
-    def pieces(self) -> Array:
-        """(1, T) p."""
-        return self.above[None]
+    limit: float
+    width: float = 1.0
 
     def value(self, x: Array) -> Array:
         """At x (N,)."""
-        total = horner(self.above, x)
+        total = along_pieces(self.pieces, self.width, x)
         return np.asarray(total / horner(self.below, x)) if len(self.below) else total
 
-    @cached_property
-    def _rising(self) -> Array:
-        """Its derivative times q^2."""
-        if not len(self.below):
-            return derivative(self.above)
-        first, second = (derivative(self.above), self.below), (self.above, derivative(self.below))
-        return less(np.convolve(*first), np.convolve(*second))
 
-    @cached_property
-    def limit(self) -> float:
-        """Where it stops growing or q reaches 0, or else its end."""
-        short = 1e-9  # of a pole: the map is finite before it
-        limit = min(self.end, first_root(self._rising))
-        return min(limit, (1.0 - short) * first_root(self.below)) if len(self.below) else limit
+def along_pieces(pieces: Array, width: float, x: Array) -> Array:
+    """Polynomials side by side, see `Profile`, at x of any shape."""
+    places = x / width
+    number = np.clip(places, 0.0, len(pieces) - 1.0).astype(int)
+    return np.asarray(polyval(places - number, np.moveaxis(pieces[number], -1, 0), tensor=False))
+
+
+def ratio(above: Array, below: Array = NOTHING, end: float = np.inf) -> Profile:
+    """p(x) / q(x) of two polynomials, lowest power first, q(0) = 1, or p alone: up to where it stops growing or q
+    reaches 0, or else to its end.
+    """
+    short = 1e-9  # of a pole: the map is finite before it
+    if not len(below):
+        return Profile(above[None], below, min(end, first_root(derivative(above))))
+    rising = less(np.convolve(derivative(above), below), np.convolve(above, derivative(below)))  # its slope times q^2
+    return Profile(above[None], below, min(end, first_root(rising), (1.0 - short) * first_root(below)))
 
 
 def invert_increasing(profile: Profile, target: Array) -> Array:
@@ -292,14 +273,14 @@ class Decentred(Planar):
         return not any(self._across)
 
     @cached_property
-    def _profile(self) -> Ratio:
+    def _profile(self) -> Profile:
         # In the worst direction decentring takes 3 |p| r^2 off the radius, and a thin prism |s| r^2 and |s'| r^4.
         p1, p2, s1, s2, s3, s4 = self._across
         above = dense_polynomial(self._named(self.above), range(3, 2 * len(self.above) + 2, 2))
         worst = np.array([0.0, 0.0, 3.0 * math.hypot(p1, p2) + math.hypot(s1, s3), 0.0, math.hypot(s2, s4)])
         if not any(under := self._named(self.below)):
-            return Ratio(less(above, worst), NOTHING, self._end)
+            return ratio(less(above, worst), end=self._end)
         below = np.array([1.0, *(part for one in under for part in (0.0, one))])
-        return Ratio(less(above, np.convolve(worst, below)), below, self._end)
+        return ratio(less(above, np.convolve(worst, below)), below, self._end)
 
     _end: ClassVar[float] = np.inf

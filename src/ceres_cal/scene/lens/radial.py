@@ -12,9 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, Indices, InputError, cached_property
-from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, required_powers, unit_rays
-from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, derivative, horner, invert_increasing, inverted, less
+from ceres_cal.scene.lens.planar import (
+    Profile,
+    dense_polynomial,
+    derivative,
+    horner,
+    invert_increasing,
+    inverted,
+    less,
+    ratio,
+)
 
 
 @dataclass(frozen=True)
@@ -100,10 +108,10 @@ class Radial(Lens):
         return dense_polynomial(self._along, self.powers)
 
     @lru_cache(maxsize=256)  # noqa: B019 a camera that is moved and asked anew has the lens that it had
-    def _profile(self, phi: float) -> Ratio:
+    def _profile(self, phi: float) -> Profile:
         """That map in units of phi, in the direction in which a decentring takes most off it, 3 |p| r^2."""
         along = dense_polynomial(self._along * phi ** np.subtract(self.powers, 1.0), self.powers)
-        return Ratio(less(along, np.array([0.0, 0.0, 3.0 * np.hypot(*self._across)])), NOTHING)
+        return ratio(less(along, np.array([0.0, 0.0, 3.0 * np.hypot(*self._across)])))
 
     def ideal_radius(self, measured_radius: ArrayLike) -> Array:
         """r' of r, both in px (paper, section 2); no check of the monotone radius."""
@@ -113,7 +121,7 @@ class Radial(Lens):
         """r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
         ideal = np.asarray(ideal_radius, dtype=float)
         with np.errstate(all="ignore"):
-            return invert_increasing(Ratio(self._polynomial, NOTHING), ideal.ravel()).reshape(ideal.shape)
+            return invert_increasing(ratio(self._polynomial), ideal.ravel()).reshape(ideal.shape)
 
     def _distort(self, rays: Array, phi: float) -> Array:
         profile, ideal = self._profile(phi), rays[:, :2] / ahead(rays)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder
 
-from ceres_cal.base import Array, Frozen, Mask, cached_property, grid_places, rms, two_digits
+from ceres_cal.base import Array, Mask, cached_property, grid_places, rms, two_digits
 from ceres_cal.kernels import NOTHING
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness, required_powers
-from ceres_cal.scene.lens.planar import Planar
+from ceres_cal.scene.lens.planar import Planar, Profile, along_pieces
 
 _GRID = COLUMNS, ROWS = 16, 12  # of a surface's nodes
 EXTENTS = ("wide", "high")
@@ -125,40 +126,19 @@ def bending() -> Array:
     return np.asarray(rows.T @ rows / (2.0 * INTERVALS))
 
 
-class Growth(Frozen):
-    """The profile u + G(u) in rims, of a lens that displaces by nothing else."""
-
-    lens: Spline
-    width: ClassVar[float] = 1.0 / INTERVALS
-    below: ClassVar[Array] = NOTHING
-
-    @cached_property
-    def pieces(self) -> Array:
-        """(intervals + 1, degree + 1) polynomials of the intervals, and the straight line beyond the last knot."""
-        each = np.append(np.zeros(2), np.array(self.lens.values[1 : 1 + COUNT]) / self.lens.rim_px)
-        own = np.array([each[j : j + DEGREE + 1] @ table for j, table in enumerate(pieces())])
-        own[:, 0] += np.arange(INTERVALS) / INTERVALS
-        own[:, 1] += 1.0 / INTERVALS
-        beyond = np.zeros(DEGREE + 1)
-        beyond[:2] = np.sum(own[-1]), own[-1] @ np.arange(DEGREE + 1)
-        return np.vstack([own, beyond])
-
-    def _at(self, x: Array, number: int) -> Array:
-        places = np.column_stack([x.ravel(), np.zeros(x.size)])
-        return np.asarray(self.lens.mapped(places)[0, number].reshape(x.shape))
-
-    def value(self, x: Array) -> Array:
-        """At x (N,) or one."""
-        return self._at(x, 0)
-
-    def slope(self, x: Array) -> Array:
-        """Its derivative at x (N,)."""
-        return self._at(x, 1)
-
-    @cached_property
-    def limit(self) -> float:
-        """Where it stops growing, `END` at most."""
-        return float(first_falls(self.slope)[0])
+def growing(coefficients: Array) -> Profile:
+    """The profile u + G(u) in rims, of the coefficients (count,) of G: the polynomials of the intervals, and a straight
+    line beyond the last knot; up to where it stops growing, `END` at most.
+    """
+    each, width = np.append(np.zeros(2), coefficients), 1.0 / INTERVALS
+    own = np.array([each[j : j + DEGREE + 1] @ table for j, table in enumerate(pieces())])
+    own[:, 0] += np.arange(INTERVALS) * width
+    own[:, 1] += width
+    beyond = np.zeros(DEGREE + 1)
+    beyond[:2] = np.sum(own[-1]), own[-1] @ np.arange(DEGREE + 1)
+    every = np.vstack([own, beyond])
+    slopes = polyder(every, axis=1)
+    return Profile(every, NOTHING, float(first_falls(partial(along_pieces, slopes, width))[0]), width)
 
 
 def first_falls(growth: Callable[[Array], Array], directions: int = 1) -> Array:
@@ -317,8 +297,8 @@ class Spline(Planar):
         return not any(value for name, value in self.coefficients.items() if name not in own)
 
     @cached_property
-    def _profile(self) -> Growth:
-        return Growth(self if self._is_round else Spline(self.values[: 1 + COUNT], ()))
+    def _profile(self) -> Profile:
+        return growing(np.array(self.values[1 : 1 + COUNT]) / self.rim_px)
 
     @property
     def _directions(self) -> Array:
