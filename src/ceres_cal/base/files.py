@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import fcntl
+import json
 import math
 import os
 import re
@@ -154,7 +155,7 @@ def parse_json(content: bytes, where: str) -> Any:
         raise InputError(f"{where}: not valid JSON (cut short?): it is empty")
     _require_few_marks(content, where)
     try:
-        data = _loads(content.decode("utf-8-sig"), parse_int=_whole)
+        data = json.loads(content.decode("utf-8-sig"), parse_int=_whole)
         if _SURROGATE.search(content):
             msgspec.json.encode(data)  # half a surrogate pair is no letter that could be written again
     except UnicodeDecodeError as error:
@@ -173,12 +174,6 @@ def _whole(text: str) -> int | float:
 
 
 _LONG_WHOLE = re.compile(rb"[:\[,]\s*-?\d{19}")  # which msgspec takes at any length, and plain data as `_whole` does
-
-
-def _loads(content: str | bytes, **options: Any) -> Any:
-    import json  # which most files do without
-
-    return json.loads(content, **options)
 
 
 def decode_json(
@@ -233,7 +228,7 @@ def _require_unique_keys(content: bytes, where: str) -> None:
                 objects.pop()
             else:
                 key = parts[number - 1].replace(b"\0", rb"\\").replace(b"\1", rb"\"")
-                name = _loads(b'"' + key + b'"') if b"\\" in key else key.decode()
+                name = json.loads(b'"' + key + b'"') if b"\\" in key else key.decode()
                 if name in objects[-1]:
                     raise InputError(f"{where}: {name!r} is given twice in one object: keep one of them")
                 objects[-1].add(name)
