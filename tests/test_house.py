@@ -40,7 +40,7 @@ FLOORS = {
 # Library: who may import it, at the top or inside a function.
 DOORS = {
     "pyceres": {"problem"},
-    "cv2": {"detect", "report", "formats"},
+    "cv2": {"detect", "report", "formats", "scene"},  # scene: what the markers of a printed board look like
     "pycolmap": {"start", "formats"},
     "matplotlib": {"report", "base"},  # base: for plot() of public objects
     "google": {"formats"},  # protobuf
