@@ -257,12 +257,9 @@ def known_of(seen: Explained) -> Calibration:
         settled = task.settle(seen.problem, seen.end, seen.explanations, task.progress)
         seen = replace(seen, end=settled.end)
     explanations = settled.explanations if settled else seen.explanations
-    effects = seen.effects
-    warnings = (
-        *(one.warning for one in explanations),
-        *(one.warning for one in effects if one.is_solved),
-        *misnamed(seen.as_built, seen.problem.observations.targets),
-    )
+    effects, of_targets = seen.effects, misnamed(seen.as_built, seen.problem.observations.targets)
+    solved_for = (one.warning for one in effects if one.is_solved)
+    warnings = (*(one.warning for one in explanations), *solved_for, *of_targets)
     posterior, alike, remarks = None, dict[str, bool](), tuple[str, ...]()
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)
