@@ -84,10 +84,10 @@ def calibrate(
 
             if apart := next(shifted(observations), None):
                 raise type(error)(f"{apart}: {error}") from None
-            words = _contradicted(observations, options)
-            if words is None:
+            free = _without_priors(observations, options)
+            if free is None:
                 raise type(error)(f"{error}{_others_can(error, observations, options)}", error.camera) from None
-            raise SolutionError(words) from None
+            return _from_there(free, observations, options)
 
 
 def _others_can(failure: CalibrationError, observations: Observations, options: Options) -> str:
@@ -303,12 +303,24 @@ def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Cali
 
 
 @or_none  # quiet: the caller raises the first failure
-def _contradicted(observations: Observations, options: Options) -> str | None:
-    """What a calibration without any priors contradicts; None where there are none, or it makes none either."""
+def _without_priors(observations: Observations, options: Options) -> Calibration | None:
+    """A calibration without any priors; None where there are none, or it makes none either."""
     if not (observations.priors or options.priors):
         return None
-    free = _calibrated(replace(observations, priors=()), replace(options, priors=()))
+    return _calibrated(replace(observations, priors=()), replace(options, priors=()))
+
+
+def _from_there(free: Calibration, observations: Observations, options: Options) -> Calibration:
+    """What agrees with what was stated from where the observations alone lead to.
+
+    Raises:
+        SolutionError: they contradict it, or nothing agrees from there either.
+    """
     stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior
     words = contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
-    return words or _OTHERWISE
+    start = Start(free.estimate, free.phi_from)
+    found = attempt(partial(_of_lens_asked, Task(), start, gather_sights(observations), options))  # reads: see above
+    if words or isinstance(found, CalibrationError):
+        raise SolutionError(words or _OTHERWISE) from None
+    return found.redrawn()

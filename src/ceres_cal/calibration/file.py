@@ -45,8 +45,8 @@ _NOT_THE_BEST = (
     "standard errors worse, and its map may be off by more than is stated: name another lens (--lens)"
 )
 _NOT_CHOSEN = (
-    "no lens could be chosen ({}), and {} was taken: what is stated holds only if the camera has it: name its lens "
-    "(--lens)"
+    "no lens could be chosen ({}), and {} was taken: what is stated counts no lens with more coefficients: name the "
+    "camera's (--lens)"
 )
 
 
@@ -86,7 +86,7 @@ class LensChoice(Frozen, eq=True):
     def words(self) -> str:
         """In a line."""
         if not self.groups:
-            return f"{self.chosen}, the paper's: {self.tried[0].failed or TOO_FEW}"
+            return f"{self.chosen}, not compared by what it predicts: {self.tried[0].failed or TOO_FEW}"
         others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
         if not others or self.tried[0].rms_px is None:
             return f"{self.chosen}, the only one that can be calibrated"

@@ -37,6 +37,7 @@ from ceres_cal.calibration.lens_forms import (
     pseudo_bma,
     standard_errors,
 )
+from ceres_cal.calibration.lens_of_few import likeliest_of_few, others_of_few
 from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
@@ -54,13 +55,14 @@ class Chosen(Frozen):
     """The lens that was chosen for a camera: options with it, where to start from, and what it was compared with.
 
     Attributes:
-        among: the lenses it was chosen from; None where nothing could be compared.
+        among: the lenses it was chosen from; None where nothing could be compared. untold: by these observations.
     """
 
     options: Options
     start: Start
     choice: LensChoice
     among: Comparison | None = None
+    untold: Observations | None = None
 
     def otherwise(self, failure: str, options: Options, start: Start) -> Chosen | None:
         """Where all of the observations make no calibration with it, the best lens of another kind, or at last the
@@ -84,10 +86,13 @@ class Chosen(Frozen):
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
 
-    def others(self, posterior: Posterior, options: Options) -> OtherLenses:
+    def others(self, posterior: Posterior, end: Estimate, options: Options) -> OtherLenses:
         """What other lenses would say, as far as they are probable, see `Comparison.others`."""
-        none = OtherLenses(self.start.estimate, (), (), {})
-        return none if self.among is None else self.among.others(posterior, options)
+        if self.among is not None:
+            return self.among.others(posterior, options)
+        if self.untold is not None:
+            return others_of_few(self.untold, self.choice.chosen, options, end)
+        return OtherLenses(self.start.estimate, (), (), {})
 
 
 class Comparison(Frozen):
@@ -229,12 +234,7 @@ class Comparison(Frozen):
     @property
     def outcome(self) -> Chosen:
         """The options with the lens that was chosen, and where to start from."""
-        there, form, start = self.there, self.chosen.form, self.start
-        placements = Poses.of(start.estimate.placements)
-        placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
-        others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # with a plainer lens so far
-        start = replace(start, estimate=replace(there, placements=placements), is_near=True, others=others)
-        return Chosen(form.of(self.seen.options), start, _choice(self), self)
+        return Chosen(self.chosen.form.of(self.seen.options), _moved_to(self.there, self.start), _choice(self), self)
 
     def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float], *, is_alone: bool) -> Chosen | None:
         """The lens in place of the chosen one, where others explain what it takes out of the observations; None where
@@ -266,6 +266,14 @@ class Comparison(Frozen):
         return _compared(self.seen, self.share, self.as_good, self.start, others)
 
 
+def _moved_to(there: Estimate, start: Start) -> Start:
+    """The start with what was solved for of it."""
+    placements = Poses.of(start.estimate.placements)
+    placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
+    others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # with a plainer lens so far
+    return replace(start, estimate=replace(there, placements=placements), is_near=True, others=others)
+
+
 def choose_lens(
     observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN, *, by_most: bool = False
 ) -> Chosen:
@@ -285,8 +293,21 @@ def choose_lens(
 
     chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
     if isinstance(chosen, CalibrationError):
-        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=str(chosen)),), 0, 0.0))
+        return _of_few(observations, by_themselves, start, str(chosen))
     return chosen
+
+
+def _of_few(observations: Observations, options: Options, start: Start, failure: str) -> Chosen:
+    """The paper's lens, or one of another kind that is far likelier, where lenses cannot be compared."""
+
+    def untold(label: str) -> LensChoice:
+        return LensChoice(label, (TriedLens(label, 2, failed=failure),), 0, 0.0)
+
+    likeliest = likeliest_of_few(observations, options, start.estimate)
+    if likeliest is None:
+        return Chosen(papers(options), start, untold(PAPER), untold=observations)
+    form, there = likeliest
+    return Chosen(form.of(options), _moved_to(there, start), untold(form.label), untold=observations)
 
 
 def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:

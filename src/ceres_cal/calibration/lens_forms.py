@@ -124,6 +124,18 @@ def kinds() -> Iterator[tuple[Form, ...]]:
     return (forms_of(kind) for kind, lens in LENSES.items() if not lens.set_at_start)
 
 
+def undecentred() -> list[Form]:
+    """The paper's lens, and one of each other kind with as many coefficients and no decentring."""
+    of_paper = Options(lens="radial", powers=PAPERS_POWERS)
+    others = [Options(lens=forms[0].lens) for forms in kinds() if forms[0].lens != of_paper.lens]
+    count = len(PAPERS_POWERS)
+    short = [
+        replace(one, coefficients=tuple(n for n in one.blank_lens.names if n not in one.blank_lens.tangential)[:count])
+        for one in others
+    ]
+    return [Form.among(one) for one in (of_paper, *short)]
+
+
 def without_formula(*, of_one_view: bool) -> Iterator[tuple[Form, ...]]:
     """The lenses of all other kinds.
 
@@ -176,7 +188,7 @@ def decide(
     """
     known = {i: one for i, one in enumerate(squares) if one is not None}
     if not known:
-        raise DegenerateError("no lens can be calibrated: check labels and target dimensions")
+        raise DegenerateError("each of them folds or cannot be solved for: check labels and dimensions")
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
     least = {sizes[i]: min(totals[j] for j in totals if sizes[j] == sizes[i]) for i in totals}

@@ -227,7 +227,7 @@ _NEAR = 4.0
 _KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
 
 
-def _found(solution: Solution) -> Solution:
+def found(solution: Solution) -> Solution:
     """A solve that came to an end; DegenerateError of one that did not."""
     if solution.failed:
         raise DegenerateError(f"cannot be solved for: {solution.termination}")
@@ -284,7 +284,7 @@ class InlierRows(Frozen):
                 solution = solve(problem, estimate, precision=_PRECISION, is_near=False)
                 if solution.failed:
                     self._shown(estimate)  # where that is why, its own words are said
-                estimate = _found(solution).estimate
+                estimate = found(solution).estimate
             return self._near_best(forms, problem, estimate)
 
         return _or_failed(near_best, forms, start)
@@ -360,7 +360,7 @@ class InlierRows(Frozen):
         problem = self._problem(options, start, candidate.of.smoothness)
         if held is not None:
             problem = problem.holding(held.owner, intrinsic_names(start.cameras[held.owner].lens).index(held.quantity))
-        solution = _found(solve(problem, start, precision=at_best, posed=at_best))
+        solution = found(solve(problem, start, precision=at_best, posed=at_best))
         if as_promised and 2.0 * solution.cost > self._kept(candidate):
             raise DegenerateError("is not at its best where normal equations have it")
         return solution

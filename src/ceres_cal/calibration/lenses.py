@@ -122,7 +122,7 @@ class ChosenLenses(Frozen):
         which these options hold numbers.
         """
         floors = {key.station for key in self.sights.keys if key.placement is None}
-        return together([one.others(posterior, options) for one in self.each.values()], floors, end)
+        return together([one.others(posterior, end, options) for one in self.each.values()], floors, end)
 
     def _with(self, others: Mapping[str, Chosen]) -> ChosenLenses:
         return replace(self, each={**self.each, **others})

@@ -1,0 +1,62 @@
+"""Lenses of observations too few to compare them by what they predict: by what each leaves, with as many coefficients.
+
+Six corners of a wide picture, with the paper's lens alone, knew its principal point to 3 px and had it 5.5 standard
+deviations off.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from ceres_cal.base import CalibrationError, attempt
+from ceres_cal.calibration.lens_forms import PAPER, Form, undecentred
+from ceres_cal.calibration.lens_seen import found, profiles_of, seen_through
+from ceres_cal.observations import Observations, gather_sights
+from ceres_cal.posterior.other_lenses import OtherLenses
+from ceres_cal.problem import Estimate, Options, Solution, problem_of, solve
+
+# Natural logarithm of how much likelier another kind must be than the paper's: strong evidence (Kass and Raftery,
+# Journal of the American Statistical Association 90, 1995).
+_STRONG = 3.0
+
+
+def likeliest_of_few(observations: Observations, options: Options, near: Estimate) -> tuple[Form, Estimate] | None:
+    """The kind that is far likelier than the paper's lens, and the estimate with it; None where none is."""
+    each = _with_each_kind(observations, options, near)
+    least = min((end.cost for end in each.values()), default=np.inf)
+    form, end = next((one for one in each.items() if one[1].cost < least + _STRONG), (None, None))
+    return None if form is None or end is None or form.label == PAPER else (form, end.estimate)
+
+
+def others_of_few(observations: Observations, label: str, options: Options, near: Estimate) -> OtherLenses:
+    """What they say with the other kinds, each as probable as what it leaves beside the lens of that label."""
+    each = {form.label: end for form, end in _with_each_kind(observations, options, near).items()}
+    own = each.pop(label, None)
+    if own is None:
+        return OtherLenses(near, (), (), {})
+    likely = np.exp([own.cost - end.cost for end in each.values()])
+    weights = tuple((likely / (1.0 + likely.sum())).tolist())
+    reach_px = {name: one.reach_px for name, one in profiles_of(near, gather_sights(observations)).items()}
+    return OtherLenses(own.estimate, tuple(end.estimate for end in each.values()), weights, reach_px)
+
+
+def _with_each_kind(observations: Observations, options: Options, near: Estimate) -> dict[Form, Solution]:
+    """The paper's lens and one of each other kind, solved for; none of many observations, whose lenses could not be
+    compared for another reason.
+    """
+    few = 1_000
+    if observations.rows > few:
+        return {}
+    sights = gather_sights(observations)
+    profiles = profiles_of(near, sights)
+
+    def solved(form: Form) -> Solution:
+        own = form.of(options)
+        there = seen_through(near, own, profiles)
+        return found(solve(problem_of(sights, own, there), there, is_near=False))
+
+    # quiet: a lens that cannot be solved for says nothing
+    ends = {form: attempt(partial(solved, form)) for form in undecentred()}
+    return {form: end for form, end in ends.items() if not isinstance(end, CalibrationError)}
