@@ -144,7 +144,12 @@ def _measured(observations: Observations, options: Options, progress: SolveProgr
         if float(np.max(np.abs(moved), initial=0.0)) < redrawn and noise == calibration.fit.of_cameras:
             break
         observations = calibration.as_taken(observations).at_noise(noise)
-    return calibration
+    if not calibration.aspects_alone or is_bulk(observations):
+        return calibration
+    from ceres_cal.calibration.stretched import beside_stretched
+
+    stretched = partial(_measured, observations, replace(options, free_aspect=True), progress, client)
+    return beside_stretched(calibration, observations, stretched)
 
 
 def _of_same_moments(calibration: Calibration, observations: Observations) -> Calibration:

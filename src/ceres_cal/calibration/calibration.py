@@ -68,6 +68,8 @@ class Calibration(Frozen):
         as_built: what of the targets is not where it is drawn, and was solved for under the sigmas that the data show;
             these are in the options' tolerances.
         effects: what else displaces the observations, and was solved for.
+        aspects_alone: camera -> fy / fx and its standard deviation by the observations alone, where it is 1 by what is
+            usual; in no file.
         notes: whatever somebody wants to keep with it, plain data.
     """
 
@@ -92,6 +94,7 @@ class Calibration(Frozen):
     effects: tuple[EffectEstimate, ...] = ()
     remarks: tuple[str, ...] = ()
     ambiguities: tuple[str, ...] = ()
+    aspects_alone: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -108,10 +108,13 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
                 yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
 
 
-def unusual_pixels(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
+def unusual_pixels(end: RobustSolution, problem: Problem, alone: Mapping[str, tuple[float, float]]) -> Iterator[str]:
     """Words about cameras whose pixels come out far from square, where only targets of the world tell so: a length that
     is not the target's looks the same. A board that is turned from view to view would contradict it. And about those
     whose pixels are square by what is usual of cameras alone.
+
+    Args:
+        alone: see `aspects_alone`.
     """
     unusual = 0.007  # of fy / fx: of the public cameras tried it is up to 0.006 off
     surely = 2.5  # standard deviations: 2.9 to 9.5 of pictures stretched by 5 to 7 %, 1.9 at most of thirty others
@@ -123,15 +126,19 @@ def unusual_pixels(end: RobustSolution, problem: Problem, posterior: Posterior) 
         if abs(camera.aspect - 1.0) > unusual:
             yield _OBLONG.format(name, camera.aspect, two_digits(100.0 * abs(camera.aspect - 1.0)))
             continue
-        value, sd = _aspect_by_itself(name, end, problem, posterior)
+        value, sd = alone.get(name, (1.0, np.inf))
         if abs(value - 1.0) > max(unusual, surely * sd):
             yield _SQUARED.format(name, value, sd)
 
 
-def _aspect_by_itself(camera: str, end: RobustSolution, problem: Problem, posterior: Posterior) -> tuple[float, float]:
-    """fy / fx by the observations alone, to first order, and its standard deviation: infinite where nobody asks."""
+def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -> dict[str, tuple[float, float]]:
+    """Camera -> fy / fx by the observations alone, to first order, and its standard deviation; of cameras that show the
+    world alone, and whose pixels are square by what is usual.
+    """
+    found = dict[str, tuple[float, float]]()
+    turned = {view.camera for view in problem.observations.views if view.placement is not None}
     for prior in problem.priors_at(end.estimate):
-        keys = [key for key in prior.keys if prior.is_usual and key.owner == camera and key.quantity == "aspect"]
+        keys = [key for key in prior.keys if prior.is_usual and key.quantity == "aspect" and key.owner not in turned]
         if not keys or end.reduced is None:
             continue
         own, off = prior.information.given(keys), prior.offsets(end.estimate)[prior.information.columns(keys)]
@@ -139,9 +146,10 @@ def _aspect_by_itself(camera: str, end: RobustSolution, problem: Problem, poster
         # What errors that go together, or other lenses, widen beyond what is usual cannot be told without it.
         sds = [sd for one in known if np.isfinite(sd := float(one.spread.sd[one.columns(keys)][0]))]
         if sds:
+            camera = keys[0].owner
             value = end.estimate.cameras[camera].aspect + sds[0] ** 2 * float(own.matrix[0, 0] * off[0])
-            return value, max(sds)
-    return 1.0, np.inf
+            found[camera] = value, max(sds)
+    return found
 
 
 def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ceres_cal.base import Array, Frozen, Mask, attempt, cached_property, meanwhile, replace
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
+    aspects_alone,
     came_out,
     noisier_cameras,
     of_all,
@@ -260,13 +261,14 @@ def known_of(seen: Explained) -> Calibration:
     effects, of_targets = seen.effects, misnamed(seen.as_built, seen.problem.observations.targets)
     solved_for = (one.warning for one in effects if one.is_solved)
     warnings = (*(one.warning for one in explanations), *solved_for, *of_targets)
-    posterior, alike, remarks = None, dict[str, bool](), tuple[str, ...]()
+    posterior, alike, alone, remarks = None, dict[str, bool](), dict[str, tuple[float, float]](), tuple[str, ...]()
     if task.tested and task.knows:
         seen, posterior = _known(seen, conflicts)
         of_world = seen.problem.sights.of_world
         alike = dict(seen_alike(seen.others, seen.end.estimate, of_world, posterior.half_width))
+        alone = aspects_alone(seen.end, seen.problem, posterior)
         strange = (
-            *unusual_pixels(seen.end, seen.problem, posterior),
+            *unusual_pixels(seen.end, seen.problem, alone),
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
@@ -281,7 +283,7 @@ def known_of(seen: Explained) -> Calibration:
     calibration = replace(calibration, remarks=(*calibration.remarks, *remarks), ambiguities=apart)
     tolerances = {**seen.problem.options.tolerances, **tolerances_of(seen.as_built)}
     options = replace(seen.problem.options, tolerances=tolerances)
-    return replace(calibration, options=options, as_built=seen.as_built, effects=effects)
+    return replace(calibration, options=options, as_built=seen.as_built, effects=effects, aspects_alone=alone)
 
 
 def _made_steady(first: Explained, problem: Problem) -> Explained | None:

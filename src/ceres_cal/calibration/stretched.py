@@ -1,0 +1,55 @@
+"""Pictures that were stretched one way: what a camera whose pixels are square by what is usual alone may be instead.
+
+A view of a field tells fy / fx to a hundredth, beside its tilt and middle; that pixels are square is known to .0005 of
+cameras, but some pictures were stretched. From 1 the solve does not come to another aspect: what is usual holds it
+there up to some 13 standard deviations. So the calibration with any aspect is made as well, where that is likely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ceres_cal.base import CalibrationError, attempt, replace
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.lens_seen import profiles_of
+from ceres_cal.observations import Observations, gather_sights
+from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
+
+# Of pictures, the share that was stretched one way, and the standard deviation of by how much.
+_STRETCHED, _BY = 0.01, 0.05
+_LEAST = 0.02  # probability that makes a difference to what is stated
+
+
+def beside_stretched(
+    square: Calibration, observations: Observations, with_any_aspect: Callable[[], Calibration]
+) -> Calibration:
+    """The likelier one of a calibration of one camera with square pixels and of that with any, the other in what is
+    known of it as far as it is probable.
+    """
+    likely = _probability(square)
+    if likely < _LEAST or square.posterior is None:
+        return square
+    any_ = attempt(with_any_aspect)  # quiet: the warning says what the observations alone say
+    if isinstance(any_, CalibrationError) or any_.posterior is None:
+        return square
+    one, other, weight = (any_, square, 1.0 - likely) if likely > 0.5 else (square, any_, likely)
+    if weight < _LEAST or one.posterior is None:
+        return one
+    profiles = profiles_of(one.estimate, gather_sights(observations))
+    reach_px = {name: profile.reach_px for name, profile in profiles.items()}
+    also, followed = OtherLenses(one.estimate, (other.estimate,), (weight,), reach_px), one.posterior.followed_phi
+    keys = [key for key in one.posterior.keys if key.kind in ("camera", "station") and key not in followed]
+    shift = shifts_to_lenses(also, keys, [one.estimate])[0]
+    return replace(one, posterior=one.posterior.with_alternatives(keys, shift, [weight]))
+
+
+def _probability(square: Calibration) -> float:
+    """That its pictures were stretched: by how much likelier the observations are with any aspect."""
+    if len(square.estimate.cameras) != 1 or not square.aspects_alone:
+        return 0.0
+    ((value, sd),) = square.aspects_alone.values()
+    times = _STRETCHED / (1.0 - _STRETCHED) * sd / np.hypot(sd, _BY)
+    odds = times * np.exp(0.5 * (value - 1.0) ** 2 * (1.0 / sd**2 - 1.0 / (sd**2 + _BY**2)))
+    return float(odds / (1.0 + odds)) if np.isfinite(odds) else 1.0

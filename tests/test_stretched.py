@@ -1,0 +1,83 @@
+"""Pictures that were stretched one way, of a field alone: by formulas of OpenCV's, without a word from anybody."""
+
+import cv2
+import numpy as np
+import pytest
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.observations import Observations
+from ceres_cal.scene.curves import Segment
+from ceres_cal.scene.targets import ssl_field
+
+_CAMERAS = {  # phi, middle, k1 k2, turn, place
+    "tilted": (1197.2, (644.7, 505.6), (-0.1405, 0.0052), (-2.9379, -0.0406, 0.7903), (1.116, 1.121, 3.1)),
+    "about straight down": (664.5, (634.0, 507.4), (-0.0702, 0.0008), (-2.977, -0.0054, 0.0658), (-1.23, 0.387, 4.692)),
+}
+_SIZE = (1280, 1024)
+
+
+class _Stretched:
+    """A camera above a division B field whose fy is not its fx."""
+
+    def __init__(self, camera: str, aspect: float) -> None:
+        phi, (x, y), (k1, k2), turn, place = _CAMERAS[camera]
+        self.matrix = np.array([[phi, 0.0, x], [0.0, aspect * phi, y], [0.0, 0.0, 1.0]])
+        self.lens, self.turn = np.array([k1, k2, 0.0, 0.0, 0.0]), np.array(turn)
+        self.shift = -cv2.Rodrigues(self.turn)[0] @ np.array(place)
+
+    def shown(self, places: Array) -> Array:
+        """Pixels (N, 2), NaN outside the picture, and where the lens folds."""
+        pixels = np.array(cv2.projectPoints(places, self.turn, self.shift, self.matrix, self.lens)[0], dtype=float)
+        flat = pixels.reshape(-1, 2)
+        rays = places @ cv2.Rodrigues(self.turn)[0].T + self.shift
+        unfolded = np.hypot(rays[:, 0], rays[:, 1]) < rays[:, 2]
+        inside = np.all((flat > 2.0) & (flat < np.array(_SIZE) - 3.0), axis=1) & unfolded
+        return np.where(inside[:, None], flat, np.nan)
+
+    def seen(self, seed: int) -> Observations:
+        """Corners and places on lines, to .15 px."""
+        field, rng = ssl_field("B"), np.random.default_rng(seed)
+        corners = self.shown(field.point_array)
+        corners += rng.normal(0.0, 0.15, corners.shape)
+        lines = {}
+        for name, curve in field.curves.items():
+            if isinstance(curve, Segment):
+                start, end = np.array(curve.start), np.array(curve.end)
+                pixels = self.shown(start + rng.uniform(0.0, 1.0, 40)[:, None] * (end - start))
+                pixels = pixels[np.isfinite(pixels[:, 0])]
+                if len(pixels) > 3:
+                    lines[name] = pixels + rng.normal(0.0, 0.15, pixels.shape)
+        points = Observations.from_points(corners, field, _SIZE, sigma_px=0.15)
+        return points + Observations.from_curves(lines, field, _SIZE, sigma_px=0.15)
+
+
+def _off_over_stated(calibration: Calibration, camera: _Stretched) -> float:
+    """The farthest of places over the field, .15 m above it, over its 95 % radius."""
+    x, y = np.meshgrid(np.linspace(-4.0, 4.0, 9), np.linspace(-2.5, 2.5, 6))
+    places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.15)])
+    pixels = camera.shown(places)
+    inside = np.isfinite(pixels[:, 0])
+    known = calibration.uncertainty.located(pixels[inside], 0.15)
+    return float(np.max(np.linalg.norm(known.located - places[inside, :2], axis=1) / known.radius_95_m))
+
+
+@pytest.mark.parametrize(("name", "aspect"), [("tilted", 1.0263), ("about straight down", 0.971)])
+def test_a_stretched_picture_is_one_by_itself(name: str, aspect: float) -> None:
+    """It was taken for square, to .0005, at 5 standard deviations of the observations; robot height 20 radii off."""
+    camera = _Stretched(name, aspect)
+    calibration = calibrate(camera.seen(3))
+    known = calibration.uncertainty.verdict("camera", "camera", "aspect")
+    assert _off_over_stated(calibration, camera) < 1.5  # .50 and .32
+    assert known.low < aspect < known.high
+    assert any("fy / fx" in words for words in calibration.warnings)
+
+
+@pytest.mark.parametrize("name", _CAMERAS)
+def test_square_pixels_stay_square(name: str) -> None:
+    camera = _Stretched(name, 1.0)
+    calibration = calibrate(camera.seen(4))
+    assert abs(calibration.station().aspect - 1.0) < 1e-3
+    assert calibration.uncertainty.verdict("camera", "camera", "aspect").sd < 1e-3
+    assert _off_over_stated(calibration, camera) < 1.5  # .82 and .20
