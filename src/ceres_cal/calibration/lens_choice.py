@@ -37,7 +37,6 @@ from ceres_cal.calibration.lens_forms import (
     pseudo_bma,
     standard_errors,
 )
-from ceres_cal.calibration.lens_of_few import likeliest_of_few, others_of_few
 from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
@@ -91,6 +90,8 @@ class Chosen(Frozen):
         if self.among is not None:
             return self.among.others(posterior, options)
         if self.untold is not None:
+            from ceres_cal.calibration.lens_of_few import others_of_few
+
             return others_of_few(self.untold, self.choice.chosen, options, end)
         return OtherLenses(self.start.estimate, (), (), {})
 
@@ -299,6 +300,7 @@ def choose_lens(
 
 def _of_few(observations: Observations, options: Options, start: Start, failure: str) -> Chosen:
     """The paper's lens, or one of another kind that is far likelier, where lenses cannot be compared."""
+    from ceres_cal.calibration.lens_of_few import likeliest_of_few
 
     def untold(label: str) -> LensChoice:
         return LensChoice(label, (TriedLens(label, 2, failed=failure),), 0, 0.0)
