@@ -110,7 +110,7 @@ def test_poses_that_a_bad_start_decided_are_tried_again() -> None:
     assert accuracy.mirrored_count(calibration, simulation.observations, rotations) == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_no_pose_is_mirrored_before_a_wide_lens(seed: int) -> None:
     problem = wide_lens(200, seed)
     observations = corner_observations(problem.corners)

@@ -64,10 +64,10 @@ def test_two_lines_accuse_no_camera_that_stands_still(calibration: Calibration) 
         assert check(calibration, few)["overhead"].probability > 1e-4  # 1.4e-4; 4 of 20 were below 1e-7, two of them 0
 
 
-def test_small_moves_are_found() -> None:
-    for seed in range(5):
-        assert not checked(KINDS[0], seed, seed, SMALL_TILT).holds
-        assert not checked(KINDS[0], seed, seed, SMALL_SHIFT).holds
+@pytest.mark.parametrize("seed", partly(range(5), [0]))
+def test_small_moves_are_found(seed: int) -> None:
+    assert not checked(KINDS[0], seed, seed, SMALL_TILT).holds
+    assert not checked(KINDS[0], seed, seed, SMALL_SHIFT).holds
 
 
 def test_more_checks_share_the_false_alarms(calibration: Calibration) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenery import BoardRanges, board_scene, field_scene, overhead_pose
+from thorough import partly
 
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.calibration.calibrating import calibrate
@@ -71,7 +72,7 @@ def test_mirrored_poses_are_mended(seed: int) -> None:
     assert none == 0 and again.placements.keys() == estimate.placements.keys()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_no_view_ends_mirrored_from_a_cold_start(seed: int) -> None:
     scene, observations = small_boards(seed, count=100)
     calibration = calibrate(observations, OPTIONS)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scenery import field_scene, overhead_pose
 from scenes import RADIAL, SCENES, camera
+from thorough import partly
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
@@ -148,7 +149,7 @@ def test_what_is_seen_lies_behind() -> None:
         judged(square(0.0), turned_upwards(2.0))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_swapped_axes_are_refused_where_the_start_holds_no_mirrored_picture(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenery import board_scene, field_scene, join, overhead_pose
+from thorough import partly
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -84,7 +85,7 @@ def left_over(errors: dict[str, float]) -> Array:
     return np.asarray(values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", partly(range(3), [0]))
 def test_painted_offsets_come_back(seed: int) -> None:
     offsets, observations = from_six_stations(seed)
     calibration = calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.01)}))

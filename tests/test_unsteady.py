@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from accuracy.as_built import CAMERAS, Board, observed
 from photos.held_out import left_px
+from thorough import partly
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -104,7 +105,7 @@ def test_principal_points_that_move_are_found_and_named(moving: list[tuple[Obser
         assert not calibration.outliers
 
 
-@pytest.mark.parametrize("seed", [1, 11])
+@pytest.mark.parametrize("seed", partly([1, 11], [11]))
 def test_rays_that_do_not_meet_in_one_point_are_no_principal_point_that_moves(seed: int) -> None:
     """What was taken off for it, or for a rolling shutter, was the lens's: other views were predicted to 0.31, 0.92."""
     known, new = through_a_moving_pupil(seed, 10), through_a_moving_pupil(100 + seed, 12)
