@@ -138,7 +138,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.noise", "_TAIL", "calibrate"),
     *_of("problem.priors", "_USUAL_ASPECT USUAL_DECENTRING", "calibrate", "verdicts"),
     *_of("robust.as_built", "_UNMEASURED", "calibrate"),
-    *_of("robust.other_points", "_NOT_BUILT", "calibrate", "diagnose"),
+    *_of("robust.usable", "_NOT_BUILT", "calibrate", "diagnose"),
     *_of("effects.aside", "FEWEST_VIEWS", "calibrate"),
     *_of("robust.other_minima", "FEW _APART", "calibrate"),
     *_of("robust.usable", "_UNFILLED _UNUSUAL", "calibrate"),

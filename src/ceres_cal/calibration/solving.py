@@ -48,10 +48,9 @@ from ceres_cal.robust.as_built import (
 from ceres_cal.robust.competing import Solver, Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
-from ceres_cal.robust.other_points import misnamed
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.unsteady import Unsteady, find_unsteady
-from ceres_cal.robust.usable import all_shown, require_fits, require_possible, require_usable
+from ceres_cal.robust.usable import all_shown, misnamed, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
 

@@ -18,7 +18,7 @@ from ceres_cal.effects import Amount, AsBuilt, Case, EffectEstimate, Finding, Li
 from ceres_cal.effects.table.targets import feature_of
 from ceres_cal.problem.structure import numbers_by_kind
 from ceres_cal.robust.noise import LARGER, Inliers
-from ceres_cal.robust.other_points import is_another
+from ceres_cal.robust.usable import is_another
 from ceres_cal.scene.curves import nearest_on_track
 
 # Pairs of neighbours: the correlation of 20 is known to 0.2. Nothing changes from half to double.
