@@ -95,6 +95,7 @@ def test_it_counts_among_the_tests_and_is_silent_on_sound_data(monkeypatch: pyte
     assert diagnose(calibrate(sound, RADIAL), sound).tests == diagnosis.tests - 1
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_it_is_in_the_command_s_answer_and_in_the_report(
     calibration: Calibration, swayed: Observations, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

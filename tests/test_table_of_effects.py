@@ -114,6 +114,7 @@ def test_it_widens(calibration: Calibration) -> None:
     assert np.all(sds[0] > 0.99 * sds[1]) and np.max(sds[0] / sds[1]) > 1.1
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_it_is_diagnosed_and_reported(calibration: Calibration, swayed: Observations, tmp_path: Path) -> None:
     assert any("its rows of pixels sway by" in words and "solved for" in words for words in calibration.warnings)
     diagnosis = diagnose(calibration, swayed)
