@@ -85,14 +85,16 @@ def solve_as_built(
     solver: Solver,
     built: Built,
     views: OfViews | None = None,
+    left_out: frozenset[tuple[str, Kind]] = frozenset(),
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
     """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
 
     Args:
         problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
             drawn as `built`. solver: of some of the observations, see `compete`. views: what was taken off.
+        left_out: targets and kinds that are as drawn.
     """
-    observations, options, stated = problem.observations, problem.options, end.estimate.structure
+    observations, options, stated, first = problem.observations, problem.options, end.estimate.structure, end
 
     def solved(there: Built) -> RobustSolution:
         held = taking_part(_held(problem, there), explanations)
@@ -103,12 +105,7 @@ def solve_as_built(
         structure = make_structure(observations.targets, tolerances, options.dimensions)
         return structure.carrying(there.whole, end.estimate.structure)
 
-    drawn = _freed(end, problem, freed(built)) if built.every else end
-    now, told, left_out = estimate_as_built(problem, drawn), dict[tuple[str, Kind], float](), frozenset[Any]()
-    while any((one.target, one.kind) not in told for one in now.every):
-        told |= {(one.target, one.kind): one.probability for one in _beside_views(now.every, drawn, stated, views)}
-        if left_out := frozenset(of for of, probability in told.items() if probability < LIKELY):
-            now = estimate_as_built(problem, drawn, left_out)
+    now = estimate_as_built(problem, _freed(end, problem, freed(built)) if built.every else end, left_out)
     if not now.every:
         if built.every:
             end, explanations = compete(problem, solved(now), solver)
@@ -121,15 +118,22 @@ def solve_as_built(
         if change > 1.0:
             before, rounds = now, rounds + 1
             end = solved(before)
-    structure = freed(before)
-    every = [replace(one, probability=told.get((one.target, one.kind), one.probability)) for one in before.every]
+    every, structure = before.every, freed(before)
     as_built = replace(problem, priors=gather_priors(observations, options, structure))
+    held, asked, measured = end, taking_part(as_built, explanations), None
+    if views is not None:
+        measured = _as_measured(asked, end, structure)
+        every = tuple(_beside_views(every, measured, stated, views))
+        if unlikely := frozenset((one.target, one.kind) for one in every if one.probability < LIKELY):
+            return solve_as_built(problem, first, explanations, solver, built, views, left_out | unlikely)
     if _change(before, built) > 1.0:
         end, explanations = compete(_held(problem, before), end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     part, problem = taking_part(as_built, explanations), as_built
     if _is_held(every, problem):
-        end = _as_measured(part, end, structure)
+        if measured is None or end is not held or part is not asked:
+            measured = _as_measured(part, end, structure)
+        end = measured
     else:
         end = solve_robustly(part, replace(end.estimate, structure=structure), is_near=True)
     end, structure = end.moved_to(end.estimate, problem), end.estimate.structure
@@ -160,16 +164,13 @@ def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) ->
 
 
 def _beside_views(
-    every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: OfViews | None
+    every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: OfViews
 ) -> Iterator[AsBuilt]:
     """The same as probable as they are where single views may be displaced otherwise, too.
 
     What was taken off of these followed what was solved for with it, and would say it again: halves of a set found
     a board of which pictures have a rolling shutter .4 % longer and .9 % shorter, each at a probability of 1.
     """
-    if views is None or not every:
-        yield from every
-        return
     most_sights = 40  # of a camera: each has numbers of its own
     targets = end.problem.observations.targets
     structure = whole_structure(targets, {one.target for one in every if one.kind == "heights"})
