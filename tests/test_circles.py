@@ -146,6 +146,7 @@ def test_as_typed(say: Say, tmp_path: Path) -> None:
     assert "--diameter" in refused(say(*detect, "--circles", 0.03))
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_run_takes_a_board_of_circles(say: Say, tmp_path: Path) -> None:
     """It was refused as a field without painted curves, whose remedy takes chessboards alone."""
     board, pictures = circle_grid(7, 5, 0.03, 0.02), tmp_path / "pictures"

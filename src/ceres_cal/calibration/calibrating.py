@@ -77,6 +77,7 @@ def calibrate(
     with for_small_matrices(), at_most(options.threads):
         try:
             return _measured(observations, options, progress, client)
+        # quiet: what agrees with all that was stated is an answer, wherever the search for it began
         except (DegenerateError, SolutionError) as error:
             if odd := next(unfilled(observations), None):
                 raise type(error)(f"{error}; {odd}") from None
@@ -325,7 +326,8 @@ def _from_there(free: Calibration, observations: Observations, options: Options)
     posterior = free.uncertainty.posterior
     words = contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
     start = Start(free.estimate, free.phi_from)
-    found = attempt(partial(_of_lens_asked, Task(), start, gather_sights(observations), options))  # reads: see above
+    # reads: "no calibration agrees with what was stated beforehand, though ..."
+    found = attempt(partial(_of_lens_asked, Task(), start, gather_sights(observations), options))
     if words or isinstance(found, CalibrationError):
         raise SolutionError(words or _OTHERWISE) from None
     return found.redrawn()

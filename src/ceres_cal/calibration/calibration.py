@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
     *("phi_from", "warnings", "remarks", "ambiguities", "digest", "versions", "conflicts", "lens_choices", "as_built"),
-    "effects",
+    *("effects", "aspects_alone"),
 )
 """What the file has as it is."""
 
@@ -69,7 +69,7 @@ class Calibration(Frozen):
             these are in the options' tolerances.
         effects: what else displaces the observations, and was solved for.
         aspects_alone: camera -> fy / fx and its standard deviation by the observations alone, where it is 1 by what is
-            usual; in no file.
+            usual.
         notes: whatever somebody wants to keep with it, plain data.
     """
 

@@ -280,6 +280,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     refitted: Refitted[PriorFile] | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choices: dict[str, LensChoice] = {}
+    aspects_alone: dict[str, tuple[float, float]] = {}
     lens_choice: LensChoice | msgspec.UnsetType | None = msgspec.UNSET
     as_built: tuple[AsBuilt, ...] = ()
     effects: tuple[EffectEstimate, ...] = ()
