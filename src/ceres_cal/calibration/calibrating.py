@@ -325,9 +325,11 @@ def _from_there(free: Calibration, observations: Observations, options: Options)
     stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior
     words = contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
+    if words:
+        raise SolutionError(words) from None
     start = Start(free.estimate, free.phi_from)
     # reads: "no calibration agrees with what was stated beforehand, though ..."
     found = attempt(partial(_of_lens_asked, Task(), start, gather_sights(observations), options))
-    if words or isinstance(found, CalibrationError):
-        raise SolutionError(words or _OTHERWISE) from None
+    if isinstance(found, CalibrationError):
+        raise SolutionError(_OTHERWISE) from None
     return found.redrawn()

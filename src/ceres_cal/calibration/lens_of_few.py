@@ -36,8 +36,9 @@ def others_of_few(observations: Observations, label: str, options: Options, near
     own = each.pop(label, None)
     if own is None:
         return OtherLenses(near, (), (), {})
-    likely = np.exp([own.cost - end.cost for end in each.values()])
-    weights = tuple((likely / (1.0 + likely.sum())).tolist())
+    costs = np.array([own.cost, *(end.cost for end in each.values())])
+    likely = np.exp(costs.min() - costs)
+    weights = tuple((likely / likely.sum())[1:].tolist())
     reach_px = {name: one.reach_px for name, one in profiles_of(near, gather_sights(observations)).items()}
     return OtherLenses(own.estimate, tuple(end.estimate for end in each.values()), weights, reach_px)
 

@@ -53,8 +53,8 @@ def _probability(square: Calibration) -> float:
     if len(square.estimate.cameras) != 1 or not square.aspects_alone:
         return 0.0
     ((value, sd),) = square.aspects_alone.values()
-    if abs(value - 1.0) > farthest * _BY:
+    if abs(value - 1.0) > farthest * _BY or not sd > 0.0:
         return 0.0
     times = _STRETCHED / (1.0 - _STRETCHED) * sd / np.hypot(sd, _BY)
-    odds = times * np.exp(0.5 * (value - 1.0) ** 2 * (1.0 / sd**2 - 1.0 / (sd**2 + _BY**2)))
-    return float(odds / (1.0 + odds)) if np.isfinite(odds) else 1.0
+    log_odds = np.log(times) + 0.5 * (value - 1.0) ** 2 * (1.0 / sd**2 - 1.0 / (sd**2 + _BY**2))
+    return float(1.0 / (1.0 + np.exp(-log_odds)))
