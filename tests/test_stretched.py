@@ -36,7 +36,7 @@ class _Stretched:
         inside = np.all((flat > 2.0) & (flat < np.array(_SIZE) - 3.0), axis=1) & unfolded
         return np.where(inside[:, None], flat, np.nan)
 
-    def seen(self, seed: int) -> Observations:
+    def seen(self, seed: int, camera: str = "camera") -> Observations:
         """Corners and places on lines, to .15 px."""
         field, rng = ssl_field("B"), np.random.default_rng(seed)
         corners = self.shown(field.point_array)
@@ -49,17 +49,17 @@ class _Stretched:
                 pixels = pixels[np.isfinite(pixels[:, 0])]
                 if len(pixels) > 3:
                     lines[name] = pixels + rng.normal(0.0, 0.15, pixels.shape)
-        points = Observations.from_points(corners, field, _SIZE, sigma_px=0.15)
-        return points + Observations.from_curves(lines, field, _SIZE, sigma_px=0.15)
+        points = Observations.from_points(corners, field, _SIZE, sigma_px=0.15, camera=camera)
+        return points + Observations.from_curves(lines, field, _SIZE, sigma_px=0.15, camera=camera)
 
 
-def _off_over_stated(calibration: Calibration, camera: _Stretched) -> float:
+def _off_over_stated(calibration: Calibration, camera: _Stretched, name: str = "camera") -> float:
     """The farthest of places over the field, .15 m above it, over its 95 % radius."""
     x, y = np.meshgrid(np.linspace(-4.0, 4.0, 9), np.linspace(-2.5, 2.5, 6))
     places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.15)])
     pixels = camera.shown(places)
     inside = np.isfinite(pixels[:, 0])
-    known = calibration.uncertainty.located(pixels[inside], 0.15)
+    known = calibration.uncertainty.located(pixels[inside], 0.15, station=name)
     return float(np.max(np.linalg.norm(known.located - places[inside, :2], axis=1) / known.radius_95_m))
 
 
@@ -81,3 +81,15 @@ def test_square_pixels_stay_square(name: str) -> None:
     assert abs(calibration.station().aspect - 1.0) < 1e-3
     assert calibration.uncertainty.verdict("camera", "camera", "aspect").sd < 1e-3
     assert _off_over_stated(calibration, camera) < 1.5  # .82 and .20
+
+
+@pytest.mark.parametrize("aspects", [(1.02, 1.02), (1.0, 1.03), (1.0, 1.0)])
+def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, float]) -> None:
+    """Both came out square, to .0005: robot height was 19 radii off."""
+    cameras = {name: _Stretched(name, aspect) for name, aspect in zip(_CAMERAS, aspects, strict=True)}
+    tilted, straight = (camera.seen(5, name) for name, camera in cameras.items())
+    calibration = calibrate(tilted + straight)
+    for (name, camera), aspect in zip(cameras.items(), aspects, strict=True):
+        known = calibration.uncertainty.verdict("camera", name, "aspect")
+        assert known.low < aspect < known.high
+        assert _off_over_stated(calibration, camera, name) < 1.5  # .06 to .73

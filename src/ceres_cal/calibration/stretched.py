@@ -7,7 +7,7 @@ there up to some 13 standard deviations. So the calibration with any aspect is m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -25,10 +25,10 @@ _LEAST = 0.02  # probability that makes a difference to what is stated
 def beside_stretched(
     square: Calibration, observations: Observations, with_any_aspect: Callable[[], Calibration]
 ) -> Calibration:
-    """The likelier one of a calibration of one camera with square pixels and of that with any, the other in what is
-    known of it as far as it is probable.
+    """The likelier one of a calibration with square pixels and of that with any, the other in what is known of it as
+    far as it is probable.
     """
-    likely = _probability(square)
+    likely = _probability(square.aspects_alone)
     if likely < _LEAST or square.posterior is None:
         return square
     any_ = attempt(with_any_aspect)  # quiet: the warning says what the observations alone say
@@ -45,15 +45,24 @@ def beside_stretched(
     return replace(one, posterior=one.posterior.with_alternatives(keys, shift, [weight]))
 
 
-def _probability(square: Calibration) -> float:
-    """That its pictures were stretched, by how much likelier the observations are with any aspect; 0 where that is more
-    than pictures are stretched by, as of lines that wander by pixels (1.19 +- .03 of a cropped photograph).
+def _probability(alone: Mapping[str, tuple[float, float]]) -> float:
+    """That pictures were stretched, by what the observations alone say: those of one camera, or all in the same way, as
+    one kind of camera and of converter would have it.
+    """
+    values, sds = np.array([*alone.values()]).reshape(-1, 2).T
+    if not np.all(sds > 0.0):
+        return 0.0
+    weights = 1.0 / sds**2
+    pooled = float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
+    return max(_of_one(value, sd) for value, sd in (*alone.values(), pooled))
+
+
+def _of_one(value: float, sd: float) -> float:
+    """The same of one aspect, by how much likelier the observations are with any; 0 where that is more than pictures
+    are stretched by, as of lines that wander by pixels (1.19 +- .03 of a cropped photograph).
     """
     farthest = 2.0  # standard deviations of by how much
-    if len(square.estimate.cameras) != 1 or not square.aspects_alone:
-        return 0.0
-    ((value, sd),) = square.aspects_alone.values()
-    if abs(value - 1.0) > farthest * _BY or not sd > 0.0:
+    if abs(value - 1.0) > farthest * _BY:
         return 0.0
     times = _STRETCHED / (1.0 - _STRETCHED) * sd / np.hypot(sd, _BY)
     log_odds = np.log(times) + 0.5 * (value - 1.0) ** 2 * (1.0 / sd**2 - 1.0 / (sd**2 + _BY**2))
