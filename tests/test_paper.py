@@ -1,4 +1,4 @@
-"""What the paper gets wrong, and what it gets right (design, section 2): its lens, its matrices, its sign."""
+"""What the paper gets wrong, and what it gets right (docs/mathematics.md): its lens, its matrices, its sign."""
 
 import numpy as np
 import pytest

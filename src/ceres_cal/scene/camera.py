@@ -209,7 +209,7 @@ class Camera(Frozen, eq=True):
     def homography(self, height_m: float = 0.0) -> Array:
         """The paper's H (3, 3): (x'', y'', 1) ~ H (x, y, 1) from the plane z = height_m to the image plane at depth 1.
 
-        H = (r1, r2, r3 l - R t) (sections 3 and 4; the paper prints the sign of r3 l wrong, design section 2).
+        H = (r1, r2, r3 l - R t) (sections 3 and 4; the paper prints the sign of r3 l wrong, docs/mathematics.md).
         """
         pose = self.cam_from_world
         return np.column_stack([pose.rotation[:, :2], pose.translation + height_m * pose.rotation[:, 2]])

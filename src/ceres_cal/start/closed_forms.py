@@ -1,4 +1,4 @@
-"""The closed forms: what the paper computes by hand, corrected where it errs (design, section 2), and what it lacks.
+"""The closed forms: what the paper computes by hand, corrected where it errs (docs/mathematics.md), and what it lacks.
 
 Plane points are (x, y) of a plane of constant z; image points are offsets from the principal point in pixels. A radial
 profile w(r) = 1 + c_1 r^2 + c_2 r^4 with r in units of `unit_px` turns a measured offset p into the direction
