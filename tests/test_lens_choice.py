@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scenes
 from accuracy import rough_lenses
+from accuracy.odd_scenes import farthest
 from accuracy.other_lenses import off_over_stated
 from hypothesis import given
 from hypothesis import strategies as st
@@ -664,6 +665,26 @@ def test_a_few_corners_know_their_place_as_well_as_they_say() -> None:
         off = np.linalg.norm(known.located - places, axis=1)
         assert np.sqrt(np.mean((off / known.sd_m) ** 2)) < 1.8  # 0.6 to 0.9; 6 with the paper's lens alone
         assert np.sqrt(np.mean(off**2)) < 0.02  # m; 0.1
+
+
+def test_two_cameras_by_a_few_corners_each() -> None:
+    """It ended in a KeyError: the lenses of one camera were asked beside the other camera, which its corners do not
+    show.
+    """
+    lens = Brown((-0.19, 0.06, 0.0, 0.0, 0.0))
+    cameras = {"left": Camera((1280, 960), 740.0, (646.5, 473.8), lens)}
+    cameras["right"] = replace(cameras["left"], phi=750.0)
+    stations = {
+        "left": Station("left", overhead_pose(-2.2, 0.0, 4.4, 8.0, 3.0)),
+        "right": Station("right", overhead_pose(2.2, 0.0, 4.4, 8.0, -3.0)),
+    }
+    ends = "LeftFieldLeft", "LeftFieldRight", "RightFieldLeft", "RightFieldRight"
+    marks = "LeftPenaltyMark", "RightPenaltyMark", "LeftCircleCrossing", "RightCircleCrossing"
+    points = *(f"{one}PenaltyCorner" for one in ends), *marks, "TopHalfwayCrossing"
+    scene = field_scene(ssl_field("B"), cameras, stations, points=points, curves=())
+    calibration = calibrate(simulate(scene, Disturbance(0.3, 0.3), 1).observations)
+    sigmas, _, radii = farthest(calibration, scene)
+    assert sigmas < 5.0 and radii < 2.5  # 0.3 and 0.8
 
 
 def test_what_a_lens_does_not_solve_for_is_no_statement() -> None:

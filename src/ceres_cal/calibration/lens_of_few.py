@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import CalibrationError, attempt
+from ceres_cal.base import CalibrationError, attempt, replace
 from ceres_cal.calibration.lens_forms import PAPER, Form, undecentred
 from ceres_cal.calibration.lens_seen import found, profiles_of, seen_through
 from ceres_cal.observations import Observations, gather_sights
@@ -31,7 +31,11 @@ def likeliest_of_few(observations: Observations, options: Options, near: Estimat
 
 
 def others_of_few(observations: Observations, label: str, options: Options, near: Estimate) -> OtherLenses:
-    """What they say with the other kinds, each as probable as what it leaves beside the lens of that label."""
+    """What they, of one camera, say with the other kinds, each as probable as what it leaves beside the lens of that
+    label; options are those of all cameras.
+    """
+    (camera,) = observations.cameras
+    options = replace(options.of_camera(camera), priors=observations.about_shown(options.priors))
     each = {form.label: end for form, end in _with_each_kind(observations, options, near).items()}
     own = each.pop(label, None)
     if own is None:

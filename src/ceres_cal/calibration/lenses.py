@@ -122,7 +122,9 @@ class ChosenLenses(Frozen):
         which these options hold numbers.
         """
         floors = {key.station for key in self.sights.keys if key.placement is None}
-        return together([one.others(posterior, end, options) for one in self.each.values()], floors, end)
+        ends = {name: _part(end, self.sights, name) for name in self.each}
+        each = [one.others(posterior, ends[name], options) for name, one in self.each.items()]
+        return together(each, floors, end)
 
     def _with(self, others: Mapping[str, Chosen]) -> ChosenLenses:
         return replace(self, each={**self.each, **others})
@@ -152,11 +154,18 @@ def start_of(start: Start, sights: Sights, camera: str) -> Start:
         return start
     posed = [i for i, key in enumerate(start.keys) if key.camera == camera and key.placement is not None]
     there = start.estimate.with_placements([start.keys[i] for i in posed], start.poses[posed])
-    names = list(dict.fromkeys(key.placement for key in sights.of_camera(camera).keys if key.placement is not None))
-    estimate = Estimate(
-        {camera: there.cameras[camera]},
-        {name: station for name, station in there.stations.items() if station.camera == camera},
-        Poses.stacked(names, Poses.of(there.placements).of_names(names)),
-        there.structure,
-    )
+    estimate = _part(there, sights, camera)
     return replace(start, estimate=estimate, phi_from={camera: start.phi_from[camera]}, others=())
+
+
+def _part(of: Estimate, sights: Sights, camera: str) -> Estimate:
+    """What is about one camera, and what it sees."""
+    if len(of.cameras) == 1:
+        return of
+    names = list(dict.fromkeys(key.placement for key in sights.of_camera(camera).keys if key.placement is not None))
+    return Estimate(
+        {camera: of.cameras[camera]},
+        {name: station for name, station in of.stations.items() if station.camera == camera},
+        Poses.stacked(names, Poses.of(of.placements).of_names(names)),
+        of.structure,
+    )
