@@ -127,30 +127,18 @@ def soccernet(found: _Found) -> list[str]:
 # ---- speed ----------------------------------------------------------------------------------------------------------
 
 
-def _timed(found: _Found, name: str, digits: int = 3) -> list[str]:
-    rows = [row for row in found.get("corners", ()) if name in row]
-    frames = sorted({row["frames"] for row in rows})
-    cells = {(row["peer"], row["setting"], row["frames"]): row[name] for row in rows}
+def corners(found: _Found) -> list[str]:
+    """Seconds from corners to a result, of a whole process, and MiB that it held: of the fewest frames and the most."""
+    rows = found.get("corners", ())
+    each = sorted({row["frames"] for row in rows})
+    ends = list(dict.fromkeys(each[:1] + each[-1:]))
+    cells = {(row["peer"], row["setting"], row["frames"]): row for row in rows}
+    what = {"solve_s": "solve, s", "whole_s": "process, s", "peak_mib": "MiB"}
     lines = []
     for peer, setting in dict.fromkeys((row["peer"], row["setting"]) for row in rows):
-        title = f"{TITLES[peer]}, {setting}"
-        lines.append([title, *(_figure(cells.get((peer, setting, count)), digits) for count in frames)])
-    return _table(["", *(f"{count} frames" for count in frames)], lines)
-
-
-def solves(found: _Found) -> list[str]:
-    """Seconds from corners to a result."""
-    return _timed(found, "solve_s")
-
-
-def wholes(found: _Found) -> list[str]:
-    """Seconds of a whole process."""
-    return _timed(found, "whole_s")
-
-
-def memory(found: _Found) -> list[str]:
-    """MiB that it held at most."""
-    return _timed(found, "peak_mib")
+        own = [_figure(cells.get((peer, setting, count), {}).get(name)) for name in what for count in ends]
+        lines.append([f"{TITLES[peer]}, {setting}", *own])
+    return _table(["", *(f"{title}: {count} frames" for title in what.values() for count in ends)], lines)
 
 
 def photographs(found: _Found) -> list[str]:
@@ -228,7 +216,7 @@ TABLES: Mapping[str, Sequence[Callable[[_Found], list[str]]]] = {
     "prediction": (prediction, over_predicted),
     "lies": (lies, counts),
     "fields": (ssl, soccernet),
-    "speed": (solves, wholes, memory, photographs),
+    "speed": (corners, photographs),
 }
 _EVERY = {table.__name__: table for table in (*sum(map(tuple, TABLES.values()), ()), versions, sets)}
 
