@@ -40,7 +40,7 @@ def detect_board(
     Args:
         images: photographs, folders, patterns or videos. board: a checkerboard, ChArUco board, circle grid,
             AprilGrid or markers.
-        camera, station: names in the observations; the station's is that of the camera by default.
+        camera: its name in the observations. station: its name there, by default the camera's.
         corner_fit: "saddle", which also measures boards partly out of the picture, or "opencv".
         frames: how many to take out of each video.
         folder: where these are kept; by default they are not.
@@ -89,7 +89,7 @@ def detect_field(
         not_painted: lines of the target that this field does not have. estimate: dimensions to solve for.
         mask: a picture of the same size; what is black in it is left out. edges: both edges of each line.
         points: corners and crossings, too, where the lines' places lead to. keep_start: the start is good to 12 px.
-        camera, station: names in the observations; by default those of the calibration, or "camera".
+        camera: its name in the observations, by default that of the calibration, or "camera". station: likewise.
         refused: called with the path of each image that does not show the field, and what was seen in it.
         progress: called after each image with (steps done, steps in all, file name).
 

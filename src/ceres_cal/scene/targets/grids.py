@@ -131,7 +131,7 @@ def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
     """The corners of the tags: feature "c,r" counts them from the top left, c < 2 columns, r < 2 rows.
 
     Args:
-        columns, rows: tags; Kalibr's tagCols and tagRows. Their numbers count from the bottom left, row by row.
+        columns: of tags, Kalibr's tagCols. rows: Kalibr's tagRows. Tags count from the bottom left, row by row.
         tag_m: side of a tag's dark border, Kalibr's tagSize. gap: between tags over that, Kalibr's tagSpacing.
 
     Raises:
@@ -165,7 +165,8 @@ def tape_grid(columns: int, rows: int, pitch_m: float, line_thickness_m: float) 
     """Lines "column_c" at x = c pitches and "row_r" at y = r pitches, and points "c,r" where they cross.
 
     Args:
-        columns, rows: lines; at least two. pitch_m: between the centres of neighbouring lines.
+        columns: lines along y, at least two. rows: lines along x, at least two.
+        pitch_m: between the centres of neighbouring lines.
 
     Raises:
         InputError: fewer than two lines a way, more than MOST_FEATURES crossings, or lengths that are no positive
