@@ -75,7 +75,7 @@ def seen(
     return simulate(field_scene(FIELD, {"overhead": camera}, stations, spacing_m=spacing_m), disturbance, seed)
 
 
-def random_move(seed: int) -> Pose:
+def random_move(seed: int, home: Pose = HOME, camera: Camera = CAMERA) -> Pose:
     """Between 0.1 and 30 degrees about any axis, 1 mm to 1 m any way, both even in the logarithm; one in ten is
     turned by half a turn besides. The camera still sees a seventh of the field, or there is nothing to refit from.
     """
@@ -84,18 +84,18 @@ def random_move(seed: int) -> Pose:
         turn, shift = (direction / np.linalg.norm(direction) for direction in rng.standard_normal((2, 3)))
         turn = turn * np.deg2rad(np.exp(rng.uniform(*np.log([0.1, 30.0]))))
         shift = shift * np.exp(rng.uniform(*np.log([1e-3, 1.0])))
-        rotation = rotation_exp(turn) @ HOME.rotation
+        rotation = rotation_exp(turn) @ home.rotation
         if rng.random() < 0.1:
             rotation = rotation_exp((0.0, 0.0, np.pi)) @ rotation
-        pose = Pose.looking(HOME.position + shift, rotation)
-        if _looks_at_field(pose):
+        pose = Pose.looking(home.position + shift, rotation)
+        if _looks_at_field(camera.at(pose)):
             return pose
 
 
-def _looks_at_field(pose: Pose) -> bool:
+def _looks_at_field(camera: Camera) -> bool:
     x, y = field_places().T
-    pixels = CAMERA.at(pose).project(np.column_stack([x, y, np.zeros(len(x))]))
-    inside = np.all((pixels >= 0.0) & (pixels <= np.array(CAMERA.image_size) - 1.0), axis=1)
+    pixels = camera.project(np.column_stack([x, y, np.zeros(len(x))]))
+    inside = np.all((pixels >= 0.0) & (pixels <= np.array(camera.image_size) - 1.0), axis=1)
     return bool(np.count_nonzero(inside) >= len(x) / 7)
 
 

@@ -19,17 +19,19 @@ import numpy as np
 from runner import Row, finished, over, over_processes, parser
 from scenery import BoardRanges, board_scene, field_scene, overhead_pose
 
-from accuracy.scenes import FIELD, Problem
+from accuracy.scenes import FIELD, Problem, taped
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import HEIGHTS_M
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.observations import Prior
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.maps import visible_pixels
 from ceres_cal.problem.parameters import Estimate, Options
 from ceres_cal.problem.quantities import difference
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import checkerboard
@@ -61,7 +63,7 @@ LENSES: dict[str, Callable[[np.random.Generator], tuple[float, Lens]]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
+class Drawn:
     """A camera drawn at random, and what draws the rest."""
 
     rng: np.random.Generator
@@ -70,13 +72,17 @@ class _Drawn:
     def over_the_field(
         self, tilt_deg: tuple[float, float], points: tuple[int, int], curves: Sequence[str], spacing_m: float
     ) -> Scene:
-        """What one station over the field shows of some of the points it sees (from, to) and of curves."""
+        """What one station over the field shows of some of the points that it sees, and of curves; see `seen_from`."""
         rng = self.rng
         tilt, direction = rng.uniform(*tilt_deg), rng.uniform(0.0, 2.0 * np.pi)
         height_m = rng.uniform(4.0, 7.0) * (0.65 if self.camera.lens.kind == "kannala-brandt" else 1.0)
         x_m, y_m = rng.uniform(-1.0, 1.0, 2)
         tilts = tilt * np.cos(direction), tilt * np.sin(direction)
         pose = overhead_pose(x_m, y_m, height_m, *tilts, yaw_deg=rng.uniform(-180.0, 180.0))
+        return self.seen_from(pose, points, curves, spacing_m)
+
+    def seen_from(self, pose: Pose, points: tuple[int, int], curves: Sequence[str], spacing_m: float) -> Scene:
+        """What is seen from a pose of so many points (from, to), at random, and of curves of these names."""
         shown = well_inside(self.camera.at(pose), FIELD.point_array)
         seen = [name for name, inside in zip(FIELD.point_names, shown, strict=True) if inside]
         stations = {"a": Station("a", pose)}
@@ -88,33 +94,33 @@ class _Drawn:
         return [str(name) for name in self.rng.permutation(names)[: self.rng.integers(least, most + 1)]]
 
 
-def _few_points(drawn: _Drawn) -> Scene:
+def _few_points(drawn: Drawn) -> Scene:
     return drawn.over_the_field((0.0, 30.0), (4, 10), (), 1.0)
 
 
-def _few_line_points(drawn: _Drawn) -> Scene:
+def _few_line_points(drawn: Drawn) -> Scene:
     return drawn.over_the_field((0.0, 30.0), (0, 0), drawn.some(_STRAIGHT, 5, 9), drawn.rng.uniform(0.3, 2.0))
 
 
-def _points_and_few_line_points(drawn: _Drawn) -> Scene:
+def _points_and_few_line_points(drawn: Drawn) -> Scene:
     return drawn.over_the_field((0.0, 30.0), (4, 8), drawn.some(_STRAIGHT, 1, 4), drawn.rng.uniform(0.3, 2.0))
 
 
-def _parallel(drawn: _Drawn) -> Scene:
+def _parallel(drawn: Drawn) -> Scene:
     lines = _ALONG if drawn.rng.random() < 0.5 else _ACROSS
     return drawn.over_the_field((0.0, 30.0), (0, 6), lines, drawn.rng.uniform(0.1, 0.5))
 
 
-def _frontal(drawn: _Drawn) -> Scene:
+def _frontal(drawn: Drawn) -> Scene:
     return drawn.over_the_field((0.0, 2.0), (0, 12), FIELD.curve_names, drawn.rng.uniform(0.1, 0.5))
 
 
-def _one_curve(drawn: _Drawn) -> Scene:
+def _one_curve(drawn: Drawn) -> Scene:
     curves = ["CenterCircle", *drawn.some(_STRAIGHT, 1, 2)]
     return drawn.over_the_field((0.0, 30.0), (2, 6), curves, drawn.rng.uniform(0.05, 0.3))
 
 
-def _boards(drawn: _Drawn, most: int) -> Scene:
+def _boards(drawn: Drawn, most: int) -> Scene:
     rng = drawn.rng
     board = checkerboard(int(rng.integers(5, 10)), int(rng.integers(4, 7)), 0.1)
     low = rng.uniform(0.0, 40.0)
@@ -124,11 +130,11 @@ def _boards(drawn: _Drawn, most: int) -> Scene:
     return board_scene(board, {"a": drawn.camera}, stations, most, int(rng.integers(1 << 30)), held)
 
 
-def _points_beside_lines(drawn: _Drawn) -> Scene:
+def _points_beside_lines(drawn: Drawn) -> Scene:
     return drawn.over_the_field((5.0, 25.0), (5, 8), _STRAIGHT, 0.25)
 
 
-_Maker = Callable[[_Drawn], Scene]
+_Maker = Callable[[Drawn], Scene]
 ODD: dict[str, _Maker] = {
     "few points": _few_points,
     "few line points": _few_line_points,
@@ -141,7 +147,7 @@ ODD: dict[str, _Maker] = {
 }
 
 
-def _above(drawn: _Drawn) -> Scene:
+def _above(drawn: Drawn) -> Scene:
     return drawn.over_the_field((0.0, 12.0), (6, 30), FIELD.curve_names, drawn.rng.uniform(0.2, 1.0))
 
 
@@ -158,11 +164,10 @@ def odd_problem(make: _Maker, lens: str, seed: int, *, is_named: bool = True) ->
     free_centre = bool(rng.random() < 0.7)
     centre = (639.5 + rng.uniform(-15.0, 15.0), 479.5 + rng.uniform(-15.0, 15.0)) if free_centre else (639.5, 479.5)
     options = Options(lens=lens, free_principal_point=free_centre) if is_named else Options()
-    scene = make(_Drawn(rng, Camera((1280, 960), phi, centre, model)))
+    scene = make(Drawn(rng, Camera((1280, 960), phi, centre, model)))
     priors: tuple[Prior, ...] = ()
     if len(scene.placements) == 0 and rng.random() < 0.25:
-        height_m = float(scene.camera_at("a").position[2])
-        priors = (Prior("station", "a", "height_m", (height_m,), (0.01,)),)
+        priors = (taped(scene, "a", 0.01),)
     return Problem(scene, options, priors)
 
 
@@ -175,7 +180,8 @@ class Outcome:
 
     Attributes:
         refused: the message where there was none. sigmas: how many standard deviations the farthest "known" number is
-            off, and which. radii: how many stated 95 % radii the farthest located place is off.
+            off, and which. radii: how many stated 95 % radii the farthest located place is off. level: of the verdict,
+            where one of them is too far.
     """
 
     kind: str
@@ -185,23 +191,51 @@ class Outcome:
     sigmas: float = 0.0
     which: str = ""
     radii: float = 0.0
+    level: str = ""
 
     def __str__(self) -> str:
-        return f"{self.kind} / {self.lens} / {self.seed}: {self.sigmas:.1f} sd ({self.which}), {self.radii:.2f} radii"
+        verdict = f", verdict {self.level}" if self.level else ""
+        off = f"{self.sigmas:.1f} sd ({self.which}), {self.radii:.2f} radii"
+        return f"{self.kind} / {self.lens} / {self.seed}: {off}{verdict}"
+
+    @property
+    def wrong(self) -> bool:
+        """Whether a "known" number is too far off."""
+        return self.sigmas > MOST_SIGMAS
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether a place is."""
+        return self.radii > MOST_RADII
 
 
 def outcome(kind: str, make: _Maker, lens: str, seed: int) -> Outcome:
     """Calibrate one scene."""
     problem = odd_problem(make, lens, seed, is_named=kind not in BY_DEFAULT)
-    rng = np.random.default_rng([seed, 14])
-    priors = [replace(p, value=tuple(rng.normal(p.value, p.sigma).tolist())) for p in problem.priors]
-    sigma_px = float(rng.choice(NOISES_PX))
     try:
-        seen = simulate(problem.scene, Disturbance(sigma_px, sigma_px), seed).observations
-        calibration = calibrate(replace(seen, priors=tuple(priors)), problem.options)
+        seen = observed(problem, NOISES_PX, seed)
+        calibration = calibrate(seen, problem.options)
     except CalibrationError as error:
         return Outcome(kind, lens, seed, refused=str(error))
-    return Outcome(kind, lens, seed, "", *farthest(calibration, problem.scene))
+    return judged(Outcome(kind, lens, seed), calibration, seen, problem.scene)
+
+
+def observed(problem: Problem, noises_px: Sequence[float], seed: int) -> Observations:
+    """What is observed of a problem, with one of these noises, and each prior as far off as it says."""
+    rng = np.random.default_rng([seed, 14])
+    priors = [replace(p, value=tuple(rng.normal(p.value, p.sigma).tolist())) for p in problem.priors]
+    sigma_px = float(rng.choice(noises_px))
+    seen = simulate(problem.scene, Disturbance(sigma_px, sigma_px), seed).observations
+    return replace(seen, priors=tuple(priors))
+
+
+def judged(of: Outcome, calibration: Calibration, observations: Observations, scene: Scene) -> Outcome:
+    """The outcome, with how far off what came out is."""
+    sigmas, which, radii = farthest(calibration, scene)
+    found = replace(of, sigmas=sigmas, which=which, radii=radii)
+    if found.wrong or found.misplaced:
+        return replace(found, level=judge_quality(quality_of(calibration, observations)).level)
+    return found
 
 
 def farthest(calibration: Calibration, scene: Scene) -> tuple[float, str, float]:
@@ -269,22 +303,10 @@ def summary(title: str, found: Sequence[Outcome], worst: int) -> None:
     print(f"  {'':30}{'scenes':>8}{'refused':>9}{'known > 5 sd':>14}{'places > 2.5':>14}")
     for kind, lens in Counter((o.kind, o.lens) for o in found):
         own = [o for o in found if (o.kind, o.lens) == (kind, lens)]
-        counts = [len(own), *(sum(test(o) for o in own) for test in (_is_refused, _is_wrong, _is_misplaced))]
+        counts = [len(own), *map(sum, zip(*((bool(o.refused), o.wrong, o.misplaced) for o in own), strict=True))]
         print(f"  {kind + ', ' + lens:44}" + "".join(f"{count:>9}" for count in counts))
     for o in sorted(found, key=lambda o: -max(o.sigmas / MOST_SIGMAS, o.radii / MOST_RADII))[:worst]:
         print(f"  {o}")
-
-
-def _is_refused(o: Outcome) -> bool:
-    return bool(o.refused)
-
-
-def _is_wrong(o: Outcome) -> bool:
-    return o.sigmas > MOST_SIGMAS
-
-
-def _is_misplaced(o: Outcome) -> bool:
-    return o.radii > MOST_RADII
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -302,14 +324,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with over_processes(given.jobs):
         for one in over(partial(_one, kinds), range(given.first, given.first + given.runs)):
             found.append(one)
-            if _is_wrong(one) or _is_misplaced(one):
+            if one.wrong or one.misplaced:
                 print(one, file=sys.stderr, flush=True)
     title = "points beside lines" if given.beside else "odd scenes"
     if given.json != "-":
         summary(title, found, given.worst)
     most = 0 if given.beside else MOST_WRONG_PLACES
     rows = [
-        Row(title, "known numbers over 5 sd off", sum(map(_is_wrong, found)), most=MOST_WRONG_KNOWN),
-        Row(title, "places over 2.5 radii off", sum(map(_is_misplaced, found)), most=most),
+        Row(title, "known numbers over 5 sd off", sum(one.wrong for one in found), most=MOST_WRONG_KNOWN),
+        Row(title, "places over 2.5 radii off", sum(one.misplaced for one in found), most=most),
     ]
     return finished(rows, given)

@@ -42,7 +42,8 @@ def _camera() -> Camera:
     return Camera((1280, 960), 868.0, (646.5, 473.8), RADIAL)
 
 
-def _height(scene: Scene, station: str, sigma_m: float) -> Prior:
+def taped(scene: Scene, station: str, sigma_m: float) -> Prior:
+    """The height of a station, measured to so much."""
     height_m = float(scene.camera_at(station).position[2])
     return Prior("station", station, "height_m", (height_m,), (sigma_m,))
 
@@ -62,7 +63,7 @@ def over_the_field() -> Problem:
     """One camera over a division B field: its points, lines and circle; the height is known to 10 mm."""
     pose = overhead_pose(-0.3, 0.2, 5.2, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=1.6)
     scene = field_scene(FIELD, {"overhead": _camera()}, {"overhead": Station("overhead", pose)}, spacing_m=_SPACING_M)
-    return Problem(scene, Options(usual_camera=False, lens="radial"), (_height(scene, "overhead", 0.010),))
+    return Problem(scene, Options(usual_camera=False, lens="radial"), (taped(scene, "overhead", 0.010),))
 
 
 def two_cameras() -> Problem:
@@ -99,7 +100,7 @@ def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0
     if boards:
         shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, held=BoardRanges((1.0, 2.0)))
         scene = join(scene, shown)
-    priors = () if height_sigma_m is None else (_height(scene, "overhead", height_sigma_m),)
+    priors = () if height_sigma_m is None else (taped(scene, "overhead", height_sigma_m),)
     return Problem(scene, Options(usual_camera=False, lens="radial"), priors)
 
 
@@ -155,7 +156,7 @@ def ssl_problem(half: bool, lens: Radial) -> Problem:
         points=("TopLeftCorner", "BottomLeftCorner", *right),
         spacing_m=_SPACING_M,
     )
-    return Problem(scene, Options(usual_camera=False, powers=lens.powers), (_height(scene, "overhead", 0.005),))
+    return Problem(scene, Options(usual_camera=False, powers=lens.powers), (taped(scene, "overhead", 0.005),))
 
 
 SSL_PROBLEMS: dict[str, Callable[[], Problem]] = {
@@ -244,7 +245,7 @@ def painted_by_two_cameras(seed: int, heights_known: bool) -> Painted:
     cameras = {"left": _camera(), "right": replace(_camera(), phi=850.0)}
     curves, offsets_m = _paint(seed)
     scene = field_scene(custom({}, curves), cameras, stations, points=(), spacing_m=0.1)
-    priors = tuple(_height(scene, name, 0.005) for name in stations) if heights_known else ()
+    priors = tuple(taped(scene, name, 0.005) for name in stations) if heights_known else ()
     return _observed(scene, offsets_m, seed, priors)
 
 

@@ -1,0 +1,88 @@
+"""Scenes that OpenCV's functions show: `python scripts/run.py opencv_scenes` has the full samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from accuracy import opencv_scenes
+from accuracy.odd_scenes import MOST_RADII, MOST_SIGMAS
+from accuracy.opencv_camera import SeenByOpenCv, Tilted
+from accuracy.opencv_scenes import CASES, KINDS, checked, outcome, refitted
+from scenery import overhead_pose
+from thorough import partly
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.scene.camera import Camera, in_image
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
+
+_BROWN = (-0.24, 0.08, 5e-4, -3e-4, 0.0)
+_LENSES: dict[str, tuple[float, Lens]] = {
+    "brown": (850.0, Brown(_BROWN)),
+    "folds in the picture": (850.0, Brown((-0.5, 0.05, 0.0, 0.0, 0.0))),
+    "kannala-brandt": (520.0, KannalaBrandt((-0.02, 0.004, 0.001, 0.0002))),
+}
+
+
+def _seen_by(phi: float, lens: Lens) -> SeenByOpenCv:
+    pose = overhead_pose(0.3, 0.2, 4.0, tilt_x_deg=10.0, tilt_y_deg=20.0, yaw_deg=30.0)
+    return SeenByOpenCv((1280, 960), phi, (641.0, 477.0), lens, 1.01, pose)
+
+
+def _places() -> Array:
+    return np.random.default_rng(0).uniform((-8.0, -6.0, 0.15), (8.0, 6.0, 0.15), (2000, 3))
+
+
+@pytest.mark.parametrize("name", _LENSES)
+def test_opencv_shows_what_the_package_shows(name: str) -> None:
+    """Pixels, and which places are not shown, as behind a fold."""
+    camera, places = _seen_by(*_LENSES[name]), _places()
+    pixels, own = camera.project(places), Camera(**vars(camera)).project(places)
+    inside = in_image(pixels, camera.image_size)
+    assert np.count_nonzero(inside) > 200
+    assert np.array_equal(inside, in_image(own, camera.image_size))
+    assert np.allclose(pixels[inside], own[inside], rtol=0.0, atol=1e-8)  # 1e-12
+
+
+@pytest.mark.parametrize("name", ["brown", "kannala-brandt", "tilted"])
+def test_there_and_back(name: str) -> None:
+    camera = _seen_by(*_LENSES.get(name, (850.0, Tilted((*_BROWN, 0.02, -0.01)))))
+    places = _places()
+    inside = in_image(camera.project(places), camera.image_size)
+    back = camera.locate(camera.project(places[inside]), 0.15)
+    assert np.allclose(back, places[inside, :2], rtol=0.0, atol=1e-9)  # 3e-14
+
+
+def test_a_tilted_sensor_is_no_camera_of_the_package() -> None:
+    """Its lens has more than the package's of that name."""
+    camera, places = _seen_by(850.0, Tilted((*_BROWN, 0.02, -0.01))), _places()
+    own = _seen_by(850.0, Brown(_BROWN)).project(places)
+    inside = in_image(own, camera.image_size)
+    assert np.max(np.linalg.norm(camera.project(places) - own, axis=1)[inside]) > 5.0
+
+
+_ASKED = [name for name, kind in KINDS.items() if kind.asked]
+
+
+@pytest.mark.parametrize("name", partly(_ASKED, ["few clicks", "two cameras"]))
+def test_known_numbers_and_places_are_right(name: str) -> None:
+    found = outcome(name, 200_001)
+    assert not found.refused
+    assert found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
+
+
+def test_a_camera_that_nobody_touched() -> None:
+    assert checked(True, 200_001) is False and checked(False, 200_001) is False
+
+
+def test_a_stated_zoom() -> None:
+    found, zoomed = refitted("zoomed", "zoom", 200_002)
+    assert zoomed and found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
+
+
+def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """A row for each figure, of the seeds that are asked for; 1 where one is missed."""
+    case = "few clicks"
+    assert opencv_scenes.main(["--runs", "1", "--first", "200001", "--case", case]) == 0
+    printed = capsys.readouterr().out
+    assert all(what in printed for what in ("refused", "known numbers over 5 sd off", "places over 2.5 radii off"))
+    assert case in CASES and "1 scenes" in printed
