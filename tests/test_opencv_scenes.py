@@ -7,11 +7,12 @@ import pytest
 from accuracy import opencv_scenes
 from accuracy.odd_scenes import MOST_RADII, MOST_SIGMAS
 from accuracy.opencv_camera import SeenByOpenCv, Tilted
-from accuracy.opencv_scenes import CASES, KINDS, checked, outcome, refitted
+from accuracy.opencv_scenes import CASES, KINDS, changed, checked, outcome, refitted
 from scenery import overhead_pose
 from thorough import partly
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.moves.refits import refit
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
 
@@ -77,6 +78,17 @@ def test_a_camera_that_nobody_touched() -> None:
 def test_a_stated_zoom() -> None:
     found, zoomed = refitted("zoomed", "zoom", 200_002)
     assert zoomed and found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
+
+
+def test_a_refit_knows_no_more_of_phi_than_other_lenses_leave_open() -> None:
+    """Six clicks on a fisheye that was moved: phi was known to 30 px, and then to 5.6, 6.9 standard deviations off: the
+    other lenses' phi was cut off at what the chosen one alone had known.
+    """
+    both = changed("moved", True, 200_234)
+    old = both.calibrated(200_234)
+    before, after = (one.uncertainty.verdict("camera", "a", "phi") for one in (old, refit(old, both.seen(200_234))))
+    assert after.sd > 0.8 * before.sd  # 1.01
+    assert after.low < both.after.cameras["a"].phi < after.high
 
 
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -220,6 +220,7 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
         return result
     sights = gather_sights(plan.sights.observations.part(*result.inlier_masks(plan.sights.observations)))
     problem, layout = refit_problem(plan, "pose-only", result.estimate)
+    _, *said = problem.priors
     followed = result.posterior.followed  # where a valley says what phi may be
     unfollowed = plan.moved_cameras - set(followed)
     free = {name: own[own == 0] if name in unfollowed else own[:0] for name, own in layout.free.items()}
@@ -244,7 +245,11 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     ]
     reach_px = {name: sights.of_camera(name).about(result.cameras[name]).reach_px for name in sights.cameras}
     lenses = OtherLenses(seen[0], tuple(seen[1:]), known.lens_weights, reach_px)
-    return replace(result, posterior=with_other_lenses(result.posterior, result.estimate, lenses))
+    # Each has its own phi: what was known of that with the chosen one, which was the prior, limits no other one's.
+    stated, told = result.posterior.stated, {key for one in said for key in one.keys}
+    phi = [key for key in stated.keys if key.quantity == "phi" and key not in told]
+    posterior = replace(result.posterior, stated=stated.without(phi))
+    return replace(result, posterior=with_other_lenses(posterior, result.estimate, lenses))
 
 
 def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
