@@ -92,7 +92,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("calibration.lens_seen", "_KEPT _NEAR", "lens"),
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),
     *_of("calibration.lens_of_few", "_STRONG", "lens"),
-    *_of("calibration.stretched", "_STRETCHED _BY _LEAST", "calibrate"),
+    *_of("calibration.stretched", "_STRETCHED _BY _LEAST _WORTH_A_SOLVE", "calibrate"),
     *_of("posterior.other_lenses", "AGREES", "lens"),
     *_of("calibration.outcome", "_RESTING", "calibrate"),
     *_of("observations.validation", "_LARGE_M", "calibrate"),
