@@ -7,6 +7,7 @@ import pytest
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.stretched import _probability
 from ceres_cal.observations import Observations
 from ceres_cal.scene.curves import Segment
 from ceres_cal.scene.targets import ssl_field
@@ -93,3 +94,9 @@ def test_two_cameras_over_one_field_are_asked_as_well(aspects: tuple[float, floa
         known = calibration.uncertainty.verdict("camera", name, "aspect")
         assert known.low < aspect < known.high
         assert _off_over_stated(calibration, camera, name) < 1.5  # .06 to .73
+
+
+def test_what_is_not_told_is_no_stretched_picture() -> None:
+    """Straight from above fy / fx is open, and the calibration failed: its probability was not a number."""
+    assert _probability({}) == _probability({"a": (1.002, np.inf)}) == 0.0
+    assert _probability({"a": (1.03, 0.005), "b": (1.0, np.inf)}) == _probability({"a": (1.03, 0.005)}) > 0.9

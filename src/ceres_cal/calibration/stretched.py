@@ -18,11 +18,11 @@ from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
 
 # Of pictures, the share that was stretched one way, and the standard deviation of by how much.
-_STRETCHED, _BY = 0.01, 0.05
+_STRETCHED, _BY = 0.03, 0.05
 _LEAST = 0.02  # probability that makes a difference to what is stated
 # The same by what the solve with square pixels says, from which on another is made: that is to first order, and said
 # .994 +- .003 of a picture stretched to .975.
-_WORTH_A_SOLVE = 0.003
+_WORTH_A_SOLVE = 0.01
 
 
 def beside_stretched(
@@ -58,12 +58,12 @@ def _probability(alone: Mapping[str, tuple[float, float]]) -> float:
     """That pictures were stretched, by what the observations alone say: those of one camera, or all in the same way, as
     one kind of camera and of converter would have it.
     """
-    values, sds = np.array([*alone.values()]).reshape(-1, 2).T
-    if not np.all(sds > 0.0):
+    told = np.array([[value, sd] for value, sd in alone.values() if np.isfinite(sd) and sd > 0.0])
+    if not len(told):
         return 0.0
-    weights = 1.0 / sds**2
-    pooled = float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
-    return max(_of_one(value, sd) for value, sd in (*alone.values(), pooled))
+    values, weights = told[:, 0], told[:, 1] ** -2.0
+    pooled = weights @ values / weights.sum(), weights.sum() ** -0.5
+    return max(_of_one(float(value), float(sd)) for value, sd in (*told, pooled))
 
 
 def _of_one(value: float, sd: float) -> float:
