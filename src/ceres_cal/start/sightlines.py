@@ -128,12 +128,12 @@ class Sightlines(Frozen):
         return 2 * self.counts[0] + 2 * len(straight) + 5 * len(distinct(self.curve[self._arcs]))
 
     @classmethod
-    def of_points(cls, known: Beforehand, pixels: Array, places: Array, unit_px: float) -> Sightlines:
-        """Of places (N, 3) m alone, seen at undistorted offsets (N, 2) px."""
-        twice, count = np.vstack([pixels, pixels]), len(pixels)
-        ones, zeros, along = np.ones(2 * count), np.zeros(2 * count), np.zeros((2 * count, 3))
-        none = np.full(2 * count, -1)
-        return cls(known, twice, ones, zeros, unit_px, np.vstack([places, places]), along, (count, 0, 0), none)
+    def of_points(cls, known: Beforehand, pixels: Array, places: Array, unit_px: float, bend: float) -> Sightlines:
+        """Of places (N, 3) m alone, seen at offsets (N, 2) px by a lens of which w is 1 + bend (r / unit_px)^2."""
+        twice, count, bent = np.vstack([pixels, pixels]), len(pixels), bend / unit_px**2
+        w, slope = 1.0 + bent * np.sum(twice**2, axis=1), np.full(2 * count, 2.0 * bent)
+        none, along = np.full(2 * count, -1), np.zeros((2 * count, 3))
+        return cls(known, twice, w, slope, unit_px, np.vstack([places, places]), along, (count, 0, 0), none)
 
     @property
     def _points(self) -> slice:

@@ -18,6 +18,7 @@ from ceres_cal.detect.photographs.refit import CAMERA, ROBUST, FreeIntrinsics, P
 from ceres_cal.observations import Prior
 from ceres_cal.problem import Weighting, intrinsic_names
 from ceres_cal.scene import Camera, Radial, Target, curve_points, require_features
+from ceres_cal.start.closed_forms import RADII, LensProfile
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.start.search import searched
 from ceres_cal.start.sightlines import Beforehand, Sightlines
@@ -78,7 +79,7 @@ def starts_from_clicks(
     Raises:
         InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
-    stretches = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
+    stretches = (1.0, 1.06, 1.14, 1.25, 1.4, 1.7, 2.3, 4.0)  # of the image's corner by the lens: a fisheye's the last
     clicks.require_names(target)
     points = {name: (*pixel, SIGMA_PX) for name, pixel in clicks.points.items()}
     hints = PointHints.of(target, points, [(*place, SIGMA_PX) for place in clicks.curves])
@@ -119,13 +120,15 @@ def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prio
 def _with_stretch(stretch: float, pixels: Array, plane: Array, image_size: tuple[int, int]) -> tuple[Camera, Array]:
     """The camera with so wide a lens that suits the clicks best, and how far off each click is, (N,) px."""
     middle, half = 0.5 * (np.array(image_size) - 1.0), 0.5 * float(np.hypot(*image_size))
-    lens = Radial((0.0, (stretch - 1.0) / half**2, 0.0, 0.0), (2, 3, 4, 5))
-    lifted = (pixels - middle) * (1.0 + lens.values[1] * np.sum((pixels - middle) ** 2, axis=1))[:, None]
+    offsets, bend = pixels - middle, 1.0 / stretch - 1.0
     usual = float(np.log(USUAL_PHI * half)), float(np.log(USUAL_PHI_FACTOR))
     known = Beforehand(np.zeros(3), np.full(3, np.inf), usual, 0.0, least_px=0.5 * SIGMA_PX)
-    lines = Sightlines.of_points(known, lifted, plane, half)
+    lines = Sightlines.of_points(known, offsets, plane, half, bend)
     best = searched(lines, lines).poses
     rotation, phi = best.rotations[0].T, float(np.exp(best.log_phi[0]))
+    radii = RADII * min(half, 1.1 * float(np.max(np.linalg.norm(offsets, axis=1))))
+    profile = LensProfile(radii, np.arctan2(radii, phi * (1.0 + bend * (radii / half) ** 2)))
+    lens = profile.nearest(Radial((0.0,) * 4, (2, 3, 4, 5)), phi, ())
     pose = Pose(rotation, -rotation @ best.positions[0])
     camera = Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose)
     off = np.linalg.norm(lines.equations(best)[0][0].reshape(2, -1), axis=0)

@@ -244,7 +244,7 @@ class Tracker:
         whole = self._with(followed)
         followed = whole.without_aside(followed)
         if followed.built.is_other:  # as by a lens that does not suit: a polynomial bends a strong one's lines
-            other = whole.without_aside(whole.with_best_lens(followed))
+            other = whole.without_aside(whole.farther(whole.with_best_lens(followed)))
             other = self.as_drawn(other) if other.built.is_other else other
             if other.built.is_other:  # the lens that its lines suit better with those dimensions says which they are
                 return min(followed, other, key=whole._misfit_as_built)
@@ -256,6 +256,16 @@ class Tracker:
             return there
         stretched = whole.without_aside(left.with_best_lens(followed, is_stretched=True))
         return stretched if stretched.is_field else there
+
+    def farther(self, followed: Followed) -> Followed:
+        """The same searched again from farther off, with its kind of lens: one that was too simple for a wide lens had
+        the ends of lines elsewhere, and what is found next to there holds another one back.
+        """
+        tracker, camera = self, followed.camera
+        for reach in _NEAR_REACHES_PX:
+            tracker, camera = tracker._search_step(camera, _free(camera), reach) or (tracker, camera)
+        there = tracker.at_rest(camera, _free(camera))
+        return there if there.may_be_worn and there.share > followed.share else followed
 
     def as_drawn(self, other: Followed) -> Followed:
         """What looks like another field, or the one that is drawn, where all of its lines are there as well.
