@@ -31,7 +31,7 @@ from ceres_cal.start.closed_forms import homography_from_points
 
 FOLDER = "udacity_gopro_wide"
 COLUMNS, ROWS = 8, 6
-THREE = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0})
+THREE = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0}, as_built="as drawn")
 CLICKS = ((227.0, 205.0), (1112.0, 188.0), (1005.0, 880.0), (367.0, 908.0))
 """In test_image.jpg, roughly: the outer ones of the four by four corners that lie where the boards were observed."""
 INNER = 4
