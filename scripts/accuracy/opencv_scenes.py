@@ -42,7 +42,8 @@ SIZES = ((780, 580), (1280, 1024), (1920, 1080))
 CLICKS_PX, SEEN_PX = (0.3, 1.0, 2.0), (0.3,)
 STRETCHED, ZOOMED = (0.01, 0.03), (0.02, 0.05)  # of itself, either way
 _CLICKS, _NEW_CLICKS, _ALL = (4, 14), (4, 10), (len(FIELD.points), len(FIELD.points))
-MOST_MISPLACED = 0.01  # of the scenes
+MOST_MISPLACED = 0.02  # of the cameras; by few clicks 3 of 400 have one
+_DEFAULTS = Options()
 _Rng = np.random.Generator
 
 
@@ -50,8 +51,9 @@ _Rng = np.random.Generator
 
 
 def _brown(rng: _Rng, unit_px: float) -> tuple[float, Lens]:
+    """A barrel that folds in no corner of the picture, as it would from 0.14 on."""
     phi = unit_px * rng.uniform(0.7, 1.3)
-    k1 = -rng.uniform(0.0, 0.2) * (phi / unit_px) ** 2
+    k1 = -rng.uniform(0.0, 0.1) * (phi / unit_px) ** 2
     return phi, Brown((k1, rng.uniform(0.1, 0.3) * k1**2, *rng.normal(0.0, 5e-4, 2), 0.0))
 
 
@@ -110,13 +112,15 @@ def _clicked(rng: _Rng, height_sigma_m: float | None = None) -> Problem:
     drawn = _drawn(rng, _usual)
     curves = drawn.some(FIELD.curve_names, 1, 5) if rng.random() < 0.5 else ()
     scene = drawn.seen_from(_over_the_field(rng), _CLICKS, curves, rng.uniform(0.8, 3.0))
-    return Problem(scene, Options(), () if height_sigma_m is None else (taped(scene, "a", height_sigma_m),))
+    return Problem(scene, _DEFAULTS, () if height_sigma_m is None else (taped(scene, "a", height_sigma_m),))
 
 
-def _seen(rng: _Rng, lens: _Lens = _usual, stretched: bool = False, low: bool = False) -> Problem:
+def _seen(
+    rng: _Rng, lens: _Lens = _usual, stretched: bool = False, low: bool = False, options: Options = _DEFAULTS
+) -> Problem:
     drawn, pose = _drawn(rng, lens), _over_the_field(rng, (2.0, 4.0) if low else (3.0, 5.0))
     scene = drawn.seen_from(pose, _ALL, FIELD.curve_names, rng.uniform(0.05, 0.15))
-    return Problem(_stretched(rng, scene) if stretched else scene, Options())
+    return Problem(_stretched(rng, scene) if stretched else scene, options)
 
 
 def _of_the_league(rng: _Rng, cameras: int, stretched: bool = False) -> Problem:
@@ -124,7 +128,7 @@ def _of_the_league(rng: _Rng, cameras: int, stretched: bool = False) -> Problem:
     tilt_deg, height = float(rng.choice([0.0, 1.0, 3.0, 8.0, 20.0])), bool(rng.random() < 0.5)
     scene = in_opencv(scene_of(SetUp(cameras, tilt_deg, "brown", False, height), rng))
     scene = _stretched(rng, scene) if stretched else scene
-    return Problem(scene, Options(), tuple(taped(scene, name, TAPE_M) for name in scene.stations if height))
+    return Problem(scene, _DEFAULTS, tuple(taped(scene, name, TAPE_M) for name in scene.stations if height))
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,7 @@ KINDS = {
     "few clicks, height to 20 mm": Kind(partial(_clicked, height_sigma_m=0.02), CLICKS_PX),
     "square pictures": Kind(_seen),
     "stretched pictures": Kind(partial(_seen, stretched=True), asked=False),
+    "stretched, --free-aspect": Kind(partial(_seen, stretched=True, options=Options(free_aspect=True))),
     "fisheyes of 65 to 80 degrees": Kind(partial(_seen, lens=_wide, low=True)),
     "tilted sensors": Kind(partial(_seen, lens=_tilted), numbers=False),
     "two cameras": Kind(partial(_of_the_league, cameras=2), (NOISE_PX,)),
@@ -169,7 +174,8 @@ def outcome(name: str, seed: int) -> Outcome:
     try:
         seen = observed(problem, kind.noises_px, seed)
         found = judged(of, calibrate(seen, problem.options), seen, problem.scene)
-        return found if kind.numbers else replace(found, sigmas=0.0, which="")
+        own = found if found.misplaced else replace(found, level="")
+        return found if kind.numbers else replace(own, sigmas=0.0, which="")
     except CalibrationError as error:
         return replace(of, refused=str(error))
 
@@ -195,11 +201,11 @@ class Changed:
 
     def calibrated(self, seed: int) -> Calibration:
         """By default, of what was seen before."""
-        return calibrate(observed(Problem(self.before, Options()), SEEN_PX, seed))
+        return calibrate(observed(Problem(self.before, _DEFAULTS), SEEN_PX, seed))
 
     def seen(self, seed: int) -> Observations:
         """What is seen later."""
-        return observed(Problem(self.after, Options()), CLICKS_PX[:2] if self.clicked else SEEN_PX, seed + 1)
+        return observed(Problem(self.after, _DEFAULTS), CLICKS_PX[:2] if self.clicked else SEEN_PX, seed + 1)
 
 
 def changed(change: str, clicked: bool, seed: int) -> Changed:
@@ -243,7 +249,10 @@ def refitted(change: str, what: str, seed: int) -> tuple[Outcome, bool]:
 # ---- figures --------------------------------------------------------------------------------------------------------
 
 
-def _told(case: str, every: Sequence[Outcome], asked: bool) -> Iterator[Row]:
+_KNOWN = "known numbers over 5 sd off"
+
+
+def _told(case: str, every: Sequence[Outcome], cameras: int, asked: bool) -> Iterator[Row]:
     """Counts of what came out wrong; each that did goes to standard error."""
     for one in every:
         if one.wrong or one.misplaced:
@@ -252,8 +261,8 @@ def _told(case: str, every: Sequence[Outcome], asked: bool) -> Iterator[Row]:
     quantities = Counter(one.which for one in every if one.wrong)
     named = ", ".join(f"{name} {count}" for name, count in quantities.most_common())
     counts = {
-        "known numbers over 5 sd off": (sum(one.wrong for one in every), 0.0, named),
-        "places over 2.5 radii off": (sum(one.misplaced for one in every), MOST_MISPLACED * len(every), ""),
+        _KNOWN: (sum(one.wrong for one in every), 0.0, named),
+        "places over 2.5 radii off": (sum(one.misplaced for one in every), MOST_MISPLACED * cameras * len(every), ""),
         "either, and trusted": (sum(one.level == "good" for one in every), 0.0, ""),
     }
     yield Row(case, "refused", refused, note=f"{len(every)} scenes")
@@ -263,7 +272,9 @@ def _told(case: str, every: Sequence[Outcome], asked: bool) -> Iterator[Row]:
 
 def calibrated_case(name: str, first: int, runs: int) -> Iterator[Row]:
     """Calibrations of one kind of scene."""
-    return _told(name, list(over(partial(outcome, name), range(first, first + runs))), KINDS[name].asked)
+    every, kind = list(over(partial(outcome, name), range(first, first + runs))), KINDS[name]
+    rows = _told(name, every, len(kind.problem(first).scene.cameras), kind.asked)
+    return (row for row in rows if kind.numbers or row.what != _KNOWN)
 
 
 def checked_case(clicked: bool, first: int, runs: int) -> Iterator[Row]:
@@ -279,7 +290,7 @@ def refitted_case(change: str, what: str, asked: bool, first: int, runs: int) ->
     """Refits by few clicks."""
     every, zoomed = zip(*over(partial(refitted, change, what), range(first, first + runs)), strict=True)
     name = f"refit, {change}" + ("" if what == "auto" else f", --what {what}")
-    yield from _told(name, every, asked)
+    yield from _told(name, every, 1, asked)
     yield Row(name, "said to be zoomed, share", float(np.mean(zoomed)))
 
 
