@@ -175,8 +175,25 @@ def test_a_folder_of_cameras(
     assert "--camera names one camera: several are called like their folders" in capsys.readouterr().err
     shutil.copy(cameras / "right.avi", cameras / "left.avi")
     assert main(asked) == 2
-    assert "two of what is in it are called 'left'" in capsys.readouterr().err
+    assert "two cameras would be called 'left', like their folder or video" in capsys.readouterr().err
     assert each_camera([str(cameras / "right.avi")]) == []
+    both = [str(cameras / "left"), str(cameras / "right.avi")]
+    assert [str(one) for one in each_camera(both)] == both  # they were taken for one camera's
+    assert each_camera([*both, PHOTOGRAPH]) == []
+
+
+@pytest.mark.usefixtures("words_alone")
+def test_two_folders_of_one_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Boards in one and the field in another tie no cameras, and are one's that is named."""
+    asked = ["run", "--target", "ssl-b", "--facing", "LeftGoalLine=top", "--board", "9x6x100mm", "--lens", "radial"]
+    for name, folder in (("0001", "field"), ("board_01", "boards"), ("board_02", "boards")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        shutil.copy(SAMPLE / "photographs" / f"{name}.jpg", tmp_path / folder)
+    asked = [*asked, str(tmp_path / "field"), str(tmp_path / "boards"), "--quiet", "-o", str(tmp_path / "out")]
+    assert main(asked) == 2
+    assert "'boards' shows boards alone and 'field' the field alone" in capsys.readouterr().err
+    assert main([*asked, "--camera", "overhead"]) == 0
+    assert [*Calibration.load(tmp_path / "out" / "calibration.json").cameras] == ["overhead"]
 
 
 def test_no_photograph_at_all(tmp_path: Path) -> None:

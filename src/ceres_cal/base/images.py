@@ -53,10 +53,14 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def each_camera(given: Sequence[str]) -> list[Path]:
-    """What there is of each camera in the one folder that is given, where it has no images itself: folders, or several
-    videos; nothing where all is of one.
+    """What there is of each camera: several folders or videos that are given, or those in the one folder that is, where
+    it has no images itself; nothing where all is of one camera.
     """
-    alone = [Path(name) for name in given if len(given) == 1 and Path(name).is_dir()]
+    shown = [Path(name) for name in given]
+    if len(shown) > 1:
+        apart = all(path.is_dir() or path.suffix.lower() in VIDEO_ENDINGS for path in shown)
+        return shown if apart else []
+    alone = [path for path in shown if path.is_dir()]
     files = [path for folder in alone for path in _inside(folder)]
     if any(path.suffix.lower() in IMAGE_ENDINGS for path in files):
         return []

@@ -27,7 +27,8 @@ class RunArguments(QuietArguments):
 
     images: tuple[str, ...] = argument(
         "IMAGE",
-        "photographs of one camera, a folder of them, or a video; or a folder with such a folder, or a video, for each",
+        "photographs of one camera, a folder of them, or a video; of several cameras a folder or a video for each, or "
+        "the folder that these are in",
     )
     output: Path = arguments.output_option("everything that is made", metavar="FOLDER")
     target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
@@ -79,7 +80,9 @@ def _run(args: RunArguments) -> Document:
         for one in (args, *cameras):
             folders.enter_context(folder_of_results(one.output))
         images = [_photographs(one) for one in cameras]
-        steps = [step for one, own in zip(cameras, images, strict=True) for step in _seen_by(one, own, several)]
+        seen = [_seen_by(one, own, several) for one, own in zip(cameras, images, strict=True)]
+    _require_tied(cameras, seen)
+    steps = [step for own in seen for step in own]
     detected = [step.data for step in steps if "output" in step.data]
     observations = [str(data["output"]) for data in detected]
     if several and _is_named_by_chance(args.board):
@@ -105,15 +108,17 @@ def _run(args: RunArguments) -> Document:
 
 
 def _cameras(args: RunArguments) -> list[RunArguments]:
-    """What is asked for of each camera: of the one that there is, or of each in the folder."""
-    shown = each_camera(args.images)
-    if not shown:
+    """What is asked for of each camera: of the one that there is, or that is named, or of each that has a folder."""
+    shown, is_named = each_camera(args.images), args.camera != RunArguments.camera
+    if not shown or (is_named and len(args.images) > 1):
         return [args]
-    if args.camera != RunArguments.camera:
+    if is_named:
         raise InputError("--camera names one camera: several are called like their folders or videos")
     names = {path: path.name if path.is_dir() else path.stem for path in shown}
     if twice := next((name for name in names.values() if list(names.values()).count(name) > 1), None):
-        raise InputError(f"{args.images[0]}: two of what is in it are called {twice!r}, as one camera: rename one")
+        raise InputError(
+            f"{args.images[0]}: two cameras would be called {twice!r}, like their folder or video: rename one"
+        )
     prefixes = tuple(f"{name}." for name in names.values())
     of_all = [side for side in args.facing if not side.startswith(prefixes)]
     return [
@@ -126,6 +131,17 @@ def _cameras(args: RunArguments) -> list[RunArguments]:
         )
         for path, name in names.items()
     ]
+
+
+def _require_tied(cameras: Sequence[RunArguments], seen: Sequence[Sequence[_Step]]) -> None:
+    """Raise InputError for folders of boards alone beside folders of the field alone: nothing ties their cameras."""
+    shown = [{Path(step.data["output"]).stem for step in own if "output" in step.data} for own in seen]
+    alone = {kind: one.camera for kinds, one in zip(shown, cameras, strict=True) if len(kinds) == 1 for kind in kinds}
+    if len(alone) > 1 and all(len(kinds) == 1 for kinds in shown):
+        raise InputError(
+            f"{alone['board']!r} shows boards alone and {alone['field']!r} the field alone, so nothing ties these "
+            "cameras: if one camera took both, name it, such as --camera overhead"
+        )
 
 
 def _require_fitting(args: RunArguments, cameras: Sequence[RunArguments]) -> None:
@@ -181,15 +197,15 @@ def _photographs(args: RunArguments) -> list[Path]:
 def _seen_by(args: RunArguments, images: list[Path], is_one_of_several: bool) -> list[_Step]:
     """What a camera observed; of several an error says which one is to be turned."""
     try:
-        return list(_observed(args, images))
+        return list(_observed(args, images, is_one_of_several))
     except InputError as error:  # reads: "..., such as --facing left.LeftGoalLine=left, ..."
         if not is_one_of_several:
             raise
         raise InputError(str(error).replace("--facing ", f"--facing {args.camera}.")) from None
 
 
-def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
-    """Boards first; what shows none may show the field."""
+def _observed(args: RunArguments, images: list[Path], is_one_of_several: bool) -> Iterator[_Step]:
+    """Boards first; what shows none may show the field. One of several cameras may see boards alone."""
     rest = [str(path) for path in images]
     if args.board is not None:
         goal = ["--camera", args.camera, "-o", str(args.output / "board.json")]
@@ -203,6 +219,8 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
                 raise
             yield _Step(COMMANDS["detect board"].typed(asked), (str(error),), {}, 1)
     if args.target is not None:
+        if not rest and is_one_of_several:
+            return
         if not rest:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
         said = [*arguments.repeated("--facing", args.facing), *arguments.repeated("--estimate", args.estimate)]

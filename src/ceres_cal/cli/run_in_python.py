@@ -33,8 +33,8 @@ def run(
     """Calibrate one camera or several from photographs or videos in one call, as `ceres-cal run` does.
 
     Args:
-        images: photographs of one camera, a folder of them, or a video; or a folder with such a folder, or a video, for
-            each camera. output: folder for everything that is made.
+        images: photographs of one camera, a folder of them, or a video; of several cameras a folder or a video for
+            each, or the folder that these are in. output: folder for everything that is made.
         target: the field, such as `ssl_field("B")` or "ssl-b". board: such as "9x6x25mm", or a target of circles or
             AprilTags.
         facing: which way round the field is, such as {"LeftGoalLine": "top"}, of several cameras

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, Mask, first_of, replace
+from ceres_cal.base import Array, Indices, Mask, first_of, replace, two_digits
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.effects.evidence import FLOOR_OFF
@@ -219,7 +219,7 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
 
 def _of_place(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    high = f"{abs(mm[0]):.0f} ± {sd[0]:.0f} mm {'higher' if mm[0] > 0.0 else 'lower'} than around it"
+    high = f"{two_digits(abs(mm[0]))} ± {two_digits(sd[0])} mm {'higher' if mm[0] > 0.0 else 'lower'} than around it"
     advice = "look for what lies under the carpet, and leave out what was observed there"
     return evidence.words(f"{evidence.score.subject} the floor is {high}", advice, ["height"], "mm")
 
