@@ -136,7 +136,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.bent", "BENDING", "verdicts"),
     *_of("effects.strands", "LOUD _MATTERS", "verdicts"),
     *_of("robust.noise", "_TAIL", "calibrate"),
-    *_of("problem.priors", "_USUAL_ASPECT USUAL_DECENTRING", "calibrate", "verdicts"),
+    *_of("problem.priors", "USUAL_ASPECT USUAL_DECENTRING", "calibrate", "verdicts"),
     *_of("robust.as_built", "_UNMEASURED", "calibrate"),
     *_of("robust.usable", "_NOT_BUILT", "calibrate", "diagnose"),
     *_of("effects.aside", "FEWEST_VIEWS", "calibrate"),

@@ -16,6 +16,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.lens_seen import profiles_of
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
+from ceres_cal.problem.priors import USUAL_ASPECT
 
 # Of pictures, the share that was stretched one way, and the standard deviation of by how much.
 _STRETCHED, _BY = 0.03, 0.05
@@ -61,18 +62,23 @@ def _probability(alone: Mapping[str, tuple[float, float]]) -> float:
     told = np.array([[value, sd] for value, sd in alone.values() if np.isfinite(sd) and sd > 0.0])
     if not len(told):
         return 0.0
-    values, weights = told[:, 0], told[:, 1] ** -2.0
-    pooled = weights @ values / weights.sum(), weights.sum() ** -0.5
-    return max(_of_one(float(value), float(sd)) for value, sd in (*told, pooled))
+    values, variances = told[:, 0], told[:, 1] ** 2 + USUAL_ASPECT**2
+    pooled = np.average(values, weights=1.0 / variances), 1.0 / np.sum(1.0 / variances)
+    each = zip(values, variances, strict=True)
+    return max(_of_one(float(value), float(variance)) for value, variance in (*each, pooled))
 
 
-def _of_one(value: float, sd: float) -> float:
-    """The same of one aspect, by how much likelier the observations are with any; 0 where that is more than pictures
-    are stretched by, as of lines that wander by pixels (1.19 +- .03 of a cropped photograph).
+def _of_one(value: float, variance: float) -> float:
+    """The same of one aspect, by how much likelier it is in a picture stretched by any; 0 where that is more than
+    pictures are stretched by, as of lines that wander by pixels (1.19 +- .03 of a cropped photograph).
+
+    Args:
+        variance: by which it differs from 1 where pixels are square, of what is usual and of the observations.
     """
     farthest = 2.0  # standard deviations of by how much
     if abs(value - 1.0) > farthest * _BY:
         return 0.0
-    times = _STRETCHED / (1.0 - _STRETCHED) * sd / np.hypot(sd, _BY)
-    log_odds = np.log(times) + 0.5 * (value - 1.0) ** 2 * (1.0 / sd**2 - 1.0 / (sd**2 + _BY**2))
+    stretched = variance + _BY**2
+    times = _STRETCHED / (1.0 - _STRETCHED) * (variance / stretched) ** 0.5
+    log_odds = np.log(times) + 0.5 * (value - 1.0) ** 2 * (1.0 / variance - 1.0 / stretched)
     return float(1.0 / (1.0 + np.exp(-log_odds)))

@@ -25,7 +25,7 @@ USUAL_CENTRE = 0.015
 middle of pictures that were not cropped."""
 # Standard deviations of fy / fx about 1, and of either decentring coefficient. Of the public cameras tried, fy / fx is
 # up to 0.6 % off and p1 and p2 are up to 3e-3.
-_USUAL_ASPECT, USUAL_DECENTRING = 5e-4, 5e-4
+USUAL_ASPECT, USUAL_DECENTRING = 5e-4, 5e-4
 # Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
 # that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
 USUAL_BENDS = 2.0
@@ -287,7 +287,7 @@ def usual_cameras(
         off_centre = USUAL_CENTRE * float(np.hypot(*size))
         usual = {"cx": (centre[0], off_centre), "cy": (centre[1], off_centre)}
         if not options.free_aspect:
-            usual["aspect"] = 1.0, _USUAL_ASPECT
+            usual["aspect"] = 1.0, USUAL_ASPECT
         usual |= dict.fromkeys(lens.tangential, (0.0, USUAL_DECENTRING))
         phi = ANY_PHI[0] * 0.5 * float(np.hypot(*size))
         usual["phi"] = phi, ANY_PHI[1] * phi
