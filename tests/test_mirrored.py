@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scenery import BoardRanges, board_scene, field_scene, overhead_pose
@@ -113,3 +114,24 @@ def test_boards_whose_rows_are_counted_upwards_are_right_beside_a_floor() -> Non
     for given, count in ((upwards, 1), (upwards + field, 0)):
         named = [words for words in calibrate(given).warnings if "checkerboards from behind" in words]
         assert len(named) == count
+
+
+def test_views_from_the_other_side_of_a_board_are_named() -> None:
+    """Where one view lists its columns from the last to the first, its pose is mirrored and residuals tell nothing."""
+    board = checkerboard(7, 5, 0.0254)
+    matrix, distortion = np.array([[810.0, 0.0, 362.0], [0.0, 807.0, 214.0], [0.0, 0.0, 1.0]]), np.zeros(5)
+    rng, shown = np.random.default_rng(0), dict[str, np.ndarray]()
+    for frame in "abcdefg":
+        turn = rng.uniform(-0.5, 0.5, 3)
+        shift = np.array([0.0, 0.0, 0.6]) - cv2.Rodrigues(turn)[0] @ board.point_array.mean(axis=0)
+        pixels = cv2.projectPoints(board.point_array, turn, shift, matrix, distortion)[0][:, 0]
+        shown[frame] = pixels + rng.normal(0.0, 0.1, pixels.shape)
+    for wrong in ("", "c", "bd"):
+        given = dict(shown)
+        for frame in wrong:
+            given[frame] = given[frame].reshape(5, 7, 2)[:, ::-1].reshape(-1, 2)
+        for target, moves in ((board, None), (board.point_array, True)):
+            said = calibrate(Observations.from_points(given, target, (640, 480), moves=moves)).warnings
+            named = [words for words in said if "from its other side" in words]
+            assert len(named) == bool(wrong)
+            assert all(repr(frame) in words for words in named for frame in wrong)

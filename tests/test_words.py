@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ceres_cal.base.words import did_you_mean, two_digits
+from ceres_cal.base.words import did_you_mean, two_digits, with_sd
 
 
 @pytest.mark.parametrize(
@@ -19,6 +19,20 @@ from ceres_cal.base.words import did_you_mean, two_digits
 )
 def test_two_digits(value: float, text: str) -> None:
     assert two_digits(value) == text
+
+
+@pytest.mark.parametrize(
+    "value, sd, sign, text",
+    [
+        (44.13, 0.52, "", "44.13 ± 0.52"),
+        (0.0297, 0.0243, "", "0.030 ± 0.024"),  # a board's bow, mm
+        (0.0461, 0.0224, "+", "+0.046 ± 0.022"),
+        (-1234.4, 130.4, "+", "-1234 ± 130"),
+        (868.9123, np.inf, "", "868.9123 ± unknown"),
+    ],
+)
+def test_with_sd(value: float, sd: float, sign: str, text: str) -> None:
+    assert with_sd(value, sd, sign) == text
 
 
 @pytest.mark.parametrize(

@@ -70,16 +70,23 @@ def chance(log10_p: float) -> str:
     return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p >= -3.0 else f"1 in 10^{-log10_p:.0f}"
 
 
-def at_precision(value: float, sd: float) -> str:
-    """A value that ends where two digits of its sd end: 868.9 beside 1.4, -5.0e-05 beside 2.2e-06."""
+def at_precision(value: float, sd: float, sign: str = "") -> str:
+    """A value that ends where two digits of its sd end: 868.9 beside 1.4, -5.0e-05 beside 2.2e-06; `sign` "+" also of
+    what is positive.
+    """
     small = abs(value) < 1e-3  # which is written with a power of ten
     if not (math.isfinite(sd) and sd > 0.0):
-        return f"{value:.3e}" if small else f"{value:.4f}"
+        return f"{value:{sign}.3e}" if small else f"{value:{sign}.4f}"
     places = 1 - math.floor(math.log10(sd))
     if small and places > 4:
         above = math.floor(math.log10(max(abs(value), sd)))
-        return f"{round(value, places):.{max(above + places, 0)}e}"
-    return f"{value:.{max(places, 0)}f}"
+        return f"{round(value, places):{sign}.{max(above + places, 0)}e}"
+    return f"{value:{sign}.{max(places, 0)}f}"
+
+
+def with_sd(value: float, sd: float, sign: str = "") -> str:
+    """A value and its standard deviation, to two digits of that: "868.9 ± 1.4", "0.023 ± 0.011"."""
+    return f"{at_precision(value, sd, sign)} ± {short(sd)}"
 
 
 def bounds_text(low: float, high: float, unit: str, digits: str = "") -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, replace, two_digits
+from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, first_of, replace, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejected
 from ceres_cal.effects.aside import Explanation
@@ -57,6 +57,10 @@ _SQUARED = (
 _BEHIND = (
     "camera {!r} sees all {} checkerboards from behind: its pictures are mirrored, x and y of its pixels or rows and "
     "columns are exchanged, or rows are counted upwards. In all but the last case the principal point is wrong"
+)
+_MIRRORED = (
+    "target {!r} is seen from its other side in {} of {} views ({}): their pictures are mirrored, or their points are "
+    "listed in mirrored order. Correct them"
 )
 
 
@@ -153,10 +157,12 @@ def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -
 
 
 def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:
-    """Words about cameras that see every checkerboard from behind, which no printed one shows: the picture of a plane
-    that is mirrored fits as well as the true one. Not where some camera sees a floor, which `require_possible` found to
-    be seen from above: then its pictures are as they should be, and the rows of the boards are counted upwards.
+    """Words about flat targets that some views show from the other side than most, which nobody sees through, and about
+    cameras that see every checkerboard from behind, which no printed one shows: the picture of a plane that is mirrored
+    fits as well as the true one. The latter not where some camera sees a floor, which `require_possible` found to be
+    seen from above: then its pictures are as they should be, and the rows of the boards are counted upwards.
     """
+    yield from _seen_from_both_sides(estimate, observations)
     if any(view.placement is None and not observations.targets[view.target].movable for view in observations.views):
         return
     boards = {name for name, target in observations.targets.items() if target.grid and target.grid.checkered}
@@ -165,6 +171,20 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
         own = [view for view in posed if view.camera == name]
         if own and all(estimate.camera_at(view.station, view.placement).position[2] > 0.0 for view in own):
             yield _BEHIND.format(name, len(own))
+
+
+def _seen_from_both_sides(estimate: Estimate, observations: Observations) -> Iterator[str]:
+    for name, target in observations.targets.items():
+        heights = target.places[:, 2]
+        views = [one for one in observations.shown_views if one.target == name and one.placement in estimate.placements]
+        if not views or np.ptp(heights) > 0.0:
+            continue
+        cameras = [estimate.camera_at(view.station, view.placement) for view in views]
+        above = np.array([camera.position[2] for camera in cameras]) > heights[0]
+        other = above != (2 * np.count_nonzero(above) >= len(views))
+        if np.any(other):
+            frames = [repr(view.frame) for view, is_other in zip(views, other, strict=True) if is_other]
+            yield _MIRRORED.format(name, len(frames), len(views), first_of(frames))
 
 
 def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Array, Frozen, InputError, Shown, are_known, cached_property, html_of, median, rows, text_of
-from ceres_cal.base.words import at_precision, two_digits
+from ceres_cal.base.words import two_digits, with_sd
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, ImageMap, PointSpread, field_map, image_map, spread_of_points
 from ceres_cal.posterior.mixture import FARTHER
 from ceres_cal.posterior.posterior import Posterior
@@ -101,7 +101,7 @@ class Uncertainty(Frozen):
         numbers = []
         for one in self.verdicts:
             unit = "" if one.key.unit == "1" else f" {one.key.unit}"
-            value = f"{at_precision(one.value, one.sd)} ± {two_digits(one.sd)}{unit}"
+            value = f"{with_sd(one.value, one.sd)}{unit}"
             numbers.append((f"{one.key.quantity} of {one.key.owner}", value, one.verdict))
         return f"Uncertainty of {len(numbers)} numbers (value ± standard deviation)", numbers
 

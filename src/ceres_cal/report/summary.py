@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ceres_cal.base import answer_or_reason, replace, rms, words
-from ceres_cal.base.words import DASH, HEIGHTS_M, at_height, at_precision, counted, mm, plural, short, two_digits
+from ceres_cal.base.words import DASH, HEIGHTS_M, at_height, counted, mm, plural, short, two_digits, with_sd
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import ResidualTable
 from ceres_cal.posterior import FieldMap, Uncertainty, Verdict
@@ -96,10 +96,7 @@ def _rig_line(pair: RigPair) -> str:
     """Baseline and angle of two stations, each with its standard deviation."""
     baseline = 1e3 * np.array([pair.baseline_m, pair.baseline_sd_m])
     turn = np.degrees([pair.angle_rad, pair.angle_sd_rad])
-    apart, turned = (
-        f"{at_precision(value, sd)} ± {two_digits(sd) if np.isfinite(sd) else 'unknown'}"
-        for value, sd in (baseline, turn)
-    )
+    apart, turned = (with_sd(value, sd) for value, sd in (baseline, turn))
     return f"{' - '.join(pair.stations)}: baseline {apart} mm, angle {turned} deg"
 
 

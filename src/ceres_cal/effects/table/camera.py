@@ -10,6 +10,7 @@ from functools import cache, partial
 import numpy as np
 
 from ceres_cal.base import Array, Pose, numbers_of, replace, skew
+from ceres_cal.base.words import with_sd
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Words, amounts, camera_effect, half_diagonals
 from ceres_cal.effects.evidence import AS_STATED
@@ -43,8 +44,8 @@ def _of_move(evidence: Evidence) -> Words:
     angle, angle_sd = np.degrees(_length(turn.amount, turn.sd))
     mm, mm_sd = 1e3 * np.array(_length(step.amount, step.sd))
     ways = [
-        (turn.decrease, f"turned by {angle:.3f} ± {angle_sd:.3f} degrees"),
-        (step.decrease, f"shifted by {mm:.1f} ± {mm_sd:.1f} mm"),
+        (turn.decrease, f"turned by {with_sd(angle, angle_sd)} degrees"),
+        (step.decrease, f"shifted by {with_sd(mm, mm_sd)} mm"),
     ]
     ways.sort(key=lambda way: -way[0])
     whole = max(both.decrease, 1e-300)

@@ -9,7 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, Mask, first_of, replace, two_digits
+from ceres_cal.base import Array, Indices, Mask, first_of, replace
+from ceres_cal.base.words import with_sd
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
 from ceres_cal.effects.evidence import FLOOR_OFF
@@ -90,7 +91,7 @@ def _of_curve(evidence: Evidence) -> Words:
     along = np.subtract(curve.end, curve.start)[:2]
     x, y = mm[0] * np.array([-along[1], along[0]]) / np.hypot(*along)
     sentence = (
-        f"{name} is painted {abs(mm[0]):.1f} ± {sd[0]:.1f} mm off its nominal position (x {x:+.1f}, y {y:+.1f} mm; "
+        f"{name} is painted {with_sd(abs(mm[0]), sd[0])} mm off its nominal position (x {x:+.1f}, y {y:+.1f} mm; "
         f"{evidence.size})"
     )
     return Words(sentence, advice, amounts(["left"], mm[:1], sd[:1], "mm"))
@@ -100,7 +101,7 @@ def _of_point(evidence: Evidence) -> Words:
     name = evidence.score.subject
     mm, sd = evidence.in_mm
     return evidence.words(
-        f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn",
+        f"{name} lies x {with_sd(mm[0], sd[0], '+')}, y {with_sd(mm[1], sd[1], '+')} mm from where it is drawn",
         f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
         "xy",
         "mm",
@@ -132,13 +133,13 @@ def _of_board(evidence: Evidence) -> Words:
     name = evidence.score.subject
     mm, sd = evidence.in_mm
     further = [
-        f"{words} {a:+.2f} ± {s:.2f} mm"
+        f"{words} {with_sd(a, s, '+')} mm"
         for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
         if abs(a) > clear * s
     ]
     return evidence.words(
-        f"board {name!r} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
-        f"along y{''.join(f', {one}' for one in further)}",
+        f"board {name!r} is not flat: bowed by {with_sd(mm[0], sd[0], '+')} mm along x, "
+        f"{with_sd(mm[1], sd[1], '+')} mm along y{''.join(f', {one}' for one in further)}",
         f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
         WARP,
         "mm",
@@ -171,8 +172,8 @@ def _bowed(case: Case) -> Iterator[EffectColumns]:
 def _of_bow(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
     return evidence.words(
-        f"{evidence.score.subject}: its floor appears {_lower(mm[0])} ± {sd[0]:.1f} mm at its edges along x than "
-        f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm",
+        f"{evidence.score.subject}: its floor appears {_lower(mm[0], sd[0])} mm at its edges along x than "
+        f"in the middle, {_lower(mm[1], sd[1])} mm along y, and twisted by {with_sd(mm[2], sd[2], '+')} mm",
         "measure its height at some points, and give them as points of a custom target with their z",
         ("x", "y", "twist"),
         "mm",
@@ -187,13 +188,13 @@ def _sheared(case: Case) -> Iterator[EffectColumns]:
 
 def _of_shear(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    lie = f"lie {mm[0]:+.1f} ± {sd[0]:.1f} mm along themselves"
+    lie = f"lie {with_sd(mm[0], sd[0], '+')} mm along themselves"
     advice = "measure its diagonals, and paint it anew, or give it as a custom target with its points as they are"
     return evidence.words(f"{evidence.score.subject} is out of square: its edges {lie}", advice, ("shear",), "mm")
 
 
-def _lower(mm: float) -> str:
-    return f"{'higher' if mm > 0.0 else 'lower'} by {abs(mm):.1f}"
+def _lower(mm: float, sd: float) -> str:
+    return f"{'higher' if mm > 0.0 else 'lower'} by {with_sd(abs(mm), sd)}"
 
 
 def _uneven(case: Case) -> Iterator[EffectColumns]:
@@ -219,7 +220,7 @@ def _uneven(case: Case) -> Iterator[EffectColumns]:
 
 def _of_place(evidence: Evidence) -> Words:
     mm, sd = evidence.in_mm
-    high = f"{two_digits(abs(mm[0]))} ± {two_digits(sd[0])} mm {'higher' if mm[0] > 0.0 else 'lower'} than around it"
+    high = f"{with_sd(abs(mm[0]), sd[0])} mm {'higher' if mm[0] > 0.0 else 'lower'} than around it"
     advice = "look for what lies under the carpet, and leave out what was observed there"
     return evidence.words(f"{evidence.score.subject} the floor is {high}", advice, ["height"], "mm")
 
