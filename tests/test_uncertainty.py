@@ -48,7 +48,7 @@ from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.foreign import nearest
 from ceres_cal.scene.lens import KannalaBrandt, Radial
-from ceres_cal.scene.targets import Segment
+from ceres_cal.scene.targets import Segment, checkerboard
 from ceres_cal.simulate import Disturbance, Station, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -630,3 +630,22 @@ def test_a_component_without_weight_tells_nothing() -> None:
     means, variances = np.array([[1.0, 0.0], [0.0, np.inf], [2.0, 1.0]]), np.array([[1.0], [1.0], [np.inf]])
     known, unknown = moments(np.array([0.25, 0.75, 0.0]), means, variances * np.ones(2))
     assert known == pytest.approx(1.25**0.5) and unknown == np.inf
+
+
+def test_phi_is_known_no_better_without_what_is_usual() -> None:
+    """Two views that are tilted alike: 9.8 % was said without it where 54 % was known with it."""
+    board, matrix = checkerboard(7, 5, 0.0254), np.array([[810.0, 0.0, 362.0], [0.0, 807.0, 214.0], [0.0, 0.0, 1.0]])
+    turns, shifts = (
+        ((-0.581, -0.248, -0.015), (-0.272, -0.699, -1.509)),
+        ((-0.033, 0.022, 0.767), (0.022, 0.076, 0.618)),
+    )
+    distortion, rng = np.array([-0.128, -0.394, -0.0044, -0.0073, 0.0]), np.random.default_rng(2)
+    shown = [
+        cv2.projectPoints(board.point_array, np.array(turn), np.array(shift), matrix, distortion)[0][:, 0]
+        + rng.normal(0.0, 0.1, (35, 2))
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    calibration = calibrate(Observations.from_points(shown, board, (640, 480)))
+    phi = calibration.station().phi
+    assert calibration.uncertainty.posterior.sd_of("camera", "camera", "phi") > 0.3 * phi  # 0.54 measured
+    assert [words for words in calibration.remarks if words.endswith("deviation of phi is larger than itself")]

@@ -95,8 +95,8 @@ def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
             yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
 
 
-def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
-    """Words about cameras whose phi rests on what is usual."""
+def resting_phi(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
+    """Words about cameras whose phi rests on what is usual, beside how well the posterior knows it."""
     estimate, reduced = end.estimate, end.reduced
     usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
     if reduced is None or not usual:
@@ -109,7 +109,8 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
             at = reduced.shared.columns([key])[0]
             sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
             if alone > _RESTING * sd:
-                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
+                known = posterior.sd_of("camera", name, "phi")
+                yield _USUAL.format(name, _share_text(known * alone / sd / estimate.cameras[name].phi))
 
 
 def unusual_pixels(end: RobustSolution, problem: Problem, alone: Mapping[str, tuple[float, float]]) -> Iterator[str]:

@@ -271,7 +271,7 @@ def known_of(seen: Explained) -> Calibration:
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
-        remarks = (*resting_phi(seen.end, seen.problem), *noisier_cameras(seen.problem.observations.noise))
+        remarks = (*resting_phi(seen.end, seen.problem, posterior), *noisier_cameras(seen.problem.observations.noise))
     calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)
