@@ -40,7 +40,7 @@ from ceres_cal.calibration.lens_forms import (
 from ceres_cal.calibration.lens_seen import Candidate, InlierRows, Kind
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
-from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior.posterior import LEAST_PROBABILITY, Posterior
 from ceres_cal.problem import Estimate, Options, moved
 from ceres_cal.problem.priors import VAGUE
 from ceres_cal.robust.as_built import AS_DRAWN, Built
@@ -137,13 +137,12 @@ class Comparison(Frozen):
             posterior: by the chosen one. options: they hold what was free when lenses were compared.
         """
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
-        least_probability = 0.02  # of another lens that counts: all that have less make no difference
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness:
             return found
-        likely, longer = self._likely(least_probability)
+        likely, longer = self._likely(LEAST_PROBABILITY)
         asked = [
-            one for one in likely if one is not self.chosen and (one in longer or likely[one] >= least_probability)
+            one for one in likely if one is not self.chosen and (one in longer or likely[one] >= LEAST_PROBABILITY)
         ]
         each = list[tuple[Candidate, float, Sequence[OpenDirection]]]()
         if not asked:
@@ -155,7 +154,7 @@ class Comparison(Frozen):
             as_long = max(weight, likely[self.chosen]) if one in longer else weight  # no data say that it is shorter
             is_open = () if spread is None or own is None else spread.beyond(own, as_long)
             weight = as_long if is_open else weight
-            if weight >= least_probability and not one.fault:
+            if weight >= LEAST_PROBABILITY and not one.fault:
                 each.append((one, weight, is_open))
         if not each:
             return found
@@ -181,7 +180,7 @@ class Comparison(Frozen):
             weights = (weight / len(ends),) * len(ends)
             found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
         # What they say by chance is less by as much as there are more observations than took part.
-        share = max(self.share, least_share) / max(left, least_probability)
+        share = max(self.share, least_share) / max(left, LEAST_PROBABILITY)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
     def _likely(self, least: float) -> tuple[dict[Candidate, float], list[Candidate]]:

@@ -16,11 +16,11 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.lens_seen import profiles_of
 from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
+from ceres_cal.posterior.posterior import LEAST_PROBABILITY
 from ceres_cal.problem.priors import USUAL_ASPECT
 
 # Of pictures, the share that was stretched one way, and the standard deviation of by how much.
 _STRETCHED, _BY = 0.03, 0.05
-_LEAST = 0.02  # probability that makes a difference to what is stated
 # The same by what the solve with square pixels says, from which on another is made: that is to first order, and said
 # .994 +- .003 of a picture stretched to .975.
 _WORTH_A_SOLVE = 0.01
@@ -39,7 +39,7 @@ def beside_stretched(
         return square
     likely = _probability({name: _told(any_, name) for name in square.aspects_alone})
     one, other, weight = (any_, square, 1.0 - likely) if likely > 0.5 else (square, any_, likely)
-    if weight < _LEAST or one.posterior is None:
+    if weight < LEAST_PROBABILITY or one.posterior is None:
         return one
     profiles = profiles_of(one.estimate, gather_sights(observations))
     reach_px = {name: profile.reach_px for name, profile in profiles.items()}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,8 @@ from ceres_cal.moves.agreement import NOISIER, price_nats
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, candidate_at, movement, pose_candidates
 from ceres_cal.moves.refit_plan import RefitPlan, mistaken_targets, relabelled
 from ceres_cal.observations import Observations, gather_sights
-from ceres_cal.problem import Estimate, make_structure
+from ceres_cal.posterior.posterior import LEAST_PROBABILITY
+from ceres_cal.problem import make_structure
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.symmetry import MIRRORED, TURNED
 
@@ -41,7 +43,6 @@ _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
 _TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
 _WIDER = {
-    "auto": ("zoom", "iris", "everything"),
     "pose-only": ("zoom", "iris", "everything"),
     "pose": ("zoom", "iris", "everything"),
     "zoom": ("everything",),
@@ -49,6 +50,7 @@ _WIDER = {
     "everything": (),
 }
 WORDS = {
+    "pose": "the lens is as it was",
     "zoom": "the zoom was changed",
     "iris": "the lens's distortion has changed (another iris or focus)",
     "everything": "this is another lens or another camera",
@@ -59,12 +61,12 @@ class OtherChangeError(SolutionError):
     """Something else has changed than what was let go.
 
     Attributes:
-        what: one of `WHAT`, that explains the observations.
+        what: one of `WHAT`, that explains the observations. rivals: what else may.
     """
 
-    def __init__(self, message: str, what: str) -> None:
+    def __init__(self, message: str, what: str, rivals: tuple[Rival, ...] = ()) -> None:
         super().__init__(f"{message}: refit with --what {what}")
-        self.what = what
+        self.what, self.rivals = what, rivals
 
 
 def labels_turned(pose: Pose, old: Pose) -> tuple[float, float] | None:
@@ -213,32 +215,51 @@ def judged(plan: RefitPlan, what: str, result: Calibration) -> RefitVerdict:
     return RefitVerdict(float(off @ off), len(off), max(noise, default=1.0))
 
 
-def require_supported(
+class Rival(NamedTuple):
+    """What else may have happened, which the observations do not tell from what is taken.
+
+    Attributes:
+        what: one of `WHAT`. probability: of it. found: the calibration where it is true.
+    """
+
+    what: str
+    probability: float
+    found: Calibration
+
+
+def supported(
     plan: RefitPlan,
     result: Calibration,
     searches: Sequence[PoseSearch],
-    solved_with: Callable[[str, Estimate], Calibration],
-) -> bool:
-    """Whether nothing fits; OtherChangeError where another explanation than the chosen one is supported.
+    solved_with: Callable[..., Calibration],
+) -> tuple[Rival, ...]:
+    """What else may be true beside the chosen explanation, where the user stated none.
 
     Args:
         searches: of each station that moved. solved_with: solves again with another freedom, from an estimate.
+
+    Raises:
+        OtherChangeError: another explanation is supported.
+        SolutionError: nothing fits.
     """
-    doubtful = judged(plan, plan.what, result).doubtful
+    doubtful, wider = judged(plan, plan.what, result).doubtful, _WIDER[plan.what]
     results = {plan.what: result}
-    for what in _WIDER[plan.what] if doubtful else _WIDER[plan.what][:2]:
+    for what in wider if doubtful else wider[:2]:
         # quiet: another freedom that is no explanation; what was asked for is judged by itself
-        wider = attempt(partial(solved_with, what, result.estimate))
-        if isinstance(wider, Calibration):
-            results[what] = wider
+        found = attempt(partial(solved_with, what, result.estimate, tested=False))
+        if isinstance(found, Calibration):
+            results[what] = found
     quiet = {w: r for w, r in results.items() if judged(plan, w, r).noise < _TOO_NOISY or w == plan.what}
-    scores = _scores(plan, quiet)
-    # Of explanations that are about as good the one that lets least go is taken.
-    margin = _SUPPORTED
-    stated = any(conflict.kind == "prior" for conflict in result.conflicts)
-    if plan.what == "auto" and not stated:  # what absorbs a wrong statement, and another lens, are not taken so easily
-        margin, scores = 0.0, {what: score + _SUPPORTED * (what == "everything") for what, score in scores.items()}
-    best = next(what for what in quiet if scores[what] <= min(scores.values()) + margin)
+    # What absorbs a wrong statement, another lens, and what the user said nothing of are not taken so easily.
+    is_free = not plan.is_stated and not any(conflict.kind == "prior" for conflict in result.conflicts)
+    easily = {plan.what, *(wider[:2] if is_free else ())}
+    misfits, count = _misfits(plan, quiet), len(plan.sights.point_rows) + len(plan.sights.curve_rows)
+    let_go = {what: len(plan.loosened(what)) for what in quiet}
+    scores = {w: misfits[w] + price_nats(let_go[w], count) + _SUPPORTED * (w not in easily) for w in quiet}
+    best = min(scores, key=scores.__getitem__)
+    # What explains no more than chance does where a number is let go (Akaike's criterion) is no reason to doubt.
+    speak_for = [w for w in quiet if w in easily and misfits[w] + let_go[w] <= misfits[plan.what] + let_go[plan.what]]
+    rivals = tuple(_rivals({what: scores[what] for what in speak_for}, best, results, solved_with))
     if best != plan.what:
         # What is as noisy may be something else; what is no noisier than what was asked for might be is taken as well.
         if judged(plan, best, results[best]).noisy and (other := _other_explanation(plan, searches)) is not None:
@@ -248,15 +269,30 @@ def require_supported(
             f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "
             f"(better by {gain:.0f} nats)",
             best,
+            rivals,
         )
-    if judged(plan, plan.what, result).noise < _TOO_NOISY:
-        return False
-    if not _explains(plan, result):
-        return True
-    other = _other_explanation(plan, searches)
-    if other is not None:
-        raise other
-    return False
+    if judged(plan, plan.what, result).noise >= _TOO_NOISY:
+        if not _explains(plan, result):
+            raise why_nothing_fits(plan, searches)
+        if (other := _other_explanation(plan, searches)) is not None:
+            raise other
+    return rivals
+
+
+def _rivals(
+    scores: Mapping[str, float], best: str, results: Mapping[str, Calibration], solved_with: Callable[..., Calibration]
+) -> Iterator[Rival]:
+    """Explanations beside the best one, as far as they are probable, with what is known where each is true."""
+    likely = {what: float(np.exp(scores[best] - score)) for what, score in scores.items() if best in scores}
+    for what, odds in likely.items():
+        probability = odds / sum(likely.values())
+        if what != best and probability >= LEAST_PROBABILITY:
+            found: Calibration | CalibrationError = results[what]
+            if results[what].posterior is None:
+                # quiet: what cannot be solved for says nothing
+                found = attempt(partial(solved_with, what, results[what].estimate))
+            if isinstance(found, Calibration):
+                yield Rival(what, probability, found)
 
 
 def _explains(plan: RefitPlan, result: Calibration) -> bool:
@@ -278,20 +314,19 @@ def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
     return f" (phi of camera {', '.join(changes)})"
 
 
-def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
-    """Misfit of observations and prior, and the price of every number let go; in nats."""
+def _misfits(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
+    """Misfit of observations and prior, in nats."""
     sights = plan.sights
     fits = [result.fit for result in results.values()]
     scales = (
         max(plan.scales[0], min(fit.point_scale for fit in fits)),
         max(plan.scales[1], min(fit.curve_scale for fit in fits)),
     )
-    count = len(sights.point_rows) + len(sights.curve_rows)
-    scores = {}
+    misfits = {}
     for what, result in results.items():
         there = residuals(sights, result.estimate)
-        total = 0.5 * judged(plan, what, result).strain + price_nats(len(plan.loosened(what)), count)
+        total = 0.5 * judged(plan, what, result).strain
         for name in sights.cameras:
             total += there.misfit(sights.of_camera(name), result.cameras[name], scales)
-        scores[what] = float(total)
-    return scores
+        misfits[what] = float(total)
+    return misfits

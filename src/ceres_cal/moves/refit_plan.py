@@ -16,6 +16,7 @@ from ceres_cal.observations import Observations, Prior, Sights, gather_sights
 from ceres_cal.problem import GaussianPrior, Problem, gather_priors, intrinsic_keys, require_possible_numbers
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.scene import TURNED, Lens, counterparts, target_from_spec
 
 
@@ -52,6 +53,9 @@ def mistaken_targets(observations: Observations) -> dict[str, Observations]:
     }
 
 
+# Of its natural size, by how much a number that was let go has usually changed.
+_CHANGED = 0.05
+
 WHAT = ("auto", "pose", "pose-only", "zoom", "iris", "everything")
 LABELS = ("check", "as-given", "turned")
 
@@ -82,7 +86,7 @@ class RefitPlan(Frozen):
 
     Attributes:
         calibration: the old one. sights: of the new observations, with the targets of both.
-        options: of the solves. what: one of WHAT. asked: how.
+        options: of the solves. what: one of WHAT but "auto". is_stated: whether the user says so. asked: how.
         stations: the observed stations and their cameras. moved: those whose poses are sought.
         stays: stations of the old calibration that are where they were, under its posterior.
         known: the old cameras, structure and stations that stay; those that moved at no particular pose.
@@ -94,6 +98,7 @@ class RefitPlan(Frozen):
     sights: Sights
     options: Options
     what: str
+    is_stated: bool
     asked: RefitOptions
     stations: dict[str, str]
     moved: frozenset[str]
@@ -116,6 +121,14 @@ class RefitPlan(Frozen):
         """What is known beforehand when so much is let go."""
         return self.prior.without(self.loosened(what))
 
+    def usual(self, what: str) -> GaussianPrior:
+        """That numbers which are let go have changed by about as much as is usual, or by far more."""
+        gone = sorted(self.loosened(what))
+        sigmas = _CHANGED * natural_sizes(self.known, gone)
+        return replace(
+            GaussianPrior.about(Information.of_sigmas(dict(zip(gone, sigmas, strict=True))), self.known), gives_way=True
+        )
+
 
 def loosened(what: str, camera: str, lens: Lens) -> frozenset[Key]:
     """The intrinsics of a camera of which a refit of `what` takes nothing to be known any more."""
@@ -130,7 +143,8 @@ def make_plan(
     moved: Collection[str] | None = None,
     asked: RefitOptions | None = None,
 ) -> RefitPlan:
-    """Who moved, who stays, and what is known of everything.
+    """Who moved, who stays, and what is known of everything; where nobody states what has changed, as if it had only
+    moved.
 
     Raises:
         InputError: a name that is not there, or a calibration that does not say how well it is known.
@@ -138,6 +152,7 @@ def make_plan(
     """
     if what not in WHAT:
         raise InputError(no_such("kind of refit (what)", what, WHAT))
+    what, is_stated = ("pose", False) if what == "auto" else (what, True)
     require_posterior(calibration)
     observed = matched(calibration, observations)
     observations = calibration.as_taken(observations)
@@ -156,7 +171,7 @@ def make_plan(
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
-    prior = carried_prior(calibration, observations, stays, of_lens=what in ("auto", "pose", "pose-only"))
+    prior = carried_prior(calibration, observations, stays, of_lens=what in ("pose", "pose-only"))
     placed = {name: old[name] for name in old if name in stays}
     placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
     return RefitPlan(
@@ -164,6 +179,7 @@ def make_plan(
         gather_sights(observed),
         options,
         what,
+        is_stated,
         asked,
         stations,
         chosen,
@@ -211,7 +227,10 @@ def _is_kept(key: Key, stays: frozenset[str]) -> bool:
 
 
 def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem, Layout]:
-    """What is solved, and the layout of what is known at all: the posterior speaks of everything, held or not."""
+    """What is solved, and the layout of what is known at all: the posterior speaks of everything, held or not.
+
+    What is tried beside what was asked for few observations may leave open: it has its usual size then.
+    """
     everything = plan.calibration.uncertainty.posterior.layout(plan.calibration.estimate)
     free, stations = everything.free, plan.moved | (plan.stays & everything.stations)
     known = Layout(free, stations, frozenset(start.placements))
@@ -220,4 +239,6 @@ def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem,
     solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=moving)
     cameras = plan.calibration.cameras
     priors = gather_priors(plan.sights.observations, plan.options, start.structure, plan.prior_for(what), cameras)
+    if what != plan.what and plan.loosened(what):
+        priors = (*priors, plan.usual(what))
     return Problem(plan.sights, solved, priors, options=plan.options), known

@@ -6,7 +6,7 @@ the old posterior is one more prior, as a full matrix.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -16,10 +16,11 @@ from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
     WORDS,
     OtherChangeError,
+    Rival,
     judged,
     old_poses,
     require_labels,
-    require_supported,
+    supported,
     why_nothing_fits,
     zoomed_search,
 )
@@ -36,7 +37,7 @@ from ceres_cal.moves.poses import (
 from ceres_cal.moves.refit_plan import RefitOptions, RefitPlan, loosened, make_plan, refit_problem
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.posterior import OtherLenses, with_other_lenses
-from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting
+from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting, difference
 from ceres_cal.robust.other_minima import solved_soon
 from ceres_cal.start import Start, what_poses
 
@@ -84,39 +85,40 @@ def refit(
         if what != "auto" or change.what == "everything":
             raise
         plan = make_plan(calibration, observations, change.what, moved, options)
-        return _refitted(plan, observations, progress, f"{WORDS[change.what]}, the observations say; ")
+        return _refitted(plan, observations, progress, change)
 
 
 def _refitted(
-    plan: RefitPlan, observations: Observations, progress: SolveProgress | None, because: str = ""
+    plan: RefitPlan, observations: Observations, progress: SolveProgress | None, change: OtherChangeError | None = None
 ) -> Calibration:
     calibration, what = plan.calibration, plan.what
     estimate = _start(plan)
     zoomed = plan.moved_cameras if what in ("zoom", "everything") else ()
     phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
 
-    def solved_with(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
+    def solved_with(what: str, start: Estimate, *, tested: bool = True) -> Calibration:
         problem, known = refit_problem(plan, what, start)
-        task = Task(progress, tested=assessed, before=known, scales=plan.scales)
+        task = Task(progress, tested=tested, before=known, scales=plan.scales)
         return solved_from(task, Start(start, phi_from), problem)
 
-    result = solved_with(what, estimate, assessed=True)
+    result = solved_with(what, estimate)
     try:
         searches = [PoseSearch(sight, estimate, plan.scales) for sight in _moved_sights(plan)]
-        if require_supported(plan, result, searches, solved_with):
-            raise why_nothing_fits(plan, searches)
+        rivals = supported(plan, result, searches, solved_with)
     except SolutionError as error:
         stated = [conflict.words for conflict in result.conflicts if conflict.kind == "prior"]
         if not stated:
             raise
         raise SolutionError(f"{stated[0]}; or else {error}") from None
     _require_known(plan, result)
-    result, explanation = _as_known(plan, _with_other_lenses(plan, result)), because + _explained(plan, result)
+    if change is not None:
+        rivals = change.rivals
+    explanation = _explained(plan, result, rivals, WORDS[plan.what] if change else "")
+    result = _as_known(plan, _beside_rivals(plan, _with_other_lenses(plan, result), rivals))
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
     if calibration.digest == observations.digest:
         seen = calibration.refitted.digests if calibration.refitted else ()
-    freed = "pose" if what == "auto" else what
-    refitted = Refitted(freed, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
+    refitted = Refitted(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
     warnings = (*_warnings(plan, result), *([_TWICE] if observations.digest in seen else []))
     return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
 
@@ -252,6 +254,18 @@ def _with_other_lenses(plan: RefitPlan, result: Calibration) -> Calibration:
     return replace(result, posterior=with_other_lenses(posterior, result.estimate, lenses))
 
 
+def _beside_rivals(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival]) -> Calibration:
+    """With what else may have happened, each as far as it is probable."""
+    posterior, so_far = result.posterior, 1.0 - sum(one.probability for one in rivals)
+    for what, probability, found in rivals:
+        so_far += probability
+        if posterior is not None and found.posterior is not None:
+            step = difference(found.estimate, result.estimate, posterior.keys)
+            let_go = plan.loosened(what) - plan.loosened(plan.what)
+            posterior = posterior.beside(found.posterior.normal, step, probability / so_far, let_go)
+    return replace(result, posterior=posterior)
+
+
 def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
     """With cameras that were not observed as they were, and all that was known of them: one normal distribution was
     their prior, and that is wider.
@@ -278,8 +292,8 @@ def _as_known(plan: RefitPlan, result: Calibration) -> Calibration:
     return replace(result, estimate=estimate, posterior=posterior)
 
 
-def _explained(plan: RefitPlan, result: Calibration) -> str:
-    words, moves = [], movements(plan.calibration, result, plan.what)
+def _explained(plan: RefitPlan, result: Calibration, rivals: Sequence[Rival], change: str) -> str:
+    words, moves = [f"{change}, the observations say"] if change else [], movements(plan.calibration, result, plan.what)
     for name in sorted(plan.moved):
         how = moved_words(*moves[name]) if name in moves else "is new"
         words.append(f"station {name!r} {how}")
@@ -287,6 +301,7 @@ def _explained(plan: RefitPlan, result: Calibration) -> str:
         for name in sorted(plan.moved_cameras):
             before, after = plan.calibration.cameras[name].phi, result.cameras[name].phi
             words.append(f"phi of camera {name!r} went from {before:.2f} to {after:.2f} px")
+    words += [f"or {WORDS[one.what]} ({one.probability:.0%})" for one in rivals]
     return "; ".join(words)
 
 

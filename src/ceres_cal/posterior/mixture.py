@@ -83,10 +83,10 @@ class Mixture(Frozen):
     lenses: Mapping[int, tuple[int, int]] = field(default_factory=dict)
 
     @classmethod
-    def of_one(cls, information: Information) -> Mixture:
-        """The normal distribution about the estimate."""
-        alone = np.zeros(1, dtype=np.int64)
-        return cls(information.keys, np.ones(1), np.zeros((1, len(information.keys))), (information,), alone)
+    def of_one(cls, information: Information, step: Array | float = 0.0) -> Mixture:
+        """The normal distribution about the estimate, or so far (K,) from it."""
+        steps = np.zeros((1, len(information.keys))) + step
+        return cls(information.keys, np.ones(1), steps, (information,), np.zeros(1, dtype=np.int64))
 
     @classmethod
     def along_phi(
@@ -189,6 +189,14 @@ class Mixture(Frozen):
         of_all = np.concatenate([weight * self.weights for weight in every])
         at = np.tile(self.at, len(every))
         return replace(self, weights=of_all, steps=steps, at=at, chains=chains, lenses=shown)
+
+    def beside(self, other: Mixture, weight: float) -> Mixture:
+        """With another one of the same numbers, seen from the same estimate, as far as that is probable."""
+        weights = np.concatenate([(1.0 - weight) * self.weights, weight * other.weights])
+        steps, known = np.concatenate([self.steps, other.steps]), (*self.information, *other.information)
+        at = np.concatenate([self.at, len(self.information) + other.at])
+        chains = (*self.chains, *(Chain(len(self.at) + chain.at, chain.roots) for chain in other.chains))
+        return replace(self, weights=weights, steps=steps, information=known, at=at, chains=chains)
 
     def off_valley(self, shifts: Array) -> Array:
         """(S, K) of shifts (S, K) what is beside the first chain, phi held: along it they change nothing."""

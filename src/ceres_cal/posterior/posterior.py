@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, InputError, Mask, Spread, brief, cached_property, field, replace, without
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
-from ceres_cal.posterior.mixture import Mixture
+from ceres_cal.posterior.mixture import FARTHER, Mixture
 from ceres_cal.problem import (
     Estimate,
     Information,
@@ -23,6 +23,9 @@ from ceres_cal.problem import (
 )
 from ceres_cal.problem.quantities import difference
 from ceres_cal.problem.reduced import Eliminated, ReducedInformation
+
+LEAST_PROBABILITY = 0.02
+"""From which on something else that may be true counts: all that has less makes no difference."""
 
 
 class Posterior(Frozen):
@@ -103,6 +106,21 @@ class Posterior(Frozen):
             mixtures[name] = mine.shifted_also(likely, off[:, None])
         information = self.wider(self.information, lambda seen: seen.widened(np.sqrt(likely)[:, None] * whole))
         return replace(self._known_by(information, mixtures), lenses=self.lenses or lenses)
+
+    def beside(self, known: Information, step: Array, weight: float, let_go: Collection[Key] = ()) -> Posterior:
+        """The posterior where something else may be true, which knows all numbers in its own way.
+
+        Args:
+            known: of all of them where that is true. step: (P,) how far they are then. weight: its probability.
+            let_go: what it does not take as it was stated.
+        """
+        mixtures = {"": self.mixture().beside(Mixture.of_one(known.given(self.keys), step), weight)}
+        for name in self.followed:
+            mine = self.mixtures[name]
+            there = over(step, self.keys, mine.keys)
+            mixtures[name] = mine.beside(_along_phi(mine, known.marginal(mine.keys), there), weight)
+        loose = replace(self, stated=self.stated.without(let_go))
+        return loose._known_by(loose._as_wide_as(self.information, [mixtures[""]]), {**self.mixtures, **mixtures})
 
     def widened(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
         """The posterior whose numbers scatter by shifts (S, K) of some of them as well: each goes into the covariance
@@ -327,6 +345,15 @@ def widths_over(spread: Spread, other: Spread) -> Array:
     """(n,) standard deviations of one spread over those of another of the same numbers; 1 where either is infinite."""
     both = np.isfinite(spread.sd) & np.isfinite(other.sd)
     return np.where(both, spread.sd, 1.0) / np.where(both, other.sd, 1.0)
+
+
+def _along_phi(valley: Mixture, known: Information, step: Array) -> Mixture:
+    """A normal distribution, so far (K,) from the estimate, as components along phi as those of a valley are."""
+    phi, along = valley.phi_px + step[0], known.spread.covariance[0]
+    sd = np.sqrt(along[0])
+    roots = min(FARTHER, 0.5 * phi / sd) * np.array([-1.0, 0.0, 1.0])  # to half of phi and half as much again
+    steps, across = step + roots[:, None] * along / sd, known.given(valley.keys[1:])
+    return Mixture.along_phi(valley.keys, valley.phi_px, steps, roots**2, [across] * 3, (False, False))
 
 
 def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatter: Scatter | None = None) -> Posterior:
