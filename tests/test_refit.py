@@ -425,6 +425,27 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
     assert any(key.owner == "left" for key in held.posterior.keys)  # type: ignore[union-attr]
 
 
+def test_a_station_that_moved_and_is_said_to_stay(two_cameras: tuple[Calibration, dict[str, Station]]) -> None:
+    """Where the other one was named, that had "another lens"."""
+    calibration, stations = two_cameras
+    old = stations["right"].cam_from_world
+    position = old.position + np.array([0.02, -0.02, 0.0])
+    moved_too = Pose.looking(position, rotation_exp((0.01, 0.0, 0.01)) @ old.rotation)
+    there = {**stations, "right": Station("right", moved_too)}
+    seen_now = simulate(field_scene(FIELD, calibration.cameras, there, spacing_m=1.0), NOISE, 3).observations
+    with pytest.raises(SolutionError, match=r"station 'right' is said to stay.*moved: name it with --moved, too"):
+        refit(calibration, seen_now, moved=["left"])
+
+
+def test_a_lens_that_folds_after_a_refit_is_not_to_be_chosen_otherwise(calibration: Calibration) -> None:
+    found = seen(MOVED, replace(NOISE, points_sigma_px=3.0), 6).observations
+    nearest = np.argsort(np.linalg.norm(found.points.pixels - (640.0, 480.0), axis=1))[:6]
+    clicks = np.isin(np.arange(len(found.points)), nearest)
+    few = found.part(clicks, np.zeros(len(found.curves), dtype=bool))
+    with pytest.raises(SolutionError, match=r"lens folds.*keep the lens as it was \(--what pose-only\), or calibrate"):
+        refit(calibration, few, "everything")
+
+
 # ---- wrong use ------------------------------------------------------------------------------------------------------
 
 

@@ -276,7 +276,8 @@ def known_of(seen: Explained) -> Calibration:
     if settled is not None:
         calibration = of_all(calibration, settled)
     wholes = [one.rows for one in seen.explanations if one.is_taken]
-    warnings = (*calibration.warnings, *require_usable(seen.end, seen.problem, wholes), *warnings)
+    usable = require_usable(seen.end, seen.problem, wholes, is_refit=task.before is not None)
+    warnings = (*calibration.warnings, *usable, *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     apart = tuple(text for text, is_apart in alike.items() if is_apart)
     calibration = replace(calibration, remarks=(*calibration.remarks, *remarks), ambiguities=apart)

@@ -92,6 +92,18 @@ def require_labels(plan: RefitPlan, poses: Mapping[str, Pose]) -> None:
             )
 
 
+def require_still(plan: RefitPlan) -> None:
+    """Raise SolutionError where a station that is said to stay sees the world from elsewhere."""
+    for name, sight in plan.sights.of_world.items():
+        search, old = PoseSearch(sight, plan.known, plan.scales), plan.known.stations[name].cam_from_world
+        if name in plan.moved or candidate_at(search, old).fits:
+            continue
+        if any(one.fits for one in pose_candidates(search, [old], patience=0)):
+            raise SolutionError(
+                f"station {name!r} is said to stay, but its observations say that it moved: name it with --moved, too"
+            )
+
+
 def old_poses(plan: RefitPlan, search: PoseSearch) -> list[Pose]:
     """Where the camera of a search stood before, the search's own station first."""
     stations, key = plan.calibration.estimate.stations, search.sight.key
@@ -287,10 +299,8 @@ def _rivals(
     for what, odds in likely.items():
         probability = odds / sum(likely.values())
         if what != best and probability >= LEAST_PROBABILITY:
-            found: Calibration | CalibrationError = results[what]
-            if results[what].posterior is None:
-                # quiet: what cannot be solved for says nothing
-                found = attempt(partial(solved_with, what, results[what].estimate))
+            # quiet: what cannot be solved for says nothing
+            found = attempt(partial(solved_with, what, results[what].estimate))
             if isinstance(found, Calibration):
                 yield Rival(what, probability, found)
 

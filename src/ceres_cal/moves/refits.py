@@ -20,6 +20,7 @@ from ceres_cal.moves.explanations import (
     judged,
     old_poses,
     require_labels,
+    require_still,
     supported,
     why_nothing_fits,
     zoomed_search,
@@ -128,6 +129,7 @@ _TWICE = "these observations are in the old calibration's past already: what the
 
 def _start(plan: RefitPlan) -> Estimate:
     """Poses of everything that is sought, lenses as they were (or zoomed, where that may be)."""
+    require_still(plan)
     poses: dict[str, Pose] = {}
     cameras = dict(plan.known.cameras)
     for sight in _moved_sights(plan):

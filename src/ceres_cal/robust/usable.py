@@ -134,12 +134,18 @@ def all_shown(camera: Camera, sights: Sights) -> bool:
     return all(bool(np.all(camera.lens.shows(pixels, camera.phi))) for pixels in places)
 
 
-def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]) -> tuple[str, ...]:
+def require_usable(
+    end: RobustSolution, problem: Problem, wholes: Sequence[Mask], *, is_refit: bool = False
+) -> tuple[str, ...]:
     """Warnings about the solution; SolutionError where it must not be used.
 
     Args:
-        wholes: (N + M,) of each the observations that were taken out as one.
+        wholes: (N + M,) of each the observations that were taken out as one. is_refit: whether the lens was chosen
+            before.
     """
+    instead = "choose fewer or other coefficients, or observe nearer to the corners"
+    if is_refit:
+        instead = "keep the lens as it was (--what pose-only), or calibrate again with fewer coefficients"
     warnings = []
     for name, camera in end.estimate.cameras.items():
         width, height = camera.image_size
@@ -161,8 +167,7 @@ def require_usable(end: RobustSolution, problem: Problem, wholes: Sequence[Mask]
         observed = end.problem.sights.of_camera(name).about(camera)
         if not camera.lens.may_fold or not all_shown(camera, observed):
             raise SolutionError(
-                f"{where}, inside the image (corner at {corner:.0f} px): "
-                "choose fewer or other coefficients, or observe nearer to the corners",
+                f"{where}, inside the image (corner at {corner:.0f} px): {instead}",
                 name,
             )
         warnings.append(
