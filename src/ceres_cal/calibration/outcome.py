@@ -5,6 +5,7 @@ Warnings of what the observations leave open: phi that they do not tell, or that
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -175,9 +176,12 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
 
 
 def _seen_from_both_sides(estimate: Estimate, observations: Observations) -> Iterator[str]:
+    """Of placements that one camera sees alone: where others see it, too, a mirrored list does not fit."""
+    seen = Counter(one.placement for one in observations.shown_views)
+    alone = {placement for placement in estimate.placements if seen[placement] == 1}
     for name, target in observations.targets.items():
         heights = target.places[:, 2]
-        views = [one for one in observations.shown_views if one.target == name and one.placement in estimate.placements]
+        views = [one for one in observations.shown_views if one.target == name and one.placement in alone]
         if not views or np.ptp(heights) > 0.0:
             continue
         cameras = [estimate.camera_at(view.station, view.placement) for view in views]
