@@ -85,7 +85,7 @@ def at_precision(value: float, sd: float, sign: str = "") -> str:
 
 
 def with_sd(value: float, sd: float, sign: str = "") -> str:
-    """A value and its standard deviation, to two digits of that: "868.9 ± 1.4", "0.023 ± 0.011"."""
+    """A value and its standard deviation, to two digits of that but for a last 0: "868.9 ± 1.4", "0.0496 ± 0.002"."""
     return f"{at_precision(value, sd, sign)} ± {short(sd)}"
 
 
