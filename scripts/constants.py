@@ -87,7 +87,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("robust.usable", "_OFF_CENTRE", "calibrate"),
     *_of("robust.usable", "_NO_FIT", "calibrate"),
     *_of("calibration.lens_forms", "AS_GOOD ALIKE CLEARLY", "lens"),
-    *_of("calibration.lens_comparison", "_QUIETER _SOUND_PX", "lens"),
+    *_of("calibration.lens_comparison", "_QUIETER _SOUND_PX PRICE", "lens"),
     *_of("calibration.lens_seen", "_REFUTED _UNSEEN_GROUPS", "lens"),
     *_of("calibration.lens_seen", "_KEPT _NEAR _FAR", "lens"),
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),

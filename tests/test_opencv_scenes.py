@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from accuracy import opencv_scenes
-from accuracy.odd_scenes import MOST_RADII, MOST_SIGMAS
+from accuracy.odd_scenes import MOST_RADII, MOST_SIGMAS, farthest, observed
 from accuracy.opencv_camera import SeenByOpenCv, Tilted
 from accuracy.opencv_scenes import CASES, KINDS, changed, checked, outcome, refitted
+from accuracy.scenes import Problem
 from scenery import overhead_pose
 from thorough import partly
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.refits import refit
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
@@ -89,6 +92,32 @@ def test_a_refit_knows_no_more_of_phi_than_other_lenses_leave_open() -> None:
     before, after = (one.uncertainty.verdict("camera", "a", "phi") for one in (old, refit(old, both.seen(200_234))))
     assert after.sd > 0.8 * before.sd  # 1.01
     assert after.low < both.after.cameras["a"].phi < after.high
+
+
+def stated_height(kind: str, seed: int) -> tuple[Problem, Calibration]:
+    """A scene whose height is stated to 10 mm, and its calibration."""
+    problem = KINDS[kind].problem(seed)
+    return problem, calibrate(observed(problem, KINDS[kind].noises_px, seed))
+
+
+@pytest.mark.parametrize("seed", partly([200_055, 200_215], [200_215]))
+def test_a_right_height_is_not_called_wrong(seed: int) -> None:
+    """It was, by 10 and 9.3 standard deviations: a fisheye with one coefficient, chosen without it, contradicted it."""
+    kind = "square pictures, height to 10 mm" if seed == 200_055 else "the same, height to 10 mm"
+    problem, calibration = stated_height(kind, seed)
+    assert not calibration.conflicts and not any("may be wrong" in one for one in calibration.warnings)
+    sigmas, _, radii = farthest(calibration, problem.scene)
+    assert sigmas < 2.0 and radii < 1.5  # 0.9 and 0.8; 1.1 and 1.1
+
+
+def test_a_height_that_only_a_shorter_lens_contradicts_is_in_doubt() -> None:
+    """A lens with a coefficient less says 3.68 for 3.58 +- .01 m, and is as likely: both are in what is stated."""
+    problem, calibration = stated_height("square pictures, height to 10 mm", 200_206)
+    (words,) = (one for one in calibration.warnings if "may be wrong" in one)
+    assert words.startswith("the stated height of station 'a', 3.58 ± 0.01 m: with the lens kannala-brandt k1 p1 p2 ")
+    (height,) = (one for one in calibration.uncertainty.verdicts if one.key.quantity == "height")
+    assert 0.02 < height.sd < 0.1  # 0.05, where 0.01 is stated
+    assert farthest(calibration, problem.scene)[0] < 1.0  # 0.5
 
 
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:

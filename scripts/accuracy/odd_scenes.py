@@ -181,7 +181,7 @@ class Outcome:
     Attributes:
         refused: the message where there was none. sigmas: how many standard deviations the farthest "known" number is
             off, and which. radii: how many stated 95 % radii the farthest located place is off. level: of the verdict,
-            where one of them is too far.
+            where one of them is too far. accused: what was stated, and is right, and is said to be contradicted.
     """
 
     kind: str
@@ -192,11 +192,13 @@ class Outcome:
     which: str = ""
     radii: float = 0.0
     level: str = ""
+    accused: str = ""
 
     def __str__(self) -> str:
         verdict = f", verdict {self.level}" if self.level else ""
         off = f"{self.sigmas:.1f} sd ({self.which}), {self.radii:.2f} radii"
-        return f"{self.kind} / {self.lens} / {self.seed}: {off}{verdict}"
+        accused = f", accused: {self.accused}" if self.accused else ""
+        return f"{self.kind} / {self.lens} / {self.seed}: {off}{verdict}{accused}"
 
     @property
     def wrong(self) -> bool:
@@ -232,7 +234,8 @@ def observed(problem: Problem, noises_px: Sequence[float], seed: int) -> Observa
 def judged(of: Outcome, calibration: Calibration, observations: Observations, scene: Scene) -> Outcome:
     """The outcome, with how far off what came out is."""
     sigmas, which, radii = farthest(calibration, scene)
-    found = replace(of, sigmas=sigmas, which=which, radii=radii)
+    accused = ", ".join(f"{one.owner} {one.quantity}" for one in calibration.conflicts)
+    found = replace(of, sigmas=sigmas, which=which, radii=radii, accused=accused)
     if found.wrong or found.misplaced:
         return replace(found, level=judge_quality(quality_of(calibration, observations)).level)
     return found

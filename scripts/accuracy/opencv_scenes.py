@@ -5,7 +5,8 @@ sizes, Brown's lens or a fisheye, tilted by up to 40 degrees. What the package's
 alike shows here. Everything is calibrated by default. Of a few clicks there are 4 to 14 points, to 0.3, 1 or 2 px, in
 half of the scenes with some places on lines; else all points and lines are seen, to 0.3 px. Counted are scenes in which
 a number that is called "known" is over 5 standard deviations off, or a place over 2.5 times its stated 95 % radius, and
-those of them whose verdict trusts the calibration. `check` asks a camera that nobody touched, `refit` one that was
+those of them whose verdict trusts the calibration; and scenes whose stated heights, all of them right, are said to be
+contradicted. `check` asks a camera that nobody touched, `refit` one that was
 moved, or zoomed by 2 to 5 %, by 4 to 10 clicks. Exits with 1 where there are more than asked.
 """
 
@@ -43,6 +44,7 @@ CLICKS_PX, SEEN_PX = (0.3, 1.0, 2.0), (0.3,)
 STRETCHED, ZOOMED = (0.01, 0.03), (0.02, 0.05)  # of itself, either way
 _CLICKS, _NEW_CLICKS, _ALL = (4, 14), (4, 10), (len(FIELD.points), len(FIELD.points))
 MOST_MISPLACED = 0.02  # of the cameras; by few clicks 3 of 400 have one
+MOST_ACCUSED = 0.005  # of the scenes
 _DEFAULTS = Options()
 _Rng = np.random.Generator
 
@@ -116,11 +118,17 @@ def _clicked(rng: _Rng, height_sigma_m: float | None = None) -> Problem:
 
 
 def _seen(
-    rng: _Rng, lens: _Lens = _usual, stretched: bool = False, low: bool = False, options: Options = _DEFAULTS
+    rng: _Rng,
+    lens: _Lens = _usual,
+    stretched: bool = False,
+    low: bool = False,
+    options: Options = _DEFAULTS,
+    height_sigma_m: float | None = None,
 ) -> Problem:
     drawn, pose = _drawn(rng, lens), _over_the_field(rng, (2.0, 4.0) if low else (3.0, 5.0))
     scene = drawn.seen_from(pose, _ALL, FIELD.curve_names, rng.uniform(0.05, 0.15))
-    return Problem(_stretched(rng, scene) if stretched else scene, options)
+    scene = _stretched(rng, scene) if stretched else scene
+    return Problem(scene, options, () if height_sigma_m is None else (taped(scene, "a", height_sigma_m),))
 
 
 def _of_the_league(rng: _Rng, cameras: int, stretched: bool = False) -> Problem:
@@ -155,9 +163,11 @@ KINDS = {
     "few clicks": Kind(_clicked, CLICKS_PX),
     "few clicks, height to 20 mm": Kind(partial(_clicked, height_sigma_m=0.02), CLICKS_PX),
     "square pictures": Kind(_seen),
+    "square pictures, height to 10 mm": Kind(partial(_seen, height_sigma_m=0.01)),
     "stretched pictures": Kind(partial(_seen, stretched=True), asked=False),
     "stretched, --free-aspect": Kind(partial(_seen, stretched=True, options=Options(free_aspect=True))),
     "fisheyes of 65 to 80 degrees": Kind(partial(_seen, lens=_wide, low=True)),
+    "the same, height to 10 mm": Kind(partial(_seen, lens=_wide, low=True, height_sigma_m=0.01)),
     "tilted sensors": Kind(partial(_seen, lens=_tilted), numbers=False),
     "two cameras": Kind(partial(_of_the_league, cameras=2), (NOISE_PX,)),
     "two cameras, stretched": Kind(partial(_of_the_league, cameras=2, stretched=True), (NOISE_PX,), asked=False),
@@ -255,7 +265,7 @@ _KNOWN = "known numbers over 5 sd off"
 def _told(case: str, every: Sequence[Outcome], cameras: int, asked: bool) -> Iterator[Row]:
     """Counts of what came out wrong; each that did goes to standard error."""
     for one in every:
-        if one.wrong or one.misplaced:
+        if one.wrong or one.misplaced or one.accused:
             print(one, file=sys.stderr, flush=True)
     refused = sum(bool(one.refused) for one in every)
     quantities = Counter(one.which for one in every if one.wrong)
@@ -264,6 +274,7 @@ def _told(case: str, every: Sequence[Outcome], cameras: int, asked: bool) -> Ite
         _KNOWN: (sum(one.wrong for one in every), 0.0, named),
         "places over 2.5 radii off": (sum(one.misplaced for one in every), MOST_MISPLACED * cameras * len(every), ""),
         "either, and trusted": (sum(one.level == "good" for one in every), 0.0, ""),
+        "what is right is contradicted": (sum(bool(one.accused) for one in every), MOST_ACCUSED * len(every), ""),
     }
     yield Row(case, "refused", refused, note=f"{len(every)} scenes")
     for what, (count, most, note) in counts.items():

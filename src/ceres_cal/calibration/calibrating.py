@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -212,18 +212,33 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
         if isinstance(start, Start):
             little_said = replace(sights, observations=little)
             found = attempt(partial(_of_lens_asked, asked, start, little_said, loose))  # quiet: as for the start
-            if isinstance(found, Calibration) and (found.conflicts or free is options):
-                return found
             if isinstance(found, Calibration):
-                # A number that is held, and agrees, tells the rest: without it another lens was taken, and a height
-                # 10 sd off, and one of a few lines' outliers was not.
-                again = attempt(as_asked)  # quiet: from where it starts nothing agrees; what was found does
-                return again if isinstance(again, Calibration) and not again.conflicts else found
+                return _or_as_asked(found, as_asked, observations, is_held=free is not options)
             if free is options:
                 return _of_lens_asked(task, start, sights, options)
         elif free is options or isinstance(start, InputError):
             raise start  # there is no other
     return as_asked()
+
+
+def _or_as_asked(
+    found: Calibration, as_asked: Callable[[], Calibration], observations: Observations, *, is_held: bool
+) -> Calibration:
+    """What was found where what is stated said little, or what is where it says all, if that agrees with it.
+
+    A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd off, and
+    one of a few lines' outliers was not. What only the lens contradicts that was chosen without it may be right.
+    """
+    if is_held == bool(found.conflicts) or not (is_held or found.lens_choices):
+        return found
+    again = attempt(as_asked)  # quiet: from where it starts nothing agrees; what was found does
+    if isinstance(again, CalibrationError) or again.conflicts:
+        return found
+    if not found.conflicts:
+        return again
+    from ceres_cal.calibration.likelier import with_lens_that_agrees
+
+    return with_lens_that_agrees(found, again, observations)
 
 
 def _of_lens_asked(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:

@@ -37,8 +37,8 @@ from ceres_cal.robust.as_built import AS_DRAWN, Built, estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
-# Twice the log-odds of an observation that is taken out: one of a hundred is bad, somewhere within twenty sigmas.
-_PRICE = 13.0
+PRICE = 13.0
+"""Twice the log-odds of an observation that is taken out: one of a hundred is bad, somewhere within twenty sigmas."""
 
 
 def explained_by_another(
@@ -67,7 +67,7 @@ def explained_by_another(
         if other is chosen or other.squares is None:
             continue
         explained = (_explained(seen, other, out, scales) or 0) - by_itself
-        if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
+        if PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
             return True
     return False
 

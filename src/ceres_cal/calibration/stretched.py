@@ -11,12 +11,10 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ceres_cal.base import CalibrationError, attempt, replace
+from ceres_cal.base import CalibrationError, attempt
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.lens_seen import profiles_of
-from ceres_cal.observations import Observations, gather_sights
-from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
-from ceres_cal.posterior.posterior import LEAST_PROBABILITY
+from ceres_cal.calibration.likelier import likelier
+from ceres_cal.observations import Observations
 from ceres_cal.problem.priors import USUAL_ASPECT
 
 # Of pictures, the share that was stretched one way, and the standard deviation of by how much: a guess, for nobody has
@@ -40,15 +38,7 @@ def beside_stretched(
     if isinstance(any_, CalibrationError) or any_.posterior is None:
         return square
     likely = _probability({name: _told(any_, name) for name in square.aspects_alone})
-    one, other, weight = (any_, square, 1.0 - likely) if likely > 0.5 else (square, any_, likely)
-    if weight < LEAST_PROBABILITY or one.posterior is None:
-        return one
-    profiles = profiles_of(one.estimate, gather_sights(observations))
-    reach_px = {name: profile.reach_px for name, profile in profiles.items()}
-    also, followed = OtherLenses(one.estimate, (other.estimate,), (weight,), reach_px), one.posterior.followed_phi
-    keys = [key for key in one.posterior.keys if key.kind in ("camera", "station") and key not in followed]
-    shift = shifts_to_lenses(also, keys, [one.estimate])[0]
-    return replace(one, posterior=one.posterior.with_alternatives(keys, shift, [weight]))
+    return likelier(square, any_, likely, observations)
 
 
 def _told(any_: Calibration, camera: str) -> tuple[float, float]:

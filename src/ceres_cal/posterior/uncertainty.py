@@ -115,7 +115,7 @@ class Uncertainty(Frozen):
     def verdicts(self) -> tuple[Verdict, ...]:
         """Known, weak, unknown or in conflict: one for each shared number, in the order of the posterior's keys."""
         posterior = self.posterior
-        disputed = {(one.owner, one.quantity, one.unit) for one in self.conflicts if one.kind not in _GIVES_WAY}
+        disputed = {one.number for one in self.conflicts if one.kind not in _GIVES_WAY}
         bounds, values = posterior.bounds, values_of(self.estimate, posterior.keys)
         half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
         if posterior.followed:  # a valley that widens farther out is no better known than there

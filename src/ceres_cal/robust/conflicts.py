@@ -36,6 +36,7 @@ from ceres_cal.problem.quantities import difference, intrinsic_keys, values_of
 from ceres_cal.problem.reduced import ReducedInformation, information, normals_with_residuals
 from ceres_cal.robust.robust import RobustSolution, SolvedFrom
 from ceres_cal.robust.stated import (
+    DOUBTED,
     LEVEL,
     Conflict,
     Statement,
@@ -322,7 +323,6 @@ class _ForwardSelection:
         # everything: of heights 5 % wrong at 20 deg, which the true lens contradicts at 2 to 3 sigma, three of twenty
         # were above 0.028.
         worth_a_solve = 0.2
-        doubtful = 0.05  # probability that a statement is wrong, from which on both explanations are named
         tests = [self._linear_test(one) for one in self.left]
         number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
         if number < 0 or tests[number].log_p > np.log(worth_a_solve):
@@ -337,7 +337,7 @@ class _ForwardSelection:
         test = test if after is None else self._confirmed(suspect, after)
         if test.log_p > self._level:
             likely = likely_wrong(test.squared)
-            if after is not None and suspect.kind == "prior" and likely > doubtful:
+            if after is not None and suspect.kind == "prior" and likely > DOUBTED:
                 shift = difference(after.estimate, self.end.estimate, self._first.shared.keys)
                 words = doubted(suspect, test, len(self.every) == 1, likely)
                 self.doubts.append(Doubt(suspect.keys, likely, shift, words))

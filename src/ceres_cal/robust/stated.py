@@ -9,12 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ceres_cal.base import Array, Frozen, is_diagonal, log_chi2_tail, replace, two_digits
+from ceres_cal.effects.aside import DOUBTFUL
 from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Options, Problem, intrinsic_keys, values_of
 
 LEVEL = 1e-3
 """Probability of a conflict where everything stated is right, over all that is stated: a conflict takes a calibration's
 word back, so it is as rare as a coin that falls on one side ten times."""
+DOUBTED = float(1.0 / (1.0 + np.exp(DOUBTFUL)))
+"""Probability that a statement is wrong, from which on both explanations are named, as of a feature aside."""
 _FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 1e-3: "km"}
 _STATED = {"prior": "stated", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
 
@@ -41,6 +44,11 @@ class Conflict(Frozen, eq=True):
     seen_sd: float
     sigmas: float
     words: str
+
+    @property
+    def number(self) -> tuple[str, str, str]:
+        """Whose, what, and in which unit: of a key without its kind."""
+        return self.owner, self.quantity, self.unit
 
 
 class WaldTest(NamedTuple):
@@ -144,10 +152,7 @@ def agreed(priors: Sequence[GaussianPrior], conflicts: Sequence[Conflict]) -> tu
     an outlier is, and of those that contradict each other alone one is left that spans them.
     """
     left = list(priors)
-    disputed = {
-        kind: {(one.owner, one.quantity, one.unit) for one in conflicts if one.kind == kind}
-        for kind in ("prior", "priors")
-    }
+    disputed = {kind: {one.number for one in conflicts if one.kind == kind} for kind in ("prior", "priors")}
     for one in grouped(priors):
         own = {key[1:] for key in one.keys if one.kind == "prior"}
         is_wrong = bool(own & disputed["prior"])
@@ -187,9 +192,18 @@ def number_text(value: float, sd: float, key: Key) -> str:
 
 def likely_wrong(squared: float) -> float:
     """Probability that a statement so far off is wrong, which one in twenty is: as of a line that lies aside."""
-    scatter = 1.0 + FEATURE_ASIDE.scatter**2
-    right, *others = FEATURE_ASIDE.probabilities * np.exp(0.5 * squared * (1.0 - 1.0 / scatter)) / np.sqrt(scatter)
-    return float(np.sum(others) / (right + np.sum(others)))
+    log_odds = log_odds_wrong(squared**0.5) + 0.5 * squared
+    return float(1.0 / (1.0 + np.exp(-log_odds)))
+
+
+def log_odds_wrong(sigmas: float) -> float:
+    """Logarithm of how much likelier a wrong statement is, so many standard deviations off, than a right one that is
+    not off; beyond the farthest that is expected each is as likely.
+    """
+    variances = 1.0 + FEATURE_ASIDE.scatter**2
+    squared = min(sigmas**2, float(variances[-1]))
+    others = (FEATURE_ASIDE.probabilities / np.sqrt(variances) * np.exp(-0.5 * squared / variances))[1:]
+    return float(np.log(np.sum(others) / FEATURE_ASIDE.absent))
 
 
 def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequence[str]) -> Conflict:
@@ -206,8 +220,19 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
 
 def doubted(statement: Statement, test: WaldTest, alone: bool, probability: float) -> str:
     """A statement that is in doubt, in words."""
-    wrong = f"It may be wrong (probability {100.0 * probability:.0f} %)"
-    return f"{_apart(statement, test, alone)}. {wrong}. The stated uncertainties include this: measure again"
+    return f"{_apart(statement, test, alone)}. It {_wrong_by(probability)}"
+
+
+def may_be_wrong(conflict: Conflict, key: Key, probability: float, lens: str) -> str:
+    """In words, that what a conflict with another lens names may be wrong."""
+    stated = number_text(conflict.stated, conflict.stated_sd, key)
+    seen = f"with the lens {lens} everything else says {number_text(conflict.seen, conflict.seen_sd, key)}"
+    return f"the {_STATED[conflict.kind]} {key.quantity} of {key.whose}, {stated}: {seen}. It {_wrong_by(probability)}"
+
+
+def _wrong_by(probability: float) -> str:
+    wrong = f"may be wrong (probability {100.0 * probability:.0f} %)"
+    return f"{wrong}. The stated uncertainties include this: measure again"
 
 
 def _apart(statement: Statement, test: WaldTest, alone: bool) -> str:
