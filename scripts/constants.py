@@ -121,6 +121,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("problem.bundle", "_POSED", "calibrate"),
     *_of("problem.costs", "_LEFT_TO_THE_COMPLEMENT", "calibrate"),
     *_of("start.initialise", "USUAL_PHI", "calibrate", "verdicts"),
+    *_of("start.listed", "_CLEARLY _BY_CHANCE", "calibrate"),
     *_of("start.planes", "_ROUGH_PX _SUSPICIOUS _NO_FIT", "calibrate"),
     *_of("start.closed_forms", "_WRONG", "calibrate"),
     *_of("start.world", "_HOLDS _SCALES _ROUGH _LEFT_OVER _TOLD _OPEN _ALIKE _APART", "calibrate"),

@@ -28,7 +28,7 @@ from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.targets import Target, checkerboard
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.same_labels import with_same_labels
-from ceres_cal.start.same_moments import shown_elsewhere
+from ceres_cal.start.same_moments import shown_otherwise
 
 __all__ = ["say"]
 _BROWN = Options(usual_camera=False, lens="brown")
@@ -230,7 +230,9 @@ def test_exchanged_frames_take_out_no_others() -> None:
 def test_turned_labels_are_no_exchanged_frames() -> None:
     """A board that is labelled turned suits another frame better, by chance."""
     seen = _turned(_rig(checkerboard(4, 6, 0.1), 8), "right", ("board_02", "board_05"))
-    assert not shown_elsewhere(seen)
+    otherwise = shown_otherwise(seen)
+    assert set(otherwise) == {("right", "board_02"), ("right", "board_05")}
+    assert all("its points are turned" in words for words in otherwise.values())
 
 
 def test_a_camera_one_frame_late_is_named() -> None:

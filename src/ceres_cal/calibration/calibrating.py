@@ -34,6 +34,7 @@ from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.initialise import Start, initialise
+from ceres_cal.start.listed import require_as_listed
 
 if TYPE_CHECKING:
     from ceres_cal.calibration.lenses import ChosenLenses
@@ -68,11 +69,13 @@ def calibrate(
         DegenerateError: the observations cannot determine the unknowns; the message names the frame or the numbers.
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image, or in a corner
-            of one that is far larger; a mirrored picture.
+            of one that is far larger; a mirrored picture; points that are listed in another order than their target's.
     """
     options = options or Options()
     require_possible_numbers(observations, options)
     require_filled(observations)
+    if not is_bulk(observations):
+        require_as_listed(observations)
     observations, options = free_dimensions(observations, options)
     with for_small_matrices(), at_most(options.threads):
         try:
@@ -81,9 +84,9 @@ def calibrate(
         except (DegenerateError, SolutionError) as error:
             if odd := next(unfilled(observations), None):
                 raise type(error)(f"{error}; {odd}") from None
-            from ceres_cal.start.same_moments import shifted
+            from ceres_cal.start.same_moments import told_apart
 
-            if apart := next(shifted(observations), None):
+            if apart := next(told_apart(observations), None):
                 raise type(error)(f"{apart}: {error}") from None
             free = _without_priors(observations, options)
             if free is None:

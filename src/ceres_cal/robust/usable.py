@@ -197,15 +197,13 @@ def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterato
     sights = problem.sights
     shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     lost = [(sights.keys[number], shares[number]) for number in np.flatnonzero(shares < 0.5)]
-    elsewhere: Mapping[tuple[str, str], str] = {}
+    otherwise: Mapping[tuple[str, str], str] = {}
     if any(key.placement not in (None, *sights.seen_once) for key, _ in lost):  # of a rig
-        from ceres_cal.start.same_moments import shown_elsewhere
+        from ceres_cal.start.same_moments import shown_otherwise
 
-        elsewhere = shown_elsewhere(problem.observations)
+        otherwise = shown_otherwise(problem.observations)
     for key, share in lost:
-        checks, other = "check its labels, do not use its pose", elsewhere.get((key.station, str(key.placement)))
-        if other is not None:
-            checks = f"it shows the board where another camera sees it at {other!r}: exchange their frames"
+        checks = otherwise.get((key.station, str(key.placement)), "check its labels, do not use its pose")
         yield f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"
 
 

@@ -8,11 +8,11 @@ moments agree on is taken.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Frozen, Pose, median, replace, rotation_exp
+from ceres_cal.base import CalibrationError, Frozen, Pose, attempt, median, replace, rotation_exp
 from ceres_cal.observations import Observations, SightKey, View, gather_sights
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import Target
@@ -48,78 +48,108 @@ def with_same_labels(observations: Observations) -> Labels:
     Raises:
         DegenerateError: a sight whose pose cannot be told.
     """
-    poses = _board_poses(observations)
-    stations = list(dict.fromkeys(key.station for key in poses))
-    alike, turned, unsaid = stations[:1], [], []
-    for station in stations[1:]:
-        shared = [(a, b) for a in poses for b in poses if _is_pair(a, b, alike, station)]
-        if not shared:
-            continue
-        turns = _turns(observations, shared, poses)
+    turned, unsaid, labelled = [], [], observations
+    for station, turns in _beside_the_first(observations, symmetries):
         if turns is None:
             unsaid.append(station)
-            continue
-        alike.append(station)
-        for (_, key), turn in zip(shared, turns, strict=True):
-            if turn is not None:
-                turned.append((station, str(key.placement)))
-                poses[key] = poses[key] @ turn
-                observations = _relabelled(observations, key, turn)
-    return Labels(observations, tuple(dict.fromkeys(turned)), tuple(unsaid))
+        for key, turn in turns or ():
+            turned.append((station, str(key.placement)))
+            labelled = _relabelled(labelled, key, turn)
+    return Labels(labelled, tuple(dict.fromkeys(turned)), tuple(unsaid))
 
 
-def _is_pair(a: SightKey, b: SightKey, alike: Sequence[str], station: str) -> bool:
-    return a.placement == b.placement and a.station == alike[0] and b.station == station
+def listed_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
+    """Station and placement -> in words, how its points are listed otherwise than those that the first station sees."""
+    # quiet: this only adds a cause to what the user reads
+    compared = attempt(lambda: list(_beside_the_first(observations, _listings)))
+    return {
+        (station, str(key.placement)): (
+            f"its points are {'mirrored' if turn.rotation[2, 2] < 0.0 else 'turned'} against those that other cameras "
+            "see: list them in the same order"
+        )
+        for station, turns in ([] if isinstance(compared, CalibrationError) else compared)
+        for key, turn in turns or ()
+    }
 
 
-def _board_poses(observations: Observations) -> dict[SightKey, Pose]:
-    """cam_from_target of every sight of a symmetric board at a placement that several stations show."""
+def _beside_the_first(
+    observations: Observations, turns_of: Callable[[Target], list[Pose]]
+) -> Iterator[tuple[str, list[tuple[SightKey, Pose]] | None]]:
+    """Stations that see boards with the first one, and which of their sights must be turned by what; None where nothing
+    tells.
+    """
+    poses = _board_poses(observations, turns_of)
+    first, *others = dict.fromkeys(key.station for key in poses) or ("",)
+    for station in others:
+        shared = [(a, b) for a in poses for b in poses if _is_pair(a, b, first, station)]
+        if shared:
+            yield station, _turns(observations, shared, poses, turns_of)
+
+
+def _is_pair(a: SightKey, b: SightKey, first: str, station: str) -> bool:
+    return a.placement == b.placement and a.station == first and b.station == station
+
+
+def _board_poses(observations: Observations, turns_of: Callable[[Target], list[Pose]]) -> dict[SightKey, Pose]:
+    """cam_from_target of every sight of a board that may be turned, at a placement that several stations show."""
     sights = gather_sights(observations)
     target_of = {SightKey(view.camera, view.station, view.placement): view.target for view in observations.views}
-    symmetric = {
+    several = {
         key
         for key in sights.keys
-        if key.placement not in (None, *sights.seen_once) and len(symmetries(observations.targets[target_of[key]])) > 1
+        if key.placement not in (None, *sights.seen_once) and len(turns_of(observations.targets[target_of[key]])) > 1
     }
-    if not symmetric:
+    if not several:
         return {}
     posed = posed_sights(sights, _START).by_key(sights)
-    return {key: pose for key, pose in posed.items() if key in symmetric}
+    return {key: pose for key, pose in posed.items() if key in several}
 
 
 def symmetries(target: Target) -> list[Pose]:
     """Turns about a board's middle after which it looks the same, as far as its corners tell; the first is none."""
     grid = target.grid
-    if grid is None or (grid.checkered and (grid.columns + grid.rows) % 2 == 1):
+    if grid is not None and grid.checkered and (grid.columns + grid.rows) % 2 == 1:
+        return [Pose.identity()]
+    return [turn for turn in _listings(target) if turn.rotation[2, 2] > 0.0]
+
+
+def _listings(target: Target) -> list[Pose]:
+    """Turns after which points of a grid lie where others did: those in which its mirrored picture is seen, too."""
+    grid = target.grid
+    if grid is None:
         return [Pose.identity()]
     middle = np.append(0.5 * grid.spacing_m * (np.array([grid.columns, grid.rows]) - 1.0), 0.0)
     count = 4 if grid.columns == grid.rows else 2
-    rotations = [rotation_exp([0.0, 0.0, 2.0 * np.pi * n / count]) for n in range(count)]
+    about = [rotation_exp([0.0, 0.0, 2.0 * np.pi * n / count]) for n in range(count)]
+    rotations = [*about, *(one @ np.diag([1.0, -1.0, -1.0]) for one in about)]
     return [Pose(rotation, middle - rotation @ middle) for rotation in rotations]
 
 
 def _turns(
-    observations: Observations, shared: Sequence[tuple[SightKey, SightKey]], poses: dict[SightKey, Pose]
-) -> list[Pose | None] | None:
-    """How each second sight of the pairs must be turned, None where it is right; None where nothing tells."""
+    observations: Observations,
+    shared: Sequence[tuple[SightKey, SightKey]],
+    poses: dict[SightKey, Pose],
+    turns_of: Callable[[Target], list[Pose]],
+) -> list[tuple[SightKey, Pose]] | None:
+    """Which second sights of the pairs must be turned, and how; None where nothing tells."""
     # Of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike.
     # By how much another labelling must be worse, as a factor, to be out of the question.
     clearly = 3.0
     alike = 0.15
     target_of = {view.placement: observations.targets[view.target] for view in observations.views}
-    turns = [symmetries(target_of[b.placement]) for _, b in shared]
+    turns = [turns_of(target_of[b.placement]) for _, b in shared]
     between = [[poses[b] @ turn @ poses[a].inverse for turn in own] for (a, b), own in zip(shared, turns, strict=True)]
     depth = median(np.array([poses[b].position @ poses[b].position for _, b in shared])) ** 0.5
-    answers = []
+    answers, most = [], max(map(len, turns))
     for pose in (one for own in between for one in own):
         off = [[apart(pose, other, depth) for other in own] for own in between]
-        answers.append((float(np.mean(np.min([row + [np.inf] * (4 - len(row)) for row in off], axis=1))), off, pose))
+        answers.append((float(np.mean(np.min([row + [np.inf] * (most - len(row)) for row in off], axis=1))), off, pose))
     cost, off, best = min(answers, key=lambda answer: answer[0])
     others = [answer[0] for answer in answers if apart(answer[2], best, depth) > alike]
     if len(shared) < 2 or (others and min(others) < clearly * max(cost, 0.01)):
         return None
     numbers = [int(np.argmin(row)) for row in off]
-    return [own[number] if number else None for own, number in zip(turns, numbers, strict=True)]
+    return [(key, own[number]) for (_, key), own, number in zip(shared, turns, numbers, strict=True) if number]
 
 
 def apart(a: Pose, b: Pose, depth: float) -> float:

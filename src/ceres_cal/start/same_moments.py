@@ -16,7 +16,7 @@ from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem import Estimate, Options, Problem
 from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.start.initialise import posed_sights
-from ceres_cal.start.same_labels import apart
+from ceres_cal.start.same_labels import apart, listed_otherwise
 
 _FEWEST = 4  # moments that say how cameras stand: of three, two agree by chance
 _ADVICE = (
@@ -81,11 +81,23 @@ def shifted(observations: Observations) -> Iterator[str]:
             )
 
 
-def shown_elsewhere(observations: Observations) -> dict[tuple[str, str], str]:
-    """Station and placement -> the placement at which the other camera sees the board there."""
-    found: dict[tuple[str, str], str] = {}
+def told_apart(observations: Observations) -> Iterator[str]:
+    """In words, why stations may contradict one another: their frames, or how they list points of boards."""
+    yield from shifted(observations)
+    if every := listed_otherwise(observations):
+        (station, placement), words = next(iter(every.items()))
+        others = f" and at {counted(len(every) - 1, 'other')}" if len(every) > 1 else ""
+        yield f"station {station!r}, placement {placement!r}{others}: {words}"
+
+
+def shown_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
+    """Station and placement -> what to do where the other camera sees the board there otherwise, at another placement
+    or with its points in another order.
+    """
+    found = listed_otherwise(observations)
     for moments in _moments(observations):
-        found |= dict(moments.exchanged())
+        for key, other in moments.exchanged():
+            found[key] = f"it shows the board where another camera sees it at {other!r}: exchange their frames"
     return found
 
 

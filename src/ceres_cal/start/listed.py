@@ -1,0 +1,113 @@
+"""Points of flat targets that are listed in another order than the target's: column by column, from the last to the
+first, there and back.
+
+A plane's picture is about a homography, whatever the lens. Points under each other's names make none, and are one again
+once they are read in the order in which they were listed. Orders that look like the target turned or mirrored fit as
+well as its own, so nothing is said of them here: half a turn matters to a rig alone (`same_labels`), and a target that
+is seen from its other side is named after the solve (`calibration.outcome`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from ceres_cal.base import Array, Indices, InputError, evenly, first_of, log_binomial_tail
+from ceres_cal.observations import Observations, bounds_of, ranges
+from ceres_cal.start.closed_forms import PlaneData, RadialProfile, homographies_of_sights
+
+_FEWEST = 6  # points of a view: of four any order makes a homography, and a fifth hardly contradicts it
+# As a factor, by which the right order leaves less: before fisheyes it is 5 and more, and a grid's mirrored order is 1.
+_CLEARLY = 2.0
+# Of a view, that some order fits as well by chance: a thousand views are misjudged once in a thousand times.
+_BY_CHANCE = 1e-6
+
+
+def require_as_listed(observations: Observations) -> None:
+    """Raise InputError naming the views of a target whose points are listed in another order than the target's."""
+    for name, target in observations.targets.items():
+        numbers = np.flatnonzero([view.target == name for view in observations.views])
+        places = target.point_array
+        if len(places) < _FEWEST or np.ptp(places[:, 2]) > 0.0 or not len(numbers):
+            continue
+        found = dict[str, list[str]]()
+        for number, order in _in_another_order(observations, numbers, places[:, :2]):
+            found.setdefault(order, []).append(repr(observations.views[number].frame))
+        if found:
+            orders = [f"{order} in {len(of)} of {len(numbers)} views ({first_of(of)})" for order, of in found.items()]
+            raise InputError(
+                f"target {name!r}: its points are listed {', '.join(orders)}: list them in the target's own order, or "
+                "correct its numbers of columns and rows"
+            )
+
+
+def _in_another_order(observations: Observations, numbers: Indices, places: Array) -> Iterator[tuple[int, str]]:
+    """Numbers of views of a target with points at places (P, 2), and the order in which they list them."""
+    points, most = observations.points, 100  # of a view that are looked at again: a board is no other with more
+    by_view = np.argsort(points.view, kind="stable")
+    counts = np.bincount(points.view, minlength=len(observations.views))
+    asked, all_bounds = numbers[counts[numbers] >= _FEWEST], bounds_of(counts)
+    if not len(asked):
+        return
+    rows, bounds = by_view[ranges(all_bounds, asked)], bounds_of(counts[asked])
+    words, orders = zip(("", np.arange(len(places))), *_orders(places), strict=True)
+    listed = places[np.array(orders)]
+    of_all = [_mean_misfits(one[points.feature[rows]], points.pixels[rows], bounds) for one in listed]
+    may_be = np.min(of_all, axis=0) < 0.9 * of_all[0]  # strays decide about it
+    for number in asked[may_be].tolist():
+        own = by_view[all_bounds[number] + evenly(int(counts[number]), most)]
+        left_px, by_chance = _left(listed[:, points.feature[own]], points.pixels[own])
+        first = int(np.argmax(left_px <= 1.01 * np.min(left_px)))  # of those that are the same but for a symmetry
+        if left_px[first] * _CLEARLY < left_px[0] and by_chance[first] < _BY_CHANCE:
+            yield number, words[first]
+
+
+def _mean_misfits(plane: Array, pixels: Array, bounds: Indices) -> Array:
+    """(S,) px by which the points of views lie from a homography."""
+    middle = np.add.reduceat(pixels, bounds[:-1]) / np.diff(bounds)[:, None]
+    offsets = pixels - np.repeat(middle, np.diff(bounds), axis=0)
+    off_px = homographies_of_sights(PlaneData(bounds, plane, offsets), _straight(offsets))[1]
+    return np.asarray(np.add.reduceat(off_px, bounds[:-1]) / np.diff(bounds))
+
+
+def _left(plane: Array, pixels: Array) -> tuple[Array, Array]:
+    """Of O orders by which a view's points are at places (O, K, 2): (O,) px within which three quarters lie from a
+    homography through four of them, and the probability that so many do by chance. The fours are the same of all
+    orders, so that those which look alike leave the same.
+    """
+    tries = 50  # of a tenth that are strays 33 hold none
+    offsets, (orders, count) = pixels - pixels.mean(axis=0), plane.shape[:2]
+    fours = np.random.default_rng(0).permuted(np.tile(np.arange(count), (tries, 1)), axis=1)[:, :4]
+    seen = np.tile(offsets[fours].reshape(-1, 2), (orders, 1))
+    data = PlaneData(4 * np.arange(orders * tries + 1), plane[:, fours].reshape(-1, 2), seen)
+    matrices = homographies_of_sights(data, _straight(offsets))[0].reshape(orders, tries, 3, 3)
+    shown = np.einsum("otij,okj->otki", matrices, np.dstack([plane, np.ones((orders, count))]))
+    with np.errstate(all="ignore"):
+        off_px = np.linalg.norm(np.nan_to_num(shown[..., :2] / shown[..., 2:] - offsets, nan=np.inf), axis=3)
+    within = 3 * count // 4
+    left_px = np.sort(off_px, axis=2)[:, :, within].min(axis=1)
+    area = 12.0 * np.sqrt(np.linalg.det(np.cov(offsets.T)))  # of a rectangle that is evenly filled
+    near = np.minimum(np.pi * left_px**2 / max(area, 1e-9), 1.0)
+    by_chance = np.exp(log_binomial_tail(within - 3, count - 4, near))
+    return left_px, orders * tries * by_chance
+
+
+def _straight(offsets: Array) -> RadialProfile:
+    """That of a lens that bends nothing."""
+    return RadialProfile((), float(np.max(np.abs(offsets))))
+
+
+def _orders(places: Array) -> Iterator[tuple[str, Indices]]:
+    """Orders in which points at places (P, 2) may be listed: in words, and the number of the point at each place of the
+    list.
+    """
+    yield "in reverse order", np.arange(len(places))[::-1]
+    x, y = places.round(9).T
+    for across, along in product((1.0, -1.0), repeat=2):
+        yield "row by row", np.lexsort([across * x, along * y])
+        yield "column by column", np.lexsort([along * y, across * x])
+    for words, on, over in (("row by row, there and back", x, y), ("column by column, there and back", y, x)):
+        turn = np.unique(over, return_inverse=True)[1] % 2
+        yield words, np.lexsort([np.where(turn, -on, on), over])
