@@ -14,7 +14,7 @@ from rendering.photography import taken_as
 from scenery import field_scene, overhead_pose
 from thorough import partly
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.frozen import replace
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
@@ -24,6 +24,7 @@ from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.images import light
 from ceres_cal.detect.lines import SPACING_PX, measure
 from ceres_cal.detect.photographs import Auto, Facing, detect_field
+from ceres_cal.detect.photographs.by_hand import Clicks
 from ceres_cal.detect.photographs.candidates import candidates, off_centre, prepare_search
 from ceres_cal.detect.photographs.follow import Tracker
 from ceres_cal.detect.photographs.grid import agreeing_with_facing, grid_of, nearest_to_before, side_of
@@ -205,6 +206,22 @@ def test_a_search_ends_and_says_so(shot: script.Shot, looks: int, monkeypatch: p
     result = search(light(shot.picture.image), FIELD, NAMES, TOP)
     assert result.followed is None
     assert result.reason.startswith("the field was not found within 60 s of processor time: check the target's")
+
+
+@pytest.mark.parametrize("painted", partly(["A", "B"], ["B"]))
+def test_the_other_division_is_named(painted: str, tmp_path: Path) -> None:
+    """Where that is what is painted: whether nothing or clicks say where it is."""
+    asked = ssl_field("B" if painted == "A" else "A")
+    shot = disturbed.taken("plain", 4, ssl_field(painted))
+    path = tmp_path / "field.png"
+    cv2.imwrite(str(path), shot.image)
+    points = ssl_field(painted).points
+    names = ("TopLeftCorner", "TopRightCorner", "BottomLeftCorner", "BottomRightCorner")
+    x, y = shot.camera.project(np.array([points[name] for name in names])).T.tolist()
+    clicks = Clicks(dict(zip(names, zip(x, y, strict=True), strict=True)))
+    for start in (Auto(), clicks):
+        with pytest.raises(NothingShownError, match=f"it shows ssl-{painted.lower()}: give that as the target"):
+            detect_field([path], asked, start)
 
 
 @pytest.mark.parametrize("kind", ["flat", "noise", "board"])

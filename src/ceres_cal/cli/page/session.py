@@ -346,7 +346,7 @@ def _about(target: scene.Target, words: str) -> dict[str, Any]:
     return {
         "words": words,
         "points": list(target.point_names),
-        "curves": [name for name, curve in target.curves.items() if curve.width_m > 0.0],
+        "curves": list(target.painted),
         "dimensions": dict(target.dimensions),
     }
 

@@ -29,12 +29,13 @@ from ceres_cal.detect.photographs.follow import follow
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
-from ceres_cal.detect.photographs.search import SearchResult, SeveralWaysError, search
+from ceres_cal.detect.photographs.search import OTHER, SearchResult, SeveralWaysError, search
 from ceres_cal.detect.strokes import Strokes, strokes_of_signs
 from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Prior, View, combine, joined
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
 from ceres_cal.scene import Camera, Target, require_features
+from ceres_cal.scene.targets import others_of_kind
 
 TARGET_NAME = "field"
 Start = Camera | Clicks | Auto
@@ -254,7 +255,7 @@ def require_findable(
             no painted line shows.
     """
     require_features(target, curves=curves or ())
-    painted = tuple(n for n, curve in target.curves.items() if curve.width_m > 0.0 and (curves is None or n in curves))
+    painted = tuple(name for name in target.painted if curves is None or name in curves)
     if not painted:
         raise InputError(
             "the target has no painted curve: a line to be found needs a width; boards are found by `detect board`, or "
@@ -299,7 +300,7 @@ def _looked_for(
         for dark, strokes in before or _signs(grey, is_near=isinstance(start, Camera)):
             one = _looked_from(negative(grey) if dark else grey, target, painted, at, options, strokes)
             tried.append(replace(one, darker=dark))
-            if one.followed is not None:
+            if one.followed is not None or one.shows:
                 return tried[-1]
     return tried[0]
 
@@ -329,6 +330,11 @@ def _looked_from(
         other = attempt(partial(search, grey, target, painted, auto), InputError)
         if isinstance(other, SearchResult) and other.followed is not None:
             return SearchResult(other.followed)
+    for name, another in others_of_kind(target).items() if isinstance(start, Clicks) else ():
+        starts, free = _starts(start, another, (int(grey.shape[1]), int(grey.shape[0])), ())
+        there = follow(grey, another, starts, another.painted, free)
+        if there.is_field and not there.built.dimensions:
+            return SearchResult(None, OTHER.format(name), seen=followed, shows=name)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 
 

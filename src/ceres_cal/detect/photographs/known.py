@@ -147,7 +147,7 @@ def check_photographs(
 
 def is_painted(target: Target) -> bool:
     """Whether a target has lines to be found in photographs: those with a width."""
-    return any(curve.width_m > 0.0 for curve in target.curves.values())
+    return bool(target.painted)
 
 
 def _counted(images: int) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import Array32, Frozen, InputError, replace
+from ceres_cal.base import Array32, CalibrationError, Frozen, InputError, attempt, replace
 from ceres_cal.detect.photographs.by_hand import SIGMA_PX, unknown_optics
 from ceres_cal.detect.photographs.candidates import (
     BUDGET_S,
@@ -33,6 +34,7 @@ from ceres_cal.detect.photographs.judgement import detected_curves, explained, l
 from ceres_cal.detect.photographs.refit import PointHints
 from ceres_cal.detect.strokes import Strokes
 from ceres_cal.scene import Camera, Target, in_image
+from ceres_cal.scene.targets import others_of_kind
 
 # Of the strokes explained, by the first without an objection: no other is followed, nor after one whose lines lie as
 # drawn to millimetres. It only saves time. Nothing changes from 0.82 to 0.95.
@@ -42,6 +44,7 @@ _SURE = 0.9
 _AS_GOOD = 0.87
 # The likeliest candidates, which a lens of another kind may suit: of 41 pictures that show the field one needs two.
 _MOST_REFINED = 2
+OTHER = "it shows {0}: give that as the target (--target {0})"
 _NO_LINES = (
     "no lines at right angles that could be this field's, two one way and one across: "
     "check the target's dimensions, or start from corners"
@@ -65,6 +68,7 @@ class SearchResult(Frozen):
         ways: in how many ways the photograph can be taken for the field; 0: none was looked for, a start was given.
             chosen_by: what chose one of them: "facing", "before", or nothing, where there is but one.
         darker: whether its lines were looked for as darker ones than the floor.
+        shows: the name of another target of the same kind that is found in its place.
     """
 
     followed: Followed | None
@@ -73,6 +77,7 @@ class SearchResult(Frozen):
     chosen_by: str = ""
     seen: Followed | None = None
     darker: bool = False
+    shows: str = ""
 
 
 def search(
@@ -95,7 +100,12 @@ def search(
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves, auto, strokes)
     result = _search_about(problem)
-    moved = off_centre(problem) if result.followed is None else problem
+    if result.followed is not None:
+        return result
+    for name, other in others_of_kind(target).items():
+        if not problem.is_out_of_time and _shows(problem, other):
+            return replace(result, reason=OTHER.format(name), shows=name)
+    moved = off_centre(problem)
     if moved is problem:
         return result
     about = _search_about(moved)
@@ -125,6 +135,21 @@ def _search_about(problem: FieldSearch) -> SearchResult:
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
     return _one_way(problem, distinct)
+
+
+def _shows(problem: FieldSearch, target: Target) -> bool:
+    """Whether the picture surely shows this target, as it is drawn, in the place of the one that was looked for."""
+    grid = attempt(partial(grid_of, target, target.painted), InputError)  # quiet: it has no lines to be found by
+    if isinstance(grid, CalibrationError):
+        return False
+    own = replace(problem, grid=grid, asked=Auto(), others=(), looked_at=[], reached=[])
+    for camera, grid in candidates(own)[:1]:
+        own = replace(own, grid=grid)
+        one = _followed(own, camera)
+        if not objection(own, one):
+            refined = _tracker(own, one.target, one.camera).refined_from(one.camera, one.lacks_wholly)
+            return not objection(own, refined) and not refined.built.dimensions
+    return False
 
 
 def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[Followed], Followed | None, str]:

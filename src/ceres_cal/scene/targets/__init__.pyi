@@ -17,6 +17,7 @@ from ceres_cal.scene.targets.target import TARGET_KINDS as TARGET_KINDS
 from ceres_cal.scene.targets.target import Grid as Grid
 from ceres_cal.scene.targets.target import Target as Target
 from ceres_cal.scene.targets.target import TargetKind as TargetKind
+from ceres_cal.scene.targets.target import others_of_kind as others_of_kind
 from ceres_cal.scene.targets.target import require_features as require_features
 from ceres_cal.scene.targets.target import still as still
 from ceres_cal.scene.targets.target import target_from_spec as target_from_spec

@@ -218,10 +218,15 @@ class Target(Frozen):
         return float(np.max(np.linalg.norm(self.places, axis=1), initial=0.0))
 
     @property
+    def painted(self) -> tuple[str, ...]:
+        """Names of the curves that photographs show: those with a width."""
+        return tuple(name for name, curve in self.curves.items() if curve.width_m > 0.0)
+
+    @property
     def usual_aside_m(self) -> float:
         """By how much a curve lies aside that does: as it states, or as people lay out what is so large; 0 without."""
         aside = 4.2  # times the line's width and a thousandth of the field's length, their geometric mean: 40 mm of 9 m
-        widths = [curve.width_m for curve in self.curves.values() if curve.width_m > 0.0]
+        widths = [self.curves[name].width_m for name in self.painted]
         if self.tolerance_m or not widths:
             return self.tolerance_m or 0.0
         return aside * float(np.sqrt(median(np.array(widths)) * 1e-3 * np.max(np.ptp(self.box, axis=0))))
@@ -346,3 +351,9 @@ def targets_by_name() -> dict[str, Target]:
     """The targets of any kind that exist in the world, such as ssl-a."""
     every = ((kind, *example) for kind in TARGET_KINDS.values() for example in kind.examples().items())
     return {name: target for kind, name, target in every if name != kind.name}
+
+
+def others_of_kind(target: Target) -> dict[str, Target]:
+    """Those of them that are of a target's kind, as the field of the other division, but for itself."""
+    kind = TARGET_KINDS[target.spec["kind"]]
+    return {name: one for name, one in kind.examples().items() if name != kind.name and one.spec != target.spec}
