@@ -613,6 +613,39 @@ def test_observations_that_cannot_tell(observations: Callable[[], Observations],
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("most, height_m, tilt", [(8, 5.3, 0.31), (24, 4.5, 0.1)])
+def test_a_height_in_metres_over_a_target_in_millimetres(most: int, height_m: float, tilt: float) -> None:
+    """Next to no observation agrees with both: there was a traceback of NumPy, and a valley of a million components."""
+    field, pose = ssl_field("B"), Pose.looking((0.3, -0.5, height_m), rotation_exp((np.pi - tilt, 0.02, 0.0)))
+    camera = Camera((1280, 960), 700.0, (640.0, 480.0), Brown((-0.25, 0.06, 0.0, 0.0, 0.0))).at(pose)
+    pixels = camera.project(field.point_array) + np.random.default_rng(1).normal(0.0, 0.5, (len(field.points), 2))
+    seen = ((pixels > 0.0) & (pixels < (1279.0, 959.0))).all(axis=1)
+    pixels[~seen | (np.cumsum(seen) > most)] = np.nan
+    places = custom({name: (1e3 * x, 1e3 * y, 0.0) for name, (x, y, _) in field.points.items()})
+    tape = Prior("station", "camera", "height_m", (height_m,), (0.02,))
+    with pytest.raises(
+        (DegenerateError, SolutionError), match="reaches 5408 m from its origin: are its numbers metres"
+    ):
+        calibrate(Observations.from_points(pixels, places, (1280, 960)), Options(priors=(tape,)))
+
+
+def test_a_first_solve_that_keeps_three_points() -> None:
+    """Three of nine clicks are wrong; lenses were compared by three others, each alone in its part of the picture, and
+    a number was divided by zero.
+    """
+    field, pixels = ssl_field("B"), np.full((len(ssl_field("B").points), 2), np.nan)
+    clicks = {
+        "TopHalfwayCrossing": (88.0738, 457.4173), "BottomHalfwayCrossing": (1266.3674, 601.7756),
+        "CenterMark": (710.7309, 548.0948), "TopCircleCrossing": (639.1353, 526.4480),
+        "BottomCircleCrossing": (822.1763, 563.4578), "LeftCircleCrossing": (722.1672, 633.0666),
+        "RightCircleCrossing": (732.0045, 422.2621), "LeftPenaltyMark": (693.5710, 814.7215),
+        "RightPenaltyMark": (793.1339, 228.0221),
+    }  # fmt: skip
+    pixels[[field.point_names.index(name) for name in clicks]] = list(clicks.values())
+    found = calibrate(Observations.from_points(pixels, field, (1440, 1080)))
+    assert found.station().phi == pytest.approx(1098.2, rel=0.02)  # 0.7 % measured
+
+
 def test_cameras_that_can_do_without_one_are_counted() -> None:
     few = lines_named("HalfwayLine")
     (camera,), views = few.cameras.values(), tuple(replace(one, camera="end", station="end") for one in few.views)

@@ -136,6 +136,15 @@ def test_a_valley_ends_where_the_prior_does() -> None:
     assert np.array_equal(back.bounds, posterior.bounds) and np.array_equal(back.sd, posterior.sd)
 
 
+@pytest.mark.parametrize("far_up", [4.0, 1e6])  # standard deviations; the farther one was 8 million components
+def test_a_steep_valley_has_few_components(far_up: float) -> None:
+    steps = np.column_stack([np.linspace(-30.0, 30.0, 3), np.zeros((3, 4))])
+    across = tuple(Information(KEYS[1:], np.eye(4)) for _ in steps)
+    valley = Mixture.along_phi(KEYS, 800.0, steps, far_up**2 * np.array([1.0, 0.0, 1.0]), across, (False, False))
+    assert len(valley.refined(valley.steps, valley.variances)[0]) < 100
+    assert valley.sd[0] == pytest.approx(30.0 / far_up, rel=0.01)
+
+
 def test_files_of_before_are_read() -> None:
     """Their valley, and one end of each weak direction, are the mixtures that they would be today."""
     steps = np.column_stack([np.linspace(-30.0, 30.0, 13), np.zeros((13, 4))])

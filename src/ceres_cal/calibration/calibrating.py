@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -16,7 +17,7 @@ from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import of_closed_form
 from ceres_cal.calibration.solving import Explained, Task, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
-from ceres_cal.observations.validation import require_filled, unfilled
+from ceres_cal.observations.validation import odd_sizes, require_filled, unfilled
 from ceres_cal.posterior.assess import with_other_lenses
 from ceres_cal.problem import (
     EXACT,
@@ -82,7 +83,7 @@ def calibrate(
             return _measured(observations, options, progress, client)
         # quiet: what agrees with all that was stated is an answer, wherever the search for it began
         except (DegenerateError, SolutionError) as error:
-            if odd := next(unfilled(observations), None):
+            if odd := next(chain(unfilled(observations), odd_sizes(observations)), None):
                 raise type(error)(f"{error}; {odd}") from None
             from ceres_cal.start.same_moments import told_apart
 

@@ -143,7 +143,9 @@ def _solved(options: Options, sights: Sights, start: Estimate, kinds: Sequence[t
         near = initialise(sights, own).estimate if from_nothing else start
         near = seen_through(near, own, profiles_of(near, sights))
         problem = problem_of(sights, own, near)
-        return solve_robustly(problem, near, most_rounds=MOST_ROUNDS if from_nothing else 1)
+        end = solve_robustly(problem, near, most_rounds=MOST_ROUNDS if from_nothing else 1)
+        require_groups(end.problem.sights)  # all may be outliers where a wrong height is stated
+        return end
 
     failure: CalibrationError | None = None
     found: list[_Found] = []
@@ -183,7 +185,7 @@ def last_resort(seen: InlierRows, chosen: Candidate, *, by_most: bool = False) -
     """
     if seen.splits_placements:
         return
-    if by_most or _between_cells(seen, chosen.of) > _TOGETHER:
+    if by_most or _goes_together(seen, chosen.of):
         fewest = min(len(seen.sights.of_camera(name)) for name in seen.sights.cameras)
         for forms in without_formula(of_one_view=fewest == 1):
             yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
@@ -200,8 +202,10 @@ def one_power_more(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:
         yield from seen.kind((Form.among(longer),), is_solved=False).candidates(first=True)
 
 
-def _between_cells(seen: InlierRows, kind: Kind) -> float:
-    """Mean square of residuals between cells over that within them; the x and y of points and each curve apart."""
+def _goes_together(seen: InlierRows, kind: Kind) -> bool:
+    """Whether residuals of a cell do: by their mean square between cells, and within those of more than one; the x and
+    y of points and each curve apart.
+    """
     points, curves = seen.in_sigmas(kind.estimate)
     left = np.concatenate([points[:, 0], points[:, 1], curves])
     cell = cells_of(seen.sights, seen.sights.observations.cameras)
@@ -209,5 +213,5 @@ def _between_cells(seen: InlierRows, kind: Kind) -> float:
     seen_in = counts > 0
     counts = counts[seen_in]
     between = np.bincount(cell, left)[seen_in] ** 2 / counts
-    within = float(left @ left - between.sum()) / max(len(left) - len(counts), 1)
-    return float(between.mean()) / within
+    freedom = len(left) - len(counts)  # none where each residual is alone in its cell
+    return freedom > 0 and float(between.mean()) * freedom > _TOGETHER * float(left @ left - between.sum())

@@ -422,7 +422,7 @@ def _or_failed(near_best: Callable[[], Kind], forms: tuple[Form, ...], start: Es
 def _placed(sights: Sights) -> Mask:
     """(S,) which sights are held out whole: those of placements, where there are enough of them."""
     fewest_placements = 8  # with fewer the features of each are held out one by one
-    placed = np.array([key.placement is not None for key in sights.keys])
+    placed = np.array([key.placement is not None for key in sights.keys], dtype=bool)
     return placed & (np.count_nonzero(placed) >= fewest_placements)
 
 

@@ -245,18 +245,19 @@ class Mixture(Frozen):
         """
         fine = 0.25  # standard deviations from one interpolated place to the next; nothing changes from half to double
         roots, log_phi = chain.roots, np.log(self.phi[chain.at])
-        counts = np.maximum(np.ceil(np.abs(np.diff(roots)) / fine), 2).astype(int)
+        near, each = np.clip(roots, -_REACH, _REACH), np.eye(len(roots))  # farther up nothing weighs
+        beyond, whole = near - roots, np.where(np.diff(roots) == 0.0, 1.0, np.diff(roots))
+        counts = np.maximum(np.ceil(np.abs(np.diff(near)) / fine), 2).astype(int)
+        share = (1.0 + np.diff(beyond) / whole) / counts
         node = np.repeat(np.arange(len(counts)), counts)
-        part = np.concatenate([(np.arange(n) + 0.5) / n for n in counts])
+        part = (beyond[:-1] / whole)[node] + share[node] * np.concatenate([np.arange(n) + 0.5 for n in counts])
         places = np.zeros((len(node), len(roots)))
         places[np.arange(len(node)), node], places[np.arange(len(node)), node + 1] = 1.0 - part, part
         long = (1.0 - _FLAT) * np.abs(np.diff(roots)) + _FLAT * np.abs(np.diff(log_phi))
-        weights = np.exp(-0.5 * (places @ roots) ** 2) * (long / counts)[node]
+        weights = np.exp(-0.5 * (places @ roots) ** 2) * (long * share)[node]
         ends = np.sqrt(2.0 * np.pi) * normal_cdf(-np.abs(roots[[0, -1]]))
-        each, none = np.eye(len(roots)), np.zeros((1, len(roots)))
-        across = (each[node + 1] - each[node]) / counts[node][:, None]
         weights, places = np.concatenate([ends[:1], weights, ends[1:]]), np.concatenate([each[:1], places, each[-1:]])
-        return weights, places, np.concatenate([none, across, none])
+        return weights, places, np.pad((each[node + 1] - each[node]) * share[node][:, None], ((1, 1), (0, 0)))
 
     def _limit(self, chain: Chain, values: Array, sds: Array, end: int) -> Array:
         """Where numbers (N, ...) go beyond an open end: on by a geometric series, each term for another factor two of
