@@ -34,7 +34,7 @@ from ceres_cal.problem.parameters import Options
 from ceres_cal.report.document import Document
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
+from ceres_cal.scene.targets import Arc, Segment, Target, custom, ssl_field
 
 FIELD = ssl_field("B")
 CAMERA = Camera(
@@ -176,6 +176,23 @@ def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
         off = np.linalg.norm(calibration.station().locate(pixels) - FIELD.point_array[:, :2], axis=1)
         over.append(float(np.sqrt(np.mean(off**2) / np.mean(calibration.uncertainty.located(pixels).sd_m ** 2))))
     assert over[0] < 1.6 < over[1]
+
+
+def test_lines_scatter_by_what_all_likely_sizes_say() -> None:
+    """Not by the likeliest of sizes a factor of two apart: pitches that had lines 6 cm aside were trusted to half of
+    what they were off.
+    """
+    laid_m, found = 0.0045, []
+    for seed in range(16):
+        rng = np.random.default_rng([seed, 7])
+        painted = moved({name: tuple(laid_m * rng.normal(size=2)) for name in FIELD.curves if name != "CenterCircle"})
+        circle = FIELD.curves["CenterCircle"]
+        assert isinstance(circle, Arc)
+        x, y, more = laid_m * rng.normal(size=3)
+        aside = Arc((x, y, 0.0), circle.radius_m + more, *circle.parameter_range, circle.width_m)
+        found.append(told(replace(painted, curves={**painted.curves, "CenterCircle": aside})).scatter_m)
+    assert 0.8 < np.sqrt(np.mean(np.square(found))) / laid_m < 1.25  # 0.99
+    assert len({round(one, 6) for one in found}) > 8  # 16, and 3
 
 
 def test_an_offset_is_no_length() -> None:

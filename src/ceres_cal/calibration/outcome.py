@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, first_of, replace, two_digits
+from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, first_of, inverted, replace, two_digits
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import COPY, Fit, Rejected
 from ceres_cal.effects.aside import Explanation
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, SightKey, View
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
@@ -171,7 +171,7 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
     posed = [view for view in observations.views if view.target in boards and view.placement in estimate.placements]
     for name in estimate.cameras:
         own = [view for view in posed if view.camera == name]
-        if own and all(estimate.camera_at(view.station, view.placement).position[2] > 0.0 for view in own):
+        if own and np.all(_heights_of_cameras(estimate, own) > 0.0):
             yield _BEHIND.format(name, len(own))
 
 
@@ -184,12 +184,17 @@ def _seen_from_both_sides(estimate: Estimate, observations: Observations) -> Ite
         views = [one for one in observations.shown_views if one.target == name and one.placement in alone]
         if not views or np.ptp(heights) > 0.0:
             continue
-        cameras = [estimate.camera_at(view.station, view.placement) for view in views]
-        above = np.array([camera.position[2] for camera in cameras]) > heights[0]
+        above = _heights_of_cameras(estimate, views) > heights[0]
         other = above != (2 * np.count_nonzero(above) >= len(views))
         if np.any(other):
             frames = [repr(view.frame) for view, is_other in zip(views, other, strict=True) if is_other]
             yield _MIRRORED.format(name, len(frames), len(views), first_of(frames))
+
+
+def _heights_of_cameras(estimate: Estimate, views: Sequence[View]) -> Array:
+    """(V,) m, of the camera of each view in the frame of its target."""
+    keys = [SightKey(view.camera, view.station, view.placement) for view in views]
+    return np.asarray(inverted(estimate.pose_stack(keys))[:, 2, 3])
 
 
 def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:

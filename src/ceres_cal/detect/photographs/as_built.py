@@ -25,7 +25,7 @@ from ceres_cal.scene.targets.target import PAINT_WANDERS
 
 # Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
 # lie aside, root sum of squares: farther, they are others.
-_SCATTER, _FARTHEST = PAINT_WANDERS * 0.5 ** np.arange(4.0, -1.0, -1.0), 3.0
+_SCATTER, _FARTHEST = PAINT_WANDERS * 0.5 ** np.arange(4.0, -0.5, -0.5), 3.0
 _OTHER = 0.1  # of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 # Sets that go on, parts of one, and parts more by which none explains better, after which none is looked for: of 46
@@ -218,19 +218,22 @@ def _searched(effects: RandomEffects, roots: Sequence[Array], usual_m: float) ->
     modes = effects.modes(np.array(padded).reshape(len(roots), len(effects.turn), width))
     beam: list[frozenset[int]] = [frozenset()]
     scatters_m = _SCATTER * usual_m
-    best, most, scatter_m = frozenset[int](), -np.inf, float(scatters_m[0])
+    best, most, seen = frozenset[int](), -np.inf, list[Array]()
     for _ in range(_MOST + 1):
         sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
         evidence = effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), scatters_m)[:, 0]
-        score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
+        seen.append(evidence + _LOG_ODDS * len(beam[0]))
+        score = seen[-1].max(axis=1)
         order = np.argsort(-score)
         if score[order[0]] > most:
             best, most = beam[order[0]], float(score[order[0]])
-            scatter_m = float(scatters_m[np.argmax(evidence[order[0]])])
+            likeliest = int(np.argmax(evidence[order[0]]))
         if len(beam[0]) - len(best) >= _IN_VAIN:
             break
         kept = [beam[row] for row in order[:_BEAM]]
         beam = list({one | {n} for one in kept for n in range(len(roots)) if n not in one})
         if not beam:
             break
+    likely = np.exp(np.concatenate(seen) - most).sum(axis=0)
+    scatter_m = float(np.sqrt(np.average(scatters_m**2, weights=likely))) if likeliest else float(scatters_m[0])
     return sorted(best), scatter_m
