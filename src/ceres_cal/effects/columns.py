@@ -252,7 +252,7 @@ class SparseColumns(Frozen):
 
     def left_of(self, model: Linearised) -> tuple[Array, Array, Array]:
         """V (Q, Q) and u (Q,), see `effects.evidence`, and what the shared numbers take (P, Q)."""
-        private, shared = self.in_private(model).reshape(-1, self.size), self.in_shared(model)
+        private, shared = np.concatenate(self.in_private(model)), self.in_shared(model)
         return self.products() - private.T @ private - shared.T @ shared, self.summed(model.left_over), shared
 
 

@@ -299,8 +299,10 @@ class Effect(Frozen):
             yield replace(columns, kind=self.kind)
 
     def prior_of(self, columns: EffectColumns, number: int, case: Case) -> SizePrior | None:
-        """The prior of one of its groups."""
-        return self.prior and self.prior.times(self.reach(columns, number, case))
+        """The prior of one of its groups; None of a target as built of which somebody stated a tolerance."""
+        if self.prior is None or (self.built and columns.subjects[number] in case.problem.options.tolerances):
+            return None
+        return self.prior.times(self.reach(columns, number, case))
 
     def evidence(self, case: Case, score: ScoreTest, others: Linearised, left_over: Array) -> Evidence:
         """For one of its groups, beside other effects in a model, which all together leave so much (E,)."""

@@ -82,9 +82,9 @@ HEIGHTS = SizePrior(0.8, AS_BUILT.sizes)
 """Of how high a board's points lie beside its bows. A few distant views say nothing of that, so even odds would be left
 as they are, and taken for waves by two of twelve flat boards. Of eight public sets seven say it at a probability of 1.
 """
-STRETCHED = SizePrior(0.8, tuple(np.geomspace(1e-5, 5e-3, 24).tolist()))
+STRETCHED = SizePrior(0.8, tuple(np.geomspace(1e-5, 1e-2, 27).tolist()))
 """Of by how much a board is stretched along each of its sides: a printer's rollers and its paper do half a percent, and
-what does more is another size of page. Both sides alike is what no view shows, so what is open of that is as likely.
+a page that is fitted to another 2 %. Both sides alike is what no view shows, so what is open of that is as likely.
 As rare as HEIGHTS: where all views show the board turned alike nothing is said of it, either.
 """
 FLOOR_OFF = SizePrior(0.8, (0.0005,))
@@ -269,7 +269,9 @@ class RepeatedAmounts(Frozen):
         parts = int(part.max()) + 1
         information, score, in_shared = columns.left_of(model)
         rounding = 1e-12  # of what they are before anything is taken: where all of it is, that is left
-        ridge = _DETERMINED * float(np.max(np.diagonal(information))) + rounding * float(np.sum(columns.values**2))
+        ridge = _DETERMINED * float(np.max(np.diagonal(information), initial=0.0)) + rounding * float(
+            np.sum(columns.values**2)
+        )
         root = inverse_root_of(information + ridge * np.eye(columns.size))
         best = columns.at(root.T @ (root @ score))
         left = np.where(model.used, model.left_over - model.left_of_column(best), 0.0)

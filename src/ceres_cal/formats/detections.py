@@ -19,7 +19,7 @@ from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.observations import NO_CURVES, Curves, Observations, Points, View
-from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, target_named, targets_by_name
+from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, of_places, target_named, targets_by_name
 
 
 def _read_corners(
@@ -122,7 +122,7 @@ def _read_table(
     if not rows:
         raise InputError("it holds no row")
     places = [_place(row, number) for number, row in enumerate(rows, start=2)] if "X_m" in names else []
-    drawn = _target(target, places)
+    drawn = _target(target, places, moves)
     views: dict[View, int] = {}
     points, curves = [], []
     for number, row in enumerate(rows, start=2):
@@ -159,9 +159,9 @@ def _view(row: Mapping[str, Any], camera: str, *, moves: bool) -> View:
     )
 
 
-def _target(name: str, places: Sequence[tuple[float, float, float]]) -> Target:
+def _target(name: str, places: Sequence[tuple[float, float, float]], moves: bool) -> Target:
     if places:
-        return custom({_place_name(place): place for place in places})
+        return of_places({_place_name(place): place for place in places}, moves=moves)
     if (known := target_named(name)) is None:
         raise InputError(f"target {name!r} is unknown: give one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
     return known

@@ -23,7 +23,7 @@ def points_by_frame(
     moves: bool | None,
 ) -> Content:
     """See `Observations.from_points`."""
-    target = points if isinstance(points, Target) else _points_target(points)
+    target = points if isinstance(points, Target) else _points_target(points, bool(moves))
     frames = _frames(pixels)
     movable = target.movable if moves is None else moves
     views, seen_rows, name = [], [], _name(target) if isinstance(points, Target) else "target"
@@ -80,15 +80,15 @@ def _name(target: Target) -> str:
     return "board" if target.movable else "field"
 
 
-def _points_target(places: Any) -> Target:
+def _points_target(places: Any, moves: bool) -> Target:
     """A target of points (N, 3) or (N, 2) m, named by their numbers."""
-    from ceres_cal.scene.targets import custom
+    from ceres_cal.scene.targets import of_places
 
     given = numbers_in(places, "points")
     if given.ndim != 2 or given.shape[1] not in (2, 3):
         raise InputError(f"points must have shape (N, 3) or (N, 2), in metres, not {given.shape}")
     whole = np.column_stack([given, np.zeros((len(given), 3 - given.shape[1]))])
-    return custom({str(number): (x, y, z) for number, (x, y, z) in enumerate(whole.tolist())})
+    return of_places({str(number): (x, y, z) for number, (x, y, z) in enumerate(whole.tolist())}, moves=moves)
 
 
 def _frames(pixels: Any) -> Mapping[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base import Array, DegenerateError, Frozen, Indices, field, replace, rms
+from ceres_cal.base import Array, DegenerateError, Frozen, Indices, field, inverse_of, replace, rms
 from ceres_cal.effects import AsBuilt, Explanation, Linearised, SparseColumns, Weights, make_linear_model, smooth_image
 from ceres_cal.effects.evidence import (
     AS_BUILT,
@@ -41,7 +41,9 @@ from ceres_cal.robust.robust import RobustSolution, SolvedFrom, judge_at, solve_
 from ceres_cal.scene.targets import Target
 
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
-_STILL = 0.5  # standard deviations by which offsets may still move: what five bows are is known to a hundredth
+# Standard deviations by which offsets may still move, root mean square of those directions that are known apart: of a
+# board's two sides the difference is known to a hundredth of what each is.
+_STILL = 0.5
 
 
 class OfViews(Frozen):
@@ -59,13 +61,14 @@ class Built(Frozen):
     """How targets are likely built.
 
     Attributes:
-        every: the kinds of features that are not where they are drawn. whole: their likeliest offsets. sd: of these;
-            infinite where nothing was found.
+        every: the kinds of features that are not where they are drawn. whole: their likeliest offsets. moved: (Q,)
+            numbers of those that were found. covariance: (Q, Q) of these.
     """
 
     every: tuple[AsBuilt, ...] = ()
     whole: Structure = EXACT
-    sd: Array = field(default_factory=lambda: np.empty(0))
+    moved: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     def held(self, sights: Sights) -> Sights:
         """The sights of targets that are drawn as they are built."""
@@ -253,9 +256,9 @@ def _change(now: Built, before: Built) -> float:
     if {(one.target, one.kind) for one in now.every} != set(sigmas):
         return np.inf
     logs = [abs(float(np.log(one.sigma_m / sigmas[one.target, one.kind]))) for one in now.every]
-    steps = (now.whole.values - now.whole.carrying(before.whole).values) / now.sd
-    moved = float(np.linalg.norm(steps)) / max(int(np.count_nonzero(steps)), 1) ** 0.5
-    return float(max(max(logs, default=0.0) / _AT_REST, moved / _STILL))
+    steps = (now.whole.values - now.whole.carrying(before.whole).values)[now.moved]
+    moved = float(steps @ inverse_of(now.covariance) @ steps) / max(len(steps), 1)
+    return float(max(max(logs, default=0.0) / _AT_REST, moved**0.5 / _STILL))
 
 
 def _measured(every: Sequence[AsBuilt], structure: Structure, targets: Mapping[str, Target]) -> Iterator[AsBuilt]:
@@ -374,10 +377,9 @@ def estimate_as_built(
     numbers = [kinds[one.target, one.kind] for one in every]
     moved = np.concatenate([np.empty(0, dtype=np.int64), *numbers])
     sigmas = np.repeat([one.sigma_m for one in every], [len(own) for own in numbers])
-    values, sd = as_stated.values.copy(), np.full(len(as_stated.values), np.inf)
+    values = as_stated.values.copy()
     values[moved], covariance = repeats.amounts(moved, sigmas)
-    sd[moved] = np.sqrt(np.diagonal(covariance))
-    return Built(every, structure.with_values(values), sd)
+    return Built(every, structure.with_values(values), moved, covariance)
 
 
 def some_sights(sights: Sights, most: int) -> Sights:

@@ -4,7 +4,8 @@ Such an effect displaces the observations by amounts that are the same in all vi
 (`effects.evidence`); where it is likelier that there is one than not, its best amounts are taken off the observations
 and everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
 without the effect as far as it is probable, go into the covariance; an effect that is in doubt, but not solved for,
-does with all of its amounts.
+does with all of its amounts. So does the stretch of a board that few views show: `as_built` solves for what views
+repeat beside what a lens may leave.
 """
 
 from __future__ import annotations
@@ -124,19 +125,19 @@ class _Amounts(Frozen):
         # Of few views, curves tell by how much errors that go together displace; not what a lens is that is wrong.
         few = len(problem.sights) < _FEWEST_SIGHTS
         repeated = RepeatedAmounts.of(model, every, strand_names(equations, equations.sight) if few else None)
-        numbers = {number: group.own for number, group in enumerate(groups)}
         each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
         priors = {number: prior for number, prior in each if prior is not None}
-        sizes = repeated.sizes(numbers, priors)
-        taken = -model.root @ repeated.in_shared
-        return cls(
-            case, repeated, taken, groups, [sizes.get(number, (0.0, 0.0)) for number in numbers], solves and not few
-        )
+        found = repeated.sizes({number: groups[number].own for number in priors}, priors)
+        taken, sizes = -model.root @ repeated.in_shared, [found.get(n, (0.0, 0.0)) for n in range(len(groups))]
+        return cls(case, repeated, taken, groups, sizes, solves and not few)
 
     @cached_property
     def likely(self) -> list[int]:
-        """Numbers of the groups that are solved for."""
-        return [number for number, (_, likely) in enumerate(self.sizes) if self.solves and likely > LIKELY]
+        """Numbers of the groups that are solved for; how boards are built is by itself (`as_built`), or widens."""
+        if not self.solves:
+            return []
+        of_world = (number for number, group in enumerate(self.groups) if not group.effect.built)
+        return [number for number in of_world if self.sizes[number][1] > LIKELY]
 
     @cached_property
     def _best(self) -> tuple[Array, Array]:
@@ -166,7 +167,7 @@ class _Amounts(Frozen):
         return self.case.equations.displacement(self._explained, observations)
 
     def estimates(self) -> Iterator[EffectEstimate]:
-        """Of what is solved for, and how likely it is that a floor is off, which is not."""
+        """Of what is solved for, and how likely it is that a floor or a board is off, which is not."""
         case, (amounts, covariance) = self.case, self._best
         left = case.model.left_over + case.model.left_of_column(self._explained * case.model.weight)
         for number in self.likely:
@@ -176,7 +177,8 @@ class _Amounts(Frozen):
             sentence, _, mending = group.effect.words(group.effect.evidence(case, score, case.model, left))
             yield EffectEstimate(group.effect.kind, score.subject, score.frame, sigma, probability, sentence, mending)
         for number, group in enumerate(self.groups):
-            if number not in self.likely and group.effect.prior is FLOOR_OFF:
+            is_said = group.effect.prior is FLOOR_OFF or (group.effect.built and self.sizes[number][1] > LIKELY)
+            if number not in self.likely and is_said:
                 subject = group.columns.subjects[group.number]
                 yield EffectEstimate(group.effect.kind, subject, None, *self.sizes[number], "", ())
 

@@ -13,7 +13,7 @@ from ceres_cal.base import Array, Indices, Mask, first_of, replace
 from ceres_cal.base.words import with_sd
 from ceres_cal.effects.columns import EffectColumns, grouped
 from ceres_cal.effects.effect import Case, Effect, Evidence, Finding, Words, amounts
-from ceres_cal.effects.evidence import FLOOR_OFF
+from ceres_cal.effects.evidence import FLOOR_OFF, STRETCHED
 from ceres_cal.observations import Observations
 from ceres_cal.problem.structure import STRETCH, WARP, dimension_slopes, dimensions_of
 from ceres_cal.scene.targets import Arc, Segment, still
@@ -265,6 +265,17 @@ def _has_floor(observations: Observations) -> bool:
     return any(not observations.targets[view.target].movable for view in observations.shown_views)
 
 
+def _has_few_boards(observations: Observations) -> bool:
+    """Whether boards are seen that may be stretched without showing it: from 7 views on 0.2 % shows."""
+    most_views = 40  # six times as many, whatever the noise: it takes a tenth of a calibration's time
+    boards = sum(observations.targets[view.target].bows for view in observations.shown_views)
+    return 0 < boards <= most_views
+
+
+def _longer_m(columns: EffectColumns, number: int, case: Case) -> float:
+    return float(np.max(np.ptp(case.problem.observations.targets[columns.subjects[number]].box, axis=0)))
+
+
 def _reach_m(columns: EffectColumns, number: int, case: Case) -> float:
     return _extent(case.equations.place[columns.group == number])[1]
 
@@ -277,7 +288,15 @@ POINT_ASIDE = _of_target("point aside", partial(_offsets, slice(0, 2)), _of_poin
 BOARD_BENT = _of_target("board bent", partial(_offsets, slice(2, 2 + len(WARP))), _of_board, built="warp")
 """A board is bowed along its sides, twisted or wavy."""
 _STRETCHES = slice(-len(STRETCH), None)
-BOARD_STRETCHED = _of_target("board stretched", _stretched, _of_stretch, built="stretch")
+BOARD_STRETCHED = _of_target(
+    "board stretched",
+    _stretched,
+    _of_stretch,
+    built="stretch",
+    prior=STRETCHED,
+    reach=_longer_m,
+    concerns=_has_few_boards,
+)
 """A board is printed longer one way than the other."""
 _of_floor = partial(Effect, absorbed=True, prior=FLOOR_OFF, reach=_reach_m, concerns=_has_floor)
 EFFECTS = (

@@ -4,6 +4,7 @@ from ceres_cal.scene.curves import Curve as Curve
 from ceres_cal.scene.curves import Segment as Segment
 from ceres_cal.scene.targets.charuco_boards import charuco as charuco
 from ceres_cal.scene.targets.custom_targets import custom as custom
+from ceres_cal.scene.targets.custom_targets import of_places as of_places
 from ceres_cal.scene.targets.grids import april_grid as april_grid
 from ceres_cal.scene.targets.grids import checkerboard as checkerboard
 from ceres_cal.scene.targets.grids import circle_grid as circle_grid

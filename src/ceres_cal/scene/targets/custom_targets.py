@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import hypot
 from typing import Any
 
 import msgspec
@@ -10,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base import InputError, checked, convert
 from ceres_cal.scene.curves import Arc, Curve, Segment, with_crossings, xyz
-from ceres_cal.scene.targets.target import Target, TargetKind, require_places
+from ceres_cal.scene.targets.target import HANDY_M, Target, TargetKind, require_places
 
 
 class _CustomSpec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -47,6 +48,11 @@ def custom(
     curves = {**segments, **arcs}  # in the order in which a file would give them back
     every = with_crossings(points, curves)
     return Target(spec, every, curves, movable=movable, bows=movable and not curves and _is_flat(every))
+
+
+def of_places(points: Mapping[str, tuple[float, float, float]], *, moves: bool) -> Target:
+    """A custom target of places alone, which is a board where it moves, unless nobody can hold one so large."""
+    return custom(points, movable=moves and all(hypot(*place) <= HANDY_M for place in points.values()))
 
 
 def _is_flat(points: Mapping[str, tuple[float, float, float]]) -> bool:
