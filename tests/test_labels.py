@@ -7,6 +7,7 @@ import pytest
 from scenery import field_scene, overhead_pose
 
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.diagnostics.diagnosis import diagnose
 from ceres_cal.diagnostics.labels import mended, renamings
 from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Options
@@ -55,6 +56,17 @@ def test_exchanged_names_are_found_and_mended(right: Observations, kind: str, fi
     again = mended(wrong, found)
     assert np.array_equal(again.points.feature, right.points.feature)
     assert np.array_equal(again.curves.feature, right.curves.feature)
+
+
+def test_a_circle_of_another_radius_is_no_wrong_label() -> None:
+    """It was taken out as a whole; the two of its six rows that lie where it crosses a line were said to be of that."""
+    drawn, station = ssl_field("B"), Station("c", overhead_pose(0.3, -0.2, 4.5, 6.0, -9.0))
+    painted = ssl_field("B", center_circle_radius_m=0.55)
+    scene = field_scene(painted, {"c": CAMERA}, {"c": station}, spacing_m=0.55)
+    seen = replace(simulate(scene, Disturbance(0.3, 0.3), 1).observations, targets={"field": drawn})
+    calibration = calibrate(seen, Options(lens="radial"))
+    assert not calibration.inlier_masks(seen)[1][seen.curves.feature == drawn.curve_index["CenterCircle"]].any()
+    assert not diagnose(calibration, seen).findings
 
 
 def test_right_names_stay(right: Observations) -> None:

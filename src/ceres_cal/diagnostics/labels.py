@@ -114,6 +114,9 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
     for label, instead in distinct(np.column_stack([named, nearest])[fits], axis=0):
         tried = named == label
         chosen = fits & tried & (nearest == instead)
+        under_it = np.count_nonzero((column.view == view) & (column.feature == label))
+        if 2 * chosen.sum() <= under_it == (misses & tried).sum():
+            continue  # all of it lies elsewhere, and only crosses the other: a circle of another radius
         near = sight.chance(is_curve, float(away[chosen].max()))
         log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
         groups.append(
