@@ -11,7 +11,7 @@ from data.built_in_scenes import scene_to_json
 from scenery import board_scene, field_scene, join, overhead_pose
 from scenes import camera
 
-from ceres_cal import Calibration, InputError, Observations, Options, calibrate, write_report
+from ceres_cal import Calibration, InputError, Observations, Options, calibrate, painted_field, write_report
 from ceres_cal.base.files import convert
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
@@ -142,6 +142,21 @@ def test_what_is_asked_of_a_target_is_its_own() -> None:
         calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(warp_m=0.001)}))
     with pytest.raises(InputError, match=r"here.size_m: Expected a number, got a text"):
         target_from_spec({"kind": "court", "size_m": "6"}, "here")
+
+
+def test_what_is_mistaken_for_another_field_keeps_its_names() -> None:
+    """The two very small fields number their features otherwise; those of a larger one are not all there."""
+    small, large = painted_field("vss-field", "3v3"), painted_field("vss-field", "5v5")
+    both = [name for name in small.point_names if name in large.points]
+    assert any(small.point_names.index(name) != large.point_names.index(name) for name in both)
+    pixels = np.where([[name in both] for name in large.point_names], [[9.0, 9.0]], np.nan)
+    seen = Observations.from_points(pixels, large, (640, 480))
+    as_small = mistaken_targets(seen)["a 3v3 field"]
+    assert [small.point_names[one] for one in as_small.points.feature] == [
+        large.point_names[one] for one in seen.points.feature
+    ]
+    every = Observations.from_points(np.full((len(large.points), 2), 9.0), large, (640, 480))
+    assert not mistaken_targets(every)
 
 
 def test_half_circles_that_change_places() -> None:

@@ -17,7 +17,7 @@ from ceres_cal.problem import GaussianPrior, Problem, gather_priors, intrinsic_k
 from ceres_cal.problem.information import Information, Key
 from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.problem.quantities import natural_sizes
-from ceres_cal.scene import TURNED, Lens, counterparts, target_from_spec
+from ceres_cal.scene import TURNED, Lens, Target, counterparts, target_from_spec
 
 
 def relabelled(observations: Observations, image: Array) -> Observations | None:
@@ -43,14 +43,32 @@ def relabelled(observations: Observations, image: Array) -> Observations | None:
 
 
 def mistaken_targets(observations: Observations) -> dict[str, Observations]:
-    """The observations as if a target were one of those that it may be mistaken for, such as the other division's
-    field; by what that is, in words.
+    """The observations as if a target were one of those that it may be mistaken for and that have all the features
+    which were seen, such as the other division's field; by what that is, in words.
     """
-    return {
-        words: replace(observations, targets={**observations.targets, name: target_from_spec(spec, words)})
+    every = {
+        words: _on(observations, name, target_from_spec(spec, words))
         for name, target in observations.targets.items()
         for words, spec in target.mistaken_for.items()
     }
+    return {words: seen for words, seen in every.items() if seen is not None}
+
+
+def _on(observations: Observations, name: str, other: Target) -> Observations | None:
+    """The observations of a target with those of its features in another one that are called alike."""
+    target, points, curves = observations.targets[name], observations.points, observations.curves
+    of_it = np.array([view.target == name for view in observations.views], dtype=bool)
+    p, c = points.feature.copy(), curves.feature.copy()
+    for feature, view, names, index in (
+        (p, points.view, target.point_names, other.point_index),
+        (c, curves.view, target.curve_names, other.curve_index),
+    ):
+        to, own = np.array([index.get(one, -1) for one in names], dtype=feature.dtype), of_it[view]
+        feature[own] = to[feature[own]]
+    if np.any(p < 0) or np.any(c < 0):
+        return None
+    targets = {**observations.targets, name: other}
+    return replace(observations, targets=targets, points=replace(points, feature=p), curves=replace(curves, feature=c))
 
 
 # Of its natural size, by how much a number that was let go has usually changed.

@@ -110,7 +110,7 @@ class Target(Frozen):
         bows: whether it is a board that may be bent or stretched: then a tolerance may have a warp.
         grid: how its points stand in columns and rows; None where they do not.
         paper: the sheet that it is printed on; None for what is painted on the floor.
-        mistaken_for: in words -> spec of another target that has features of the same names.
+        mistaken_for: in words -> spec of another target, most of whose features have the same names.
         dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
             spec its features lie elsewhere.
         optional: names of curves that go together and that a field may lack without being another one.
