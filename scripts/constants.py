@@ -96,7 +96,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("posterior.posterior", "LEAST_PROBABILITY", "calibrate", "refit"),
     *_of("posterior.other_lenses", "AGREES", "lens"),
     *_of("calibration.outcome", "_RESTING", "calibrate"),
-    *_of("observations.validation", "_LARGE_M", "calibrate"),
+    *_of("observations.validation", "_LARGE_M _REMOTE_M", "calibrate"),
     *_of("robust.robust", "AT_REST", "calibrate"),
     *_of("robust.robust", "_ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),
     *_of("robust.robust", "AT_REST_AGAIN", "refit"),

@@ -618,3 +618,22 @@ def test_a_name_that_no_file_can_hold(what: str) -> None:
     nothing = Curves(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.ones(0), np.zeros(0, np.int8))
     with pytest.raises(InputError, match=rf"^{what} 'ove\\udce9head': a name must be UTF-8: give another one$"):
         Observations({"field": ssl_field("B")}, {names["camera"]: (640, 480)}, (view,), seen, nothing)
+
+
+@pytest.mark.parametrize(
+    "unit, origin_m, said",
+    [
+        (1.0, 0.0, ""),
+        (1.0, 9e4, ""),  # a surveyor's local grid: it was said to be in millimetres, and never trusted
+        (
+            1.0,
+            5.8e6,
+            "target 'target' lies 5800 km from the origin of its numbers, which costs digits: give them from an ",
+        ),
+        (1e3, 0.0, "target 'target' is 18028 m large: are its numbers metres, or millimetres?"),
+    ],
+)
+def test_sizes_that_are_odd(unit: float, origin_m: float, said: str) -> None:
+    places = np.array([[0.0, 0.0], [15.0, 0.0], [15.0, 10.0], [0.0, 10.0]]) * unit + [origin_m, 0.0]
+    warnings = Observations.from_points(np.full((4, 2), 9.0) + np.eye(4, 2), places, (640, 480)).warnings
+    assert [one[: len(said)] for one in warnings] == [said] * bool(said)

@@ -28,8 +28,11 @@ _MARGIN_PX = 1.5
 # Of a camera's observations: more of them outside, and its image has another size.
 _FEW = 0.01
 _FAR = 10.0  # image diagonals: a pixel farther off was not measured, and its square swamps what was
-# The largest playing fields end at 60 m; the smallest board in millimetres reaches as far.
-_LARGE_M = 100.0
+# The largest playing fields have 126 m from corner to corner; a board of 200 mm has as much in millimetres.
+_LARGE_M = 200.0
+# From the origin of a target's numbers, whence digits are lost: one in eight solves over a parking lot does not come to
+# rest there, none at a tenth of it, three in eight at ten times as far.
+_REMOTE_M = 1e5
 # Of the largest sigma over the smallest: from ten pixels by a click to a thousandth of a pixel by a large target in the
 # image. Beyond it one observation decides alone, and nothing contradicts it.
 _SIGMA_RATIO = 1e4
@@ -173,10 +176,16 @@ def _within(content: Content, reach: Mapping[str, Array], corner: float) -> list
 
 
 def odd_sizes(content: Content) -> Iterator[str]:
-    """A line for each target so large that its numbers may be millimetres."""
+    """A line for each target so large that its numbers may be millimetres, or so far from their origin that digits are
+    lost.
+    """
     for name, target in content.targets.items():
-        if (reach_m := target.reach_m) > _LARGE_M:
-            yield f"target {name!r} reaches {reach_m:.0f} m from its origin: are its numbers metres, or millimetres?"
+        size_m = float(np.linalg.norm(np.ptp(target.places, axis=0)))
+        if size_m > _LARGE_M:
+            yield f"target {name!r} is {size_m:.0f} m large: are its numbers metres, or millimetres?"
+        elif target.reach_m > _REMOTE_M:
+            away = f"{1e-3 * target.reach_m:.0f} km from the origin of its numbers"
+            yield f"target {name!r} lies {away}, which costs digits: give them from an origin near it"
 
 
 # ---- observations that are there twice ------------------------------------------------------------------------------
