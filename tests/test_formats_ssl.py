@@ -316,7 +316,7 @@ def test_published_and_heard_over_the_loopback(
     assert "ssl-field with 25 points and 13 curves from 127.0.0.1:" in capsys.readouterr().out
     two_cameras(SSL_LENS).save(tmp_path / "c.json")
     assert main(["publish", str(tmp_path / "c.json"), "--once", *group]) == 0
-    assert f"1 times to 224.5.23.9:{loopback.port}" in capsys.readouterr().out
+    assert f"1 time to 224.5.23.9:{loopback.port}" in capsys.readouterr().out
     assert main(["listen", "-o", str(tmp_path / "field.pb"), "--seconds", "0.2", *group]) == 2
     assert "no geometry of a field within 0.2 s, but nothing at all" in capsys.readouterr().err
 

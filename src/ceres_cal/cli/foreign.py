@@ -10,6 +10,7 @@ from typing import Any
 
 from ceres_cal import formats, scene
 from ceres_cal.base import InputError, replace
+from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
 from ceres_cal.cli.command import REQUIRED, Arguments, argument, command, flag, option, options_of, switch, whole
 from ceres_cal.cli.files import read_calibration, require_output, save
@@ -144,7 +145,8 @@ def _import(
     path, place = str(output), f"written to {output}"
     if isinstance(given, Observations):
         sizes = {name: len(getattr(given, name)) for name in ("points", "curves", "views")}
-        counts = "{points} points and {curves} curve observations in {views} views".format(**sizes)
+        points, curves = plural(sizes["points"], "point"), plural(sizes["curves"], "curve observation")
+        counts = f"{points} and {curves} in {plural(sizes['views'], 'view')}"
         return Document((Section("import", [counts, place], {"output": path, **sizes}),))
     lines = [f"{name}: {camera!r}" for name, camera in given.stations.items()]
     stations = {name: camera.position.tolist() for name, camera in given.stations.items()}
@@ -187,7 +189,7 @@ def _publish(
     packet, exported = formats.ssl_packet(read_calibration(calibration), station or None, camera_id, geometry)
     exported.require_loss_mm(max_loss_mm)
     sent = formats.publish(packet, _group(args), 1 if once else None)
-    words = f"{exported.words}, {len(packet)} bytes, {sent} times to {args.address}:{args.port}"
+    words = f"{exported.words}, {len(packet)} bytes, {plural(sent, 'time')} to {args.address}:{args.port}"
     lost = [
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
     ]
@@ -232,7 +234,7 @@ def _targets_import(
 def _write_target(target: scene.Target, path: Path, sender: str = "") -> Document:
     save(path, target.spec)
     whence = f" from {sender}" if sender else ""
-    counts = f"{len(target.points)} points and {len(target.curves)} curves"
-    words = f"{target.kind} with {counts}{whence}, written to {path}"
+    points, curves = plural(len(target.points), "point"), plural(len(target.curves), "curve")
+    words = f"{target.kind} with {points} and {curves}{whence}, written to {path}"
     data = {"output": str(path), "spec": target.spec, **({"sender": sender} if sender else {})}
     return Document((Section("target", [words], data),))

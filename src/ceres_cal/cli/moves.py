@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal import base, detect, formats, moves, report, scene
 from ceres_cal.base import HEIGHTS_M, InputError, at_height, fixed, replace, short
+from ceres_cal.base.words import plural
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import REQUIRED, argument, command, option, switch, whole
 from ceres_cal.cli.foreign import from_option, import_options, typed_options
@@ -74,7 +75,7 @@ def _checked_station(one: moves.Agreement) -> Section:
         size = f"{picture}phi {100.0 * phi_change:+.3f} %"
         maps = [(over.height_m, over.mean_mm, over.worst_mm) for over in change.maps]
         lines += [
-            f"{used} observations, {misfit.outliers} outliers, noise {noise:.2f} times as before",
+            f"{plural(used, 'observation')}, {plural(misfit.outliers, 'outlier')}, noise {noise:.2f} times as before",
             f"{moves.moved_words(1e-3 * change.moved_mm, change.turned_deg)}, {size}",
             *(
                 f"map {at_height(h)}: {short(mean, 3)} mm on average, {short(worst, 3)} mm at most"

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, kept_signals, read_bytes
+from ceres_cal.base.words import plural
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera, camera_matrix
@@ -60,7 +61,7 @@ def _export(request: ExportRequest) -> Exported:
         model.write_text(folder)
         content = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
     models = " and ".join(_MODELS[one.model] for one in cameras)
-    return Exported(content, losses, f"{len(cameras)} cameras, {models}, one rig, one frame")
+    return Exported(content, losses, f"{plural(len(cameras), 'camera')}, {models}, one rig, one frame")
 
 
 def _camera(foreign: ForeignCamera, number: int) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, require_rotation
+from ceres_cal.base.words import plural
 from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
@@ -39,7 +40,9 @@ def _export(request: ExportRequest) -> Exported:
     comments = [f"# {line}\n" for loss in losses for line in loss_words(loss)]
     comments.append("# T_cn_cnm1 of cam0 takes points of the field (m) to cam0, as mrcal-to-kalibr writes it\n")
     models = " and ".join(str(one["distortion_model"]) for one in chain.values())
-    return Exported(("".join(comments) + yaml_text(chain)).encode(), losses, f"{len(chain)} cameras, {models}")
+    return Exported(
+        ("".join(comments) + yaml_text(chain)).encode(), losses, f"{plural(len(chain), 'camera')}, {models}"
+    )
 
 
 def _read(request: ImportRequest) -> Any:

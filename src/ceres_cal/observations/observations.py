@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base import Indices, Indices32, InputError, Mask, cached_property, checked, field, naming, replace
-from ceres_cal.base.words import no_such, printable
+from ceres_cal.base.words import no_such, plural, printable
 from ceres_cal.observations.columns import (
     Columns,
     Curves,
@@ -58,8 +58,9 @@ class Observations(Content):
     noise: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        counts = f"{len(self.points)} points, {len(self.curves)} curve observations in {len(self.views)} views"
-        return f"Observations({counts} of {', '.join(self.stations) or 'nothing'})"
+        points, curves = plural(len(self.points), "point"), plural(len(self.curves), "curve observation")
+        stations = ", ".join(self.stations) or "nothing"
+        return f"Observations({points}, {curves} in {plural(len(self.views), 'view')} of {stations})"
 
     def __post_init__(self) -> None:
         self._check_names()

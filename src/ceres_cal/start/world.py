@@ -11,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base import DegenerateError, Frozen, InputError, Pose, Poses, SolutionError, chained, inverted, replace
 from ceres_cal.base.arrays import Array, Indices, distinct, evenly
+from ceres_cal.base.words import plural
 from ceres_cal.observations import Prior, Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
@@ -311,8 +312,8 @@ def _require_all(
             continue
         sight = sights[number]
         frames = ", ".join(repr(sights.observations.views[i].frame) for i in sight.views[0][:3])
-        said = f"{len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations (on "
-        said += f"{len(distinct(sight.track_index))} curves) cannot fix its pose"
+        said = f"{plural(len(sight.point_rows), 'point')} and {plural(len(sight.curve_rows), 'curve observation')} (on "
+        said += f"{plural(len(distinct(sight.track_index)), 'curve')}) cannot fix its pose"
         if names := open_numbers.get(number, ()):
             stated = [_STATED[name] for name in names if name in _STATED]
             state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""

@@ -18,6 +18,7 @@ from msgspec import Struct
 
 from ceres_cal.base import Array, Frozen, LazyTable, Mask, cached_property, convert, did_you_mean, field, median
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.words import plural
 from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
 
 
@@ -148,7 +149,7 @@ class Target(Frozen):
     __hash__: ClassVar[None] = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        return f"Target({self.kind}, {len(self.points)} points, {len(self.curves)} curves)"
+        return f"Target({self.kind}, {plural(len(self.points), 'point')}, {plural(len(self.curves), 'curve')})"
 
     @property
     def kind(self) -> str:
