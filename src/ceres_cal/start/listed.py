@@ -14,10 +14,11 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import Array, Indices, InputError, evenly, first_of, log_binomial_tail
+from ceres_cal.base import Array, Indices, InputError, Mask, evenly, first_of, log_binomial_tail, median
 from ceres_cal.observations import Observations, bounds_of, ranges
 from ceres_cal.start.closed_forms import PlaneData, RadialProfile, homographies_of_sights
 
+_FEW = 16  # points of a view by which it is asked whether its order is looked at
 _FEWEST = 6  # points of a view: of four any order makes a homography, and a fifth hardly contradicts it
 # As a factor, by which the right order leaves less: before fisheyes it is 5 and more, and a grid's mirrored order is 1.
 _CLEARLY = 2.0
@@ -49,6 +50,10 @@ def _in_another_order(observations: Observations, numbers: Indices, places: Arra
     by_view = np.argsort(points.view, kind="stable")
     counts = np.bincount(points.view, minlength=len(observations.views))
     asked, all_bounds = numbers[counts[numbers] >= _FEWEST], bounds_of(counts)
+    if len(asked):
+        evenly_drawn = np.arange(1, _FEW + 1) * 0.6180339887 % 1.0  # in no step that a target's own pattern may have
+        few = by_view[all_bounds[asked, None] + (evenly_drawn * counts[asked, None]).astype(np.int64)]
+        asked = asked[_is_bent(places[points.feature[few]], points.pixels[few], _between_neighbours(places))]
     if not len(asked):
         return
     rows, bounds = by_view[ranges(all_bounds, asked)], bounds_of(counts[asked])
@@ -62,6 +67,29 @@ def _in_another_order(observations: Observations, numbers: Indices, places: Arra
         first = int(np.argmax(left_px <= 1.01 * np.min(left_px)))  # of those that are the same but for a symmetry
         if left_px[first] * _CLEARLY < left_px[0] and by_chance[first] < _BY_CHANCE:
             yield number, words[first]
+
+
+def _is_bent(plane: Array, pixels: Array, between_m: float) -> Mask:
+    """(S,) whether the points of views, at places (S, K, 2), lie so far from a homography that their order is asked
+    for: most lenses leave less, and most calibrations need no more than this.
+
+    Args:
+        between_m: neighbours of the target.
+    """
+    least = 0.5  # of the distance between neighbours: a fisheye leaves 0.2 to 0.4, another order 1.4 and more
+    size_m, size_px = (
+        np.linalg.norm(one - one.mean(axis=1, keepdims=True), axis=2).mean(axis=1) for one in (plane, pixels)
+    )
+    bounds = np.arange(0, plane.shape[0] * plane.shape[1] + 1, plane.shape[1])
+    left_px = _mean_misfits(plane.reshape(-1, 2), pixels.reshape(-1, 2), bounds)
+    return np.asarray(left_px * size_m > least * between_m * size_px)
+
+
+def _between_neighbours(places: Array) -> float:
+    """m, of the places (P, 2) of a target, the median."""
+    some = places[evenly(len(places), _FEW)]
+    apart_m = np.linalg.norm(some[:, None] - places, axis=2)
+    return median(np.min(np.where(apart_m > 0.0, apart_m, np.inf), axis=1))
 
 
 def _mean_misfits(plane: Array, pixels: Array, bounds: Indices) -> Array:
