@@ -1,6 +1,7 @@
 """Two calibrations side by side."""
 
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,6 +11,7 @@ from accuracy.moves import calibrated as calibrated_at_home
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
+from ceres_cal.formats import export, import_calibration
 from ceres_cal.moves.comparisons import compare
 from ceres_cal.moves.refits import refit
 from ceres_cal.report.maps import comparison_svg
@@ -63,11 +65,22 @@ def test_without_uncertainty_nothing_is_explained(calibration: Calibration) -> N
 
 
 def test_no_station_in_common(calibration: Calibration) -> None:
-    other = replace(calibration.estimate, stations={"elsewhere": calibration.estimate.stations["overhead"]})
+    there = calibration.estimate.stations["overhead"]
+    others = replace(calibration.estimate, stations={"elsewhere": there, "nowhere": there})
     with pytest.raises(InputError, match="no station is in both"):
-        compare(calibration, replace(calibration, estimate=other))
-    with pytest.raises(InputError, match="not in both"):
+        compare(calibration, replace(calibration, estimate=others))
+    with pytest.raises(InputError, match="station 'elsewhere' is not in both calibrations: one has 'overhead'"):
         compare(calibration, calibration, station="elsewhere")
+
+
+def test_the_only_station_of_each_may_be_called_otherwise(calibration: Calibration, tmp_path: Path) -> None:
+    """As it is after an export to a format that knows no names, and back."""
+    export(calibration, "mrcal", tmp_path / "elsewhere.cameramodel")
+    back = import_calibration(tmp_path / "elsewhere.cameramodel")
+    assert list(back.stations) == ["elsewhere"]
+    found = compare(calibration, back)["overhead"]
+    assert found.holds is None and found.change is not None
+    assert found.change.maps[0].worst_mm < 0.3  # 0.04 measured
 
 
 def test_the_picture_is_svg(calibration: Calibration) -> None:

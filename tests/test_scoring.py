@@ -154,7 +154,7 @@ def test_a_turn_is_taken_out(calibration: Calibration) -> None:
 
 
 def test_cameras_that_cannot_be_compared(calibration: Calibration) -> None:
-    with pytest.raises(InputError, match="camera 'other' is in both"):
+    with pytest.raises(InputError, match="camera 'other' is not in both"):
         compare_cameras(calibration, calibration, "other")
     small = replace(calibration.cameras["camera"], image_size=(640, 480))
     other = replace(calibration, estimate=replace(calibration.estimate, cameras={"camera": small}))

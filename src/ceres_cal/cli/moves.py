@@ -230,7 +230,9 @@ def _compare(
     a: Path = argument("A", "one calibration"),
     b: Path = argument("B", "the other"),
     height_mm: float | None = arguments.height_option("of the map above the floor; default: 0"),
-    station: str | None = arguments.station_option("only this one; default: all that both have"),
+    station: str | None = arguments.station_option(
+        "only this one; default: all that both have, or the only one of each"
+    ),
     picture: Path | None = option("draw the map there (of one station)", "SVG"),
     over_image: bool = switch("intrinsics, over the image in px; default where there is no field"),
     without_turn: bool = switch(

@@ -28,7 +28,7 @@ from ceres_cal.problem import EXACT, Estimate, Key, difference
 @checked
 @numerical("the comparison")
 def compare(a: Calibration, b: Calibration, height_m: float = 0.0, station: str | None = None) -> Agreements:
-    """Compare two calibrations, station by station.
+    """Compare two calibrations, station by station: those of one name, or the only one of each.
 
     The two count as independent of each other. Where b is a refit of a they share what was known before, and the
     difference that is to be expected is smaller than stated.
@@ -36,35 +36,39 @@ def compare(a: Calibration, b: Calibration, height_m: float = 0.0, station: str 
     Raises:
         InputError: no station that both have, or not the one named; no field to draw a map of.
     """
-    common = [name for name in a.estimate.stations if name in b.estimate.stations]
-    if station is not None and station not in common:
-        raise InputError(f"station {station!r} is not in both calibrations: both have {_listed(common)}")
-    if not common:
-        raise InputError(
-            f"no station is in both calibrations: one has {_listed(list(a.estimate.stations))}, the other "
-            f"{_listed(list(b.estimate.stations))}"
-        )
-    names = [station] if station is not None else common
-    return Agreements({name: _compared(a, b, name, height_m) for name in names}, FALSE_ALARMS)
+    pairs = _pairs("station", list(a.stations), list(b.stations), station)
+    return Agreements({name: _compared(a, b, name, other, height_m) for name, other in pairs}, FALSE_ALARMS)
+
+
+def _pairs(kind: str, first: Sequence[str], second: Sequence[str], asked: str | None) -> list[tuple[str, str]]:
+    """What is called alike in both, or the only one of each; all, or the one asked for."""
+    pairs = [(name, name) for name in first if name in second]
+    if not pairs and len(first) == len(second) == 1:
+        pairs = [(first[0], second[0])]
+    pairs = [pair for pair in pairs if asked in (None, pair[0])]
+    if not pairs:
+        which = f"no {kind} is" if asked is None else f"{kind} {asked!r} is not"
+        raise InputError(f"{which} in both calibrations: one has {_listed(first)}, the other {_listed(second)}")
+    return pairs
 
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(map(repr, names)) or "none"
 
 
-def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> Agreement:
-    grid = FieldGrid(height_m, *field_grid(a.targets))
-    known = [c for c in (a, b) if c.posterior is not None and c.posterior.knows_station(station)]
+def _compared(a: Calibration, b: Calibration, station: str, other: str, height_m: float) -> Agreement:
+    grid, both = FieldGrid(height_m, *field_grid(a.targets)), ((a, station), (b, other))
+    known = [(c, name) for c, name in both if c.posterior is not None and c.posterior.knows_station(name)]
 
     def expected_mm(grid: FieldGrid) -> Array:
-        maps = [field_map(c.estimate, c.uncertainty.posterior, station, grid).sd_mm for c in known]
+        maps = [field_map(c.estimate, c.uncertainty.posterior, name, grid).sd_mm for c, name in known]
         return np.asarray(np.hypot(*maps))
 
     expected = expected_mm if len(known) == 2 else None
-    change = change_of(a.estimate, station, b.station(station), [grid], expected)
-    if len(known) < 2:
+    change = change_of(a.estimate, station, b.station(other), [grid], expected)
+    if len(known) < 2 or station != other:
         return Agreement(name=station, change=change, solution=b)
-    keys, others = (c.uncertainty.posterior.keys_of(c.estimate, station) for c in known)
+    keys, others = (c.uncertainty.posterior.keys_of(c.estimate, name) for c, name in known)
     tested = _tested(a, b, keys, difference(_only(b, station), _only(a, station), keys), set(others))
     return Agreement(name=station, change=change, solution=b, **tested)
 
@@ -111,13 +115,7 @@ def compare_cameras(
     Raises:
         InputError: no camera that both have, or not the one named; images of other sizes.
     """
-    pairs = [(name, name) for name in a.cameras if name in b.cameras]
-    if not pairs and len(a.cameras) == len(b.cameras) == 1:
-        pairs = [(next(iter(a.cameras)), next(iter(b.cameras)))]
-    pairs = [pair for pair in pairs if camera in (None, pair[0])]
-    if not pairs:
-        asked = "no camera" if camera is None else f"camera {camera!r}"
-        raise InputError(f"{asked} is in both calibrations: {_listed([*a.cameras])}, and {_listed([*b.cameras])}")
+    pairs = _pairs("camera", list(a.cameras), list(b.cameras), camera)
     return Agreements({name: _camera_compared(a, b, name, other, without_turn) for name, other in pairs}, FALSE_ALARMS)
 
 
