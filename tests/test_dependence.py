@@ -19,7 +19,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
-from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
+from ceres_cal.effects.dependence import Correlation, Dependence, Scatter, _freedom_of_mixture
 from ceres_cal.effects.groups import GroupScatter, _averaged, _expected
 from ceres_cal.effects.likelihood import likelihoods
 from ceres_cal.effects.strands import Strand, StrandFamily, _shown, decay, decays, distances_of
@@ -417,3 +417,11 @@ def test_what_takes_width_back_is_no_reason_for_it(variance: float, probability:
     dependence = Dependence(between=between)
     assert dependence.is_likely == (probability > 0.5)
     assert bool(dependence.causes) == widens
+
+
+@pytest.mark.parametrize(
+    "length_m, said", [(None, "as a whole"), (0.0099, "over 0.0099 m"), (1.3e-8, "over less than 1 mm")]
+)
+def test_no_length_is_shorter_than_a_millimetre(length_m: float | None, said: str) -> None:
+    repeated = Dependence((Correlation("curves", 0.9, length_m, 0.5, True),))
+    assert repeated.causes == (f"errors are correlated along lines {said} in all views alike",)

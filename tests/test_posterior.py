@@ -173,6 +173,8 @@ def test_one_number_at_a_time() -> None:
         posterior.sd_of("camera", "overhead", "aspect")
     with pytest.raises(InputError, match="placement 'gone' has no free pose"):
         posterior.placement("gone")
+    with pytest.raises(InputError, match=r"no free number 'height_m': did you mean 'height'\?"):
+        posterior.sd_of("station", "overhead", "height_m")
 
 
 @pytest.mark.parametrize("freedom", [5.0, 12.0, 100.0, np.inf])

@@ -246,7 +246,10 @@ class Dependence(Frozen, eq=True):
 
 def _reach(correlation: Correlation) -> str:
     length = correlation.length_m
-    over = " as a whole" if length is None else f" over {two_digits(length)} m"
+    if length is None:
+        over = " as a whole"
+    else:  # what repeats at each place alone has no length: the likeliest one was 13 nm
+        over = f" over {two_digits(length)} m" if length >= 1e-3 else " over less than 1 mm"
     over += "" if correlation.camera is None else f" in camera {correlation.camera!r}"
     return over + (" in all views alike" if correlation.lasting else "")
 

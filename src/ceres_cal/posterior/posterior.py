@@ -9,6 +9,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Frozen, InputError, Mask, Spread, brief, cached_property, field, replace, without
 from ceres_cal.base.tails import NORMAL_95, student_95
+from ceres_cal.base.words import did_you_mean
 from ceres_cal.effects.dependence import Dependence, Scatter, scattered
 from ceres_cal.posterior.mixture import FARTHER, Mixture
 from ceres_cal.problem import (
@@ -317,7 +318,8 @@ class Posterior(Frozen):
         for column, key in enumerate(self.keys):
             if key[:3] == (kind, owner, quantity):
                 return column
-        raise InputError(f"{kind} {owner!r} has no free number {quantity!r}: it was held, or is not there")
+        meant = did_you_mean(quantity, [key.quantity for key in self.keys if key[:2] == (kind, owner)])
+        raise InputError(f"{kind} {owner!r} has no free number {quantity!r}{meant or ': it was held, or is not there'}")
 
     def sd_of(self, kind: str, owner: str, quantity: str) -> float:
         """Standard deviation of one shared number, in its key's unit; 0 is never one, infinity means unknown.
