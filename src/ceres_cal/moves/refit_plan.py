@@ -186,6 +186,11 @@ def make_plan(
     asked = asked or RefitOptions()
     observed = _turned(observed) if asked.labels == "turned" else observed
     same = calibration.digest == observations.digest  # then the question is the same, too
+    if same and calibration.refitted is None:
+        raise InputError(
+            "these are the observations that the calibration was made of, and it is what they say: give new ones, or "
+            "calibrate these again with what is known besides"
+        )
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
@@ -232,9 +237,8 @@ def carried_prior(
     Args:
         of_lens: what is known where the chosen lens is the right one.
     """
-    if calibration.digest == observations.digest:
-        before = calibration.refitted.prior if calibration.refitted is not None else None
-        before = before or GaussianPrior(Information.nothing(), np.empty(0))
+    if calibration.refitted is not None and calibration.digest == observations.digest:
+        before = calibration.refitted.prior
         return before.without([key for key in before.keys if not _is_kept(key, stays)])
     kept = [key for key in calibration.uncertainty.posterior.keys if _is_kept(key, stays)]
     return calibration.prior_of(kept, of_lens=of_lens)

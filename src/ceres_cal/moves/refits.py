@@ -64,8 +64,8 @@ def refit(
     Stations that were not observed stay under the old posterior, but for those of a camera that was observed elsewhere:
     they are dropped, the camera is not there any more. Placements are not carried over, only what the new observations
     show is placed. Priors of the old options are in the posterior already; those on the new observations count as new.
-    Refitting a calibration to the observations that it was made of asks the same question once more: what was known
-    before them is the prior then, and nothing counts twice.
+    A refit to the observations of a refit asks the same question once more: what was known before them is the prior
+    then, and nothing counts twice. The observations that a calibration was made of are refused.
 
     Args:
         what: "auto" ("pose", or "zoom" or "iris" where the observations say so), "pose" (intrinsics under their
@@ -75,7 +75,8 @@ def refit(
         moved: observed stations that moved; by default all. The other observed ones stay under their posterior.
 
     Raises:
-        InputError: names that do not fit the calibration, or one that does not say how well it is known.
+        InputError: names that do not fit the calibration, one that does not say how well it is known, or its own
+            observations.
         DegenerateError: the observations cannot tell a pose, or not for sure after so large a move.
         SolutionError: no explanation fits, or another one than `what` allows for does; the message says which.
     """
@@ -116,9 +117,9 @@ def _refitted(
         rivals = change.rivals
     explanation = _explained(plan, result, rivals, WORDS[plan.what] if change else "")
     result = _as_known(plan, _beside_rivals(plan, _with_other_lenses(plan, result), rivals))
-    seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
-    if calibration.digest == observations.digest:
-        seen = calibration.refitted.digests if calibration.refitted else ()
+    seen = calibration.refitted.digests if calibration.refitted else ()
+    if calibration.digest != observations.digest:
+        seen = (*seen, calibration.digest)
     refitted = Refitted(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
     warnings = (*_warnings(plan, result), *([_TWICE] if observations.digest in seen else []))
     return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
