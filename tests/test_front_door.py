@@ -1,5 +1,7 @@
 """From arrays to a calibration and back in a few lines, as someone types them who knows OpenCV."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scenery import overhead_pose
 import ceres_cal
 from ceres_cal import Camera, InputError, Observations, Pose, View, calibrate, checkerboard, ssl_field
 from ceres_cal.base.arrays import Array32
+from ceres_cal.base.images import image_files
 from ceres_cal.scene.lens import Brown
 
 BOARD = checkerboard(9, 6, 0.1)
@@ -45,6 +48,8 @@ def test_places_frames_and_what_was_not_seen() -> None:
     one = Observations.from_points(pixels, places, (640, 480), sigma_px=0.3)
     assert one.points.feature.tolist() == [0, 1, 3] and one.points.sigma_px.tolist() == [0.3] * 3
     assert one.views == (View("0", "camera", "camera", "target"),)
+    for listed in (pixels.tolist(), list(pixels)):  # pixel by pixel, as they are typed or collected
+        assert np.array_equal(Observations.from_points(listed, places, (640, 480)).points.pixels, one.points.pixels)
     named = Observations.from_points({"a": pixels, "b": pixels}, places, (640, 480), moves=True, camera="left")
     assert named.views[1] == View("b", "left", "left", "target", "b")
     with pytest.raises(InputError, match="frame 'a': 3 pixels for 4 points"):
@@ -53,6 +58,13 @@ def test_places_frames_and_what_was_not_seen() -> None:
         Observations.from_points(pixels, places[0], (640, 480))
     with pytest.raises(InputError, match="frame '0': pixels must have shape"):
         Observations.from_points([pixels.T], places, (640, 480))
+
+
+@pytest.mark.parametrize("given", [np.ones((4, 2)), [np.ones((480, 640, 3))], 7])
+def test_what_are_no_photographs(given: Any) -> None:
+    """Pixels, or images that were read, given to `check` ended in a ValueError of NumPy."""
+    with pytest.raises(InputError, match=r"photographs are named by their files, not given as \w+; of pixels"):
+        image_files(given)
 
 
 def test_names_from_arrays_are_text() -> None:

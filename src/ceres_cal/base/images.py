@@ -21,7 +21,13 @@ def image_files(given: Images) -> list[Path]:
     Raises:
         InputError: there is no such file, no image in a folder, or nothing at all.
     """
-    each = [given] if isinstance(given, str | PathLike) else given
+    each = [given] if isinstance(given, str | PathLike) or not isinstance(given, Iterable) else list(given)
+    for one in each:
+        if not isinstance(one, str | PathLike):
+            raise InputError(
+                f"photographs are named by their files, not given as {type(one).__name__}; of pixels "
+                "`Observations.from_points` makes observations"
+            )
     if not each:
         raise InputError("no photograph is given: name files, folders, or videos")
     return [path for name in each for path in _files(str(name))]

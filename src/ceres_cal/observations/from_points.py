@@ -99,7 +99,15 @@ def _frames(pixels: Any) -> Mapping[str, Any]:
         return {"0": pixels}
     if not isinstance(pixels, Sequence | np.ndarray) or isinstance(pixels, str):
         raise InputError(f"pixels must be an array (N, 2), or a list or dict of them, not {type(pixels).__name__}")
+    if len(pixels) and _is_pixel(pixels[0]):
+        return {"0": pixels}
     return {str(number): values for number, values in enumerate(pixels)}
+
+
+def _is_pixel(value: Any) -> bool:
+    """Whether it is one pixel of a frame's list, not a frame."""
+    is_flat = value.ndim == 1 if isinstance(value, np.ndarray) else isinstance(value, Sequence)
+    return is_flat and len(value) == 2 and all(np.isscalar(one) for one in value)
 
 
 def _pixels(values: Any, where: str) -> Array:
