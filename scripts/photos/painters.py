@@ -107,12 +107,18 @@ def with_old_field(curves: dict[str, Curve], field: Target, rng: np.random.Gener
 
 
 def as_farmers_do(curves: dict[str, Curve], field: Target, rng: np.random.Generator) -> dict[str, Curve]:
-    """Every straight line of a large pitch aside by centimetres: half of the width of its paint."""
+    """Every line of a large pitch aside by centimetres, half of the width of its paint; circles and arcs, which are
+    drawn by a rope about a peg, have their middles and radii off by as much.
+    """
     moved = dict(curves)
     for name, line in curves.items():
+        off = rng.normal(0.0, 0.5 * line.width_m, 1 if isinstance(line, Segment) else 3)
         if isinstance(line, Segment):
             along = np.subtract(line.end, line.start) / line.length_m
-            off = rng.normal(0.0, 0.5 * line.width_m) * np.array([-along[1], along[0], 0.0])
-            start, end = (tuple((np.array(one) + off).tolist()) for one in (line.start, line.end))
+            aside = off * np.array([-along[1], along[0], 0.0])
+            start, end = (tuple((np.array(one) + aside).tolist()) for one in (line.start, line.end))
             moved[name] = structs.replace(line, start=start, end=end)
+        elif isinstance(line, Arc):
+            middle = tuple((np.array(line.centre) + np.append(off[:2], 0.0)).tolist())
+            moved[name] = structs.replace(line, centre=middle, radius_m=line.radius_m + float(off[2]))
     return moved
