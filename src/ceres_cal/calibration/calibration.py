@@ -189,8 +189,11 @@ class Calibration(Frozen):
         for name, target in targets.items():
             own = [one for one in target.dimensions if f"{name}/{one}" in self.options.dimensions]
             if own and name in self.targets:
-                known = self.targets[name].dimensions
-                targets[name] = redrawn(target, {one: known[one] for one in own if one in known})
+                lengths_m = self.targets[name].dimensions
+                targets[name] = redrawn(target, {one: lengths_m[one] for one in own if one in lengths_m})
+            known = self.targets.get(name)
+            if known is not None and targets[name] == known and target.movable != known.movable:
+                targets[name] = known  # which is a board there, or none
         return observations.with_targets(targets).at_noise(self.fit.of_cameras)
 
     @property

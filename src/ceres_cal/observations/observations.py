@@ -242,7 +242,8 @@ class Observations(Content):
 
     def with_targets(self, targets: Mapping[str, Target]) -> Observations:
         """The same observations of targets that are drawn otherwise; their digest stays."""
-        if all(targets[name] == target for name, target in self.targets.items()):
+        each = [(target, targets[name]) for name, target in self.targets.items()]
+        if all(one == other and one.movable == other.movable for one, other in each):
             return self
         drawn = replace(self, targets=dict(targets))
         vars(drawn)["digest"] = self.digest

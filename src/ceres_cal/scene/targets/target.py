@@ -103,8 +103,8 @@ class Target(Frozen):
     """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
 
     Attributes:
-        spec: what a file says of it, `{"kind": ..., ...}`; two targets are equal when their specs are and their
-            features come in the same order (observations number them).
+        spec: what a file says of it, `{"kind": ..., ...}`; two targets are equal when their specs are, whether they
+            move or not, and their features come in the same order (observations number them).
         points: name -> (x, y, z) m.
         curves: name -> Segment or Arc.
         movable: whether it lies where somebody put it; what is not movable is the world.
@@ -141,7 +141,7 @@ class Target(Frozen):
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, Target)
-            and self.spec == other.spec
+            and {**self.spec, "movable": None} == {**other.spec, "movable": None}
             and self.point_names == other.point_names
             and self.curve_names == other.curve_names
         )
