@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ceres_cal.base import InputError, Mask, Pose, checked, numerical, replace, rms, two_digits
+from ceres_cal.base.tails import log_f_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.solving import Task, solved_from
-from ceres_cal.moves.agreement import NOISIER, Agreement, Agreements, Misfit, matched, require_stations
+from ceres_cal.moves.agreement import (
+    FALSE_ALARMS,
+    NOISIER,
+    Agreement,
+    Agreements,
+    Misfit,
+    matched,
+    require_stations,
+)
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.problem import EXACT, Estimate, Options, Problem, Station, gather_priors, make_layout
@@ -66,7 +75,7 @@ def score(
         own = np.array([view.camera == name for view in observed.views])
         misfit = _misfit(own, observed, left, posed, noise)
         its = tuple(view for camera, view in views if camera == name)
-        holds, words = _verdict(misfit)
+        holds, words = _verdict(misfit, (_spare(posed), _spare(calibration)))
         answers[name] = Agreement(
             name=name, holds=holds, words=words, misfit=misfit, views=its, pose_free=True, solution=posed
         )
@@ -98,14 +107,25 @@ def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station
     return Estimate(cameras, stations, placements, EXACT)
 
 
-def _verdict(misfit: Misfit) -> tuple[bool | None, str]:
-    """Whether a camera predicts what it was scored by, and the sentence that says so."""
+def _spare(calibration: Calibration) -> tuple[float, float]:
+    """The part of points' equations, and of curves', beyond the unknowns: by which their noise is known."""
+    every, unknowns = (2 * calibration.fit.points, calibration.fit.curves), calibration.fit.unknowns
+    left = 1.0 - unknowns / max(sum(every), unknowns, 1)
+    points, curves = (max(left * one, 1.0) for one in every)
+    return points, curves
+
+
+def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool | None, str]:
+    """Whether a camera predicts what it was scored by, and the sentence that says so; `spare` equations behind the
+    noise of these and of those that it was made from, of which few make one many times the other by chance.
+    """
     noise = max((one for one in misfit.noise if one == one), default=np.nan)
     size = f"to {two_digits(max(misfit.points_rms_px, misfit.curves_rms_px))} px"
     if misfit.many_out:
         out = f"{misfit.outliers} of {misfit.count} observations were taken out"
         return False, f"is not good for these: {out}: check labels, target and camera"
-    if noise > NOISIER:
+    behind = [one[misfit.noise.index(noise)] for one in spare] if noise > NOISIER else []
+    if behind and log_f_tail(noise**2, *behind) < np.log(FALSE_ALARMS):
         much = f"the noise is {two_digits(noise)} times that of its calibration"
         return False, f"is not good for these, {size} only: {much}: another focus, zoom or target, or too simple a lens"
     if np.isnan(noise):
