@@ -410,7 +410,7 @@ def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> N
     noise_px = 1e-4 * phi
     seen = simulate(scene, Disturbance(noise_px, noise_px)).observations
     found = calibrate(seen, Options(lens="radial", free_principal_point=False))
-    assert (scale > 1.0) == any("reaches 5408 m from its origin: are its numbers" in one for one in found.warnings)
+    assert (scale > 1.0) == any("is 10817 m large: are its numbers" in one for one in found.warnings)
     known = found.uncertainty.verdict("camera", "c", "phi")
     assert abs(known.value - phi) < 4.0 * known.sd < 0.1 * phi
 
