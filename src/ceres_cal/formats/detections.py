@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ceres_cal.base import InputError, finite, read_foreign_npz, replace, require_room
+from ceres_cal.base import InputError, did_you_mean, finite, read_foreign_npz, replace, require_room
 from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
@@ -163,7 +163,8 @@ def _target(name: str, places: Sequence[tuple[float, float, float]], moves: bool
     if places:
         return of_places({_place_name(place): place for place in places}, moves=moves)
     if (known := target_named(name)) is None:
-        raise InputError(f"target {name!r} is unknown: give one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
+        what = f"target {name!r} is unknown" if name else "whose features these are is not said"
+        raise InputError(f"{what}: give a target, one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
     return known
 
 
@@ -182,7 +183,8 @@ def _number(row: Mapping[str, Any], name: str, number: int) -> float:
 
 def _index(numbers: Mapping[str, int], name: str, number: int) -> int:
     if name not in numbers:
-        raise InputError(f"line {number}: there is no feature {name!r}: `ceres-cal targets` lists the names")
+        meant = did_you_mean(name, numbers) or ":"
+        raise InputError(f"line {number}: there is no feature {name!r}{meant} `ceres-cal targets` lists the names")
     return numbers[name]
 
 

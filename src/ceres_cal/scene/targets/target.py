@@ -339,7 +339,10 @@ def require_features(target: Target, points: Iterable[str] = (), curves: Iterabl
     for kind, names, known in (("point", points, target.point_index), ("curve", curves, target.curve_index)):
         for name in names:
             if name not in known:
-                raise InputError(f"{kind} {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+                meant = did_you_mean(name, known) or ":"
+                raise InputError(
+                    f"{kind} {name!r} is not one of the target's{meant} `ceres-cal targets` lists the names"
+                )
 
 
 def target_named(name: str) -> Target | None:
