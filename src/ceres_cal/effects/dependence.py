@@ -202,9 +202,6 @@ def _root_of(rising: Callable[[float], float], low: float, high: float) -> float
 # Share of the largest variance of a score: what is below is rounding. Of a direction that priors alone know it was
 # 3e-10, and rounding of that made a standard deviation four times too large. Nothing changes up to a thousandfold.
 _DETERMINED = 1e-9
-# Of the variance by the model: errors that go together cancel in some directions, but nothing is known a hundred times
-# better for that. In a rig whose cameras contradict one another it was 1e-8, and rounding of that hid all the rest.
-_LEAST = 1e-4
 _OVER = {"points": "errors are correlated between a target's points", "curves": "errors are correlated along lines"}
 
 
@@ -278,8 +275,12 @@ class Scatter(Frozen):
         determined = values > _DETERMINED * values[-1]
         white = vectors[:, determined] / np.sqrt(values[determined])
         scores = np.eye(white.shape[1]) + white.T @ (self.matrix - np.eye(len(own))) @ white
+        # Of the variance by the model: errors that go together cancel in some directions, but nothing is known a
+        # hundred times better for that. In a rig whose cameras contradict one another it was 1e-8, and its rounding
+        # hid all else.
+        least = 1e-4
         scatters, turned = np.linalg.eigh(0.5 * (scores + scores.T))
-        inverse = (turned / np.maximum(scatters, _LEAST)) @ turned.T
+        inverse = (turned / np.maximum(scatters, least)) @ turned.T
         change = (along.T @ white) @ (inverse - np.eye(len(scores))) @ (white.T @ along)
         return Information(seen.keys, seen.matrix + 0.5 * (change + change.T))
 

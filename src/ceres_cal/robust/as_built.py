@@ -41,9 +41,6 @@ from ceres_cal.robust.robust import RobustSolution, SolvedFrom, judge_at, solve_
 from ceres_cal.scene.targets import Target
 
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
-# Standard deviations by which offsets may still move, root mean square of those directions that are known apart: of a
-# board's two sides the difference is known to a hundredth of what each is.
-_STILL = 0.5
 
 
 class OfViews(Frozen):
@@ -255,10 +252,13 @@ def _change(now: Built, before: Built) -> float:
     sigmas = {(one.target, one.kind): one.sigma_m for one in before.every}
     if {(one.target, one.kind) for one in now.every} != set(sigmas):
         return np.inf
+    # Standard deviations by which offsets may still move, root mean square of those directions that are known apart: of
+    # a board's two sides the difference is known to a hundredth of what each is.
+    still = 0.5
     logs = [abs(float(np.log(one.sigma_m / sigmas[one.target, one.kind]))) for one in now.every]
     steps = (now.whole.values - now.whole.carrying(before.whole).values)[now.moved]
     moved = float(steps @ inverse_of(now.covariance) @ steps) / max(len(steps), 1)
-    return float(max(max(logs, default=0.0) / _AT_REST, moved**0.5 / _STILL))
+    return float(max(max(logs, default=0.0) / _AT_REST, moved**0.5 / still))
 
 
 def _measured(every: Sequence[AsBuilt], structure: Structure, targets: Mapping[str, Target]) -> Iterator[AsBuilt]:

@@ -22,7 +22,6 @@ from ceres_cal.effects.table import estimated
 from ceres_cal.problem import Estimate, Key, Problem, free_keys, write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
-_FEWEST_SIGHTS = 3  # that tell an effect from a lens that leaves something
 _MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
 
 
@@ -123,7 +122,8 @@ class _Amounts(Frozen):
                 size += parts[-1].size
         every = SparseColumns.side_by_side(parts, len(equations))
         # Of few views, curves tell by how much errors that go together displace; not what a lens is that is wrong.
-        few = len(problem.sights) < _FEWEST_SIGHTS
+        fewest_sights = 3  # that tell an effect from a lens that leaves something
+        few = len(problem.sights) < fewest_sights
         repeated = RepeatedAmounts.of(model, every, strand_names(equations, equations.sight) if few else None)
         each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
         priors = {number: prior for number, prior in each if prior is not None}
