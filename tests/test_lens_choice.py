@@ -667,6 +667,20 @@ def test_a_few_corners_know_their_place_as_well_as_they_say() -> None:
         assert np.sqrt(np.mean(off**2)) < 0.02  # m; 0.1
 
 
+def test_a_few_corners_before_which_the_papers_lens_folds_have_another() -> None:
+    """They were refused: "the solved radial lens folds ..., choose fewer coefficients", which nobody had chosen."""
+    field, pixels = ssl_field("A"), np.full((len(ssl_field("A").points), 2), np.nan)
+    clicks = {
+        "CenterMark": (324.59, 288.14), "TopCircleCrossing": (280.48, 310.06), "BottomCircleCrossing": (374.29, 262.87),
+        "LeftCircleCrossing": (350.36, 335.78), "RightCircleCrossing": (302.05, 239.11),
+        "RightPenaltyMark": (230.77, 99.32),
+    }  # fmt: skip
+    pixels[[field.point_names.index(name) for name in clicks]] = list(clicks.values())
+    found = calibrate(Observations.from_points(pixels, field, (640, 480), sigma_px=1.0))
+    assert found.lens_choice is not None and found.lens_choice.chosen != "radial 2,3"
+    assert any(one.label == "radial 2,3" and "folds" in one.failed for one in found.lens_choice.tried)
+
+
 def test_two_cameras_by_a_few_corners_each() -> None:
     """It ended in a KeyError: the lenses of one camera were asked beside the other camera, which its corners do not
     show.

@@ -65,11 +65,13 @@ class Chosen(Frozen):
 
     def otherwise(self, failure: str, options: Options, start: Start) -> Chosen | None:
         """Where all of the observations make no calibration with it, the best lens of another kind, or at last the
-        paper's; None after that.
+        paper's; None after that. Of too few to compare lenses by, the likeliest that was not tried.
 
         Args:
             options: with the paper's lens. start: with that, too.
         """
+        if self.untold is not None:
+            return _of_few(self.untold, self.options, self.start, self.choice.tried, failure)
         if self.among is None:
             return None
         return self.among.without_kind(failure) or self._papers(failure, options, start)
@@ -293,22 +295,34 @@ def choose_lens(
 
     chosen = attempt(compared)  # reads: "..." beside the paper's lens, why no other was compared
     if isinstance(chosen, CalibrationError):
-        return _of_few(observations, by_themselves, start, str(chosen))
+        of_few = _of_few(observations, by_themselves, start, (TriedLens(PAPER, 2, failed=str(chosen)),))
+        assert of_few is not None  # nothing was tried yet
+        return of_few
     return chosen
 
 
-def _of_few(observations: Observations, options: Options, start: Start, failure: str) -> Chosen:
-    """The paper's lens, or one of another kind that is far likelier, where lenses cannot be compared."""
+def _of_few(
+    observations: Observations, options: Options, start: Start, tried: tuple[TriedLens, ...], failure: str = ""
+) -> Chosen | None:
+    """The paper's lens, or one of another kind that is far likelier, where lenses cannot be compared; None where none
+    is left.
+
+    Args:
+        tried: of which the first says why they cannot. failure: why the first makes no calibration, if it does not.
+    """
     from ceres_cal.calibration.lens_of_few import likeliest_of_few
 
-    def untold(label: str) -> LensChoice:
-        return LensChoice(label, (TriedLens(label, 2, failed=failure),), 0, 0.0)
-
-    likeliest = likeliest_of_few(observations, options, start.estimate)
+    first, *others = tried
+    out = [replace(first, failed=failure), *others] if failure else []
+    likeliest = likeliest_of_few(observations, options, start.estimate, [one.label for one in out])
+    if likeliest is None and out:
+        return None
+    label = PAPER if likeliest is None else likeliest[0].label
+    choice = LensChoice(label, (replace(first, label=label), *out), 0, 0.0)
     if likeliest is None:
-        return Chosen(papers(options), start, untold(PAPER), untold=observations)
+        return Chosen(papers(options), start, choice, untold=observations)
     form, there = likeliest
-    return Chosen(form.of(options), _moved_to(there, start), untold(form.label), untold=observations)
+    return Chosen(form.of(options), _moved_to(there, start), choice, untold=observations)
 
 
 def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:

@@ -6,6 +6,7 @@ deviations off.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import partial
 
 import numpy as np
@@ -22,9 +23,15 @@ from ceres_cal.problem import Estimate, Options, Solution, problem_of, solve
 _STRONG = 3.0
 
 
-def likeliest_of_few(observations: Observations, options: Options, near: Estimate) -> tuple[Form, Estimate] | None:
-    """The kind that is far likelier than the paper's lens, and the estimate with it; None where none is."""
-    each = _with_each_kind(observations, options, near)
+def likeliest_of_few(
+    observations: Observations, options: Options, near: Estimate, failed: Collection[str] = ()
+) -> tuple[Form, Estimate] | None:
+    """The kind that is far likelier than the paper's lens, and the estimate with it; None where none is.
+
+    Args:
+        failed: labels of those with which all of the observations made no calibration.
+    """
+    each = {form: end for form, end in _with_each_kind(observations, options, near).items() if form.label not in failed}
     least = min((end.cost for end in each.values()), default=np.inf)
     form, end = next((one for one in each.items() if one[1].cost < least + _STRONG), (None, None))
     return None if form is None or end is None or form.label == PAPER else (form, end.estimate)
