@@ -15,6 +15,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.detect.photographs import FieldOptions, detect_field
+from ceres_cal.observations import Observations
 from ceres_cal.problem.parameters import Station
 
 __all__ = ["say"]
@@ -184,7 +185,9 @@ def test_reports_with_photographs(say: Say, folder: Path, tmp_path: Path) -> Non
     (photograph,) = re.findall(r'<figure id="photograph-0".*?</figure>', text, flags=re.S)
     assert 'src="data:image/jpeg;base64,' in photograph and "the paper&#x27;s closed form, " in photograph
     assert len(photograph) < 320_000
-    refit = ("refit", folder / "c.json", folder / "obs.json", "--report", page, *images)
+    seen, later = Observations.load(folder / "obs.json"), tmp_path / "later.json"
+    replace(seen, points=replace(seen.points, pixels=seen.points.pixels + 0.05)).save(later)
+    refit = ("refit", folder / "c.json", later, "--report", page, *images)
     assert say(*refit).code == 0 and "Cyan: the calibration before, " in page.read_text(encoding="utf-8")
     assert say("diagnose", folder / "c.json", folder / "obs.json", "--report", page, *images).code in (0, 1)
     assert '<section id="photographs"' in page.read_text(encoding="utf-8")

@@ -84,8 +84,9 @@ def test_they_are_asked_of_a_files_priors_and_of_a_refit_too() -> None:
     with pytest.raises(InputError, match=r"is it in mm\?"):
         calibrate(replace(SEEN, priors=(height(4020.0, 20.0),)))
     known = calibrate(SEEN, Options(lens="radial"))
+    later = replace(SEEN, points=replace(SEEN.points, pixels=SEEN.points.pixels + 0.1))
     with pytest.raises(InputError, match=r"is it in mm\?"):
-        refit(known, SEEN, options=RefitOptions(priors=(height(4020.0, 20.0),)))
+        refit(known, later, options=RefitOptions(priors=(height(4020.0, 20.0),)))
 
 
 @given(factor=st.floats(0.05, 10.0), sigma=st.floats(1e-6, 1e3), scale=st.floats(1e-3, 1e3))
