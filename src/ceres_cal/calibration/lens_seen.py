@@ -251,9 +251,11 @@ def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
 
 
 def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, LensProfile]) -> Estimate:
-    """The estimate with the lens of the options, as near to its own as it comes."""
+    """The estimate with the lens of the options, as near to its own as it comes; DegenerateError: it shows nothing."""
     cameras = dict(estimate.cameras)
     for name, profile in profiles.items():
+        if not len(profile.angles):
+            raise DegenerateError(f"camera {name!r}: its lens shows nothing that was observed: check pixels and labels")
         phi, edge = cameras[name].phi, edge_over(cameras[name], profile.reach_px)
         blank = options.blank_lens.spanning(float(profile.angles[-1]), phi, edge, cameras[name].image_size)
         lens = profile.nearest(blank, phi, options.held)
