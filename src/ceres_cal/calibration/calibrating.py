@@ -233,7 +233,8 @@ def _or_as_asked(
     A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd off, and
     one of a few lines' outliers was not. What only the lens contradicts that was chosen without it may be right.
     """
-    if is_held == bool(found.conflicts) or not (is_held or found.lens_choices):
+    asks_again = found.lens_choices and not is_held if found.conflicts else is_held
+    if not asks_again:
         return found
     again = attempt(as_asked)  # quiet: from where it starts nothing agrees; what was found does
     if isinstance(again, CalibrationError) or again.conflicts:

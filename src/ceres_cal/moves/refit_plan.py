@@ -47,14 +47,14 @@ def mistaken_targets(observations: Observations) -> dict[str, Observations]:
     which were seen, such as the other division's field; by what that is, in words.
     """
     every = {
-        words: _on(observations, name, target_from_spec(spec, words))
+        words: _seen_as(observations, name, target_from_spec(spec, words))
         for name, target in observations.targets.items()
         for words, spec in target.mistaken_for.items()
     }
     return {words: seen for words, seen in every.items() if seen is not None}
 
 
-def _on(observations: Observations, name: str, other: Target) -> Observations | None:
+def _seen_as(observations: Observations, name: str, other: Target) -> Observations | None:
     """The observations of a target with those of its features in another one that are called alike."""
     target, points, curves = observations.targets[name], observations.points, observations.curves
     of_it = np.array([view.target == name for view in observations.views], dtype=bool)
