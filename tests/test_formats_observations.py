@@ -69,6 +69,15 @@ def test_named_columns(tmp_path: Path, table: str) -> None:
     assert seen.points.pixels.tolist() == [[100.0, 50.0], [100.0, 400.0]]
 
 
+def test_places_far_from_their_origin_stay_apart(tmp_path: Path) -> None:
+    """Rounded to six digits, places of a survey had one name: all but the last were lost."""
+    places = [(412345.25 + 0.5 * n, 5765432.75) for n in range(4)]
+    rows = [f"{100 * n},50,{x},{y}" for n, (x, y) in enumerate(places)]
+    (tmp_path / "a.csv").write_text("\n".join(["x_px,y_px,X_m,Y_m", *rows]))
+    seen = import_observations(tmp_path / "a.csv", image_size="640x480")
+    assert [place[:2] for place in seen.targets["target"].points.values()] == places
+
+
 def test_named_arrays(tmp_path: Path) -> None:
     columns: dict[str, Any] = {
         "x_px": [1.0, 2.0, 3.0],
@@ -127,6 +136,7 @@ def test_keypoints_of_colmap_lose_their_half_pixel(tmp_path: Path) -> None:
         ("a.csv", "x_px,y_px,point\n1,2,CentreMark", "no feature 'CentreMark': did you mean 'CenterMark'?"),
         ("a.csv", "x_px,y_px,point\n1,z,CenterMark", "line 2: y_px is no finite number, but 'z'"),
         ("a.csv", "x_px,y_px,point\n", "it holds no row"),
+        ("a.csv", "point,x_px,y_px\nCenterMark,102,4,800,1", "line 2 has more values than there are columns"),
         ("a.npz", "hello", "no NPZ file"),
         ("a.csv", "x_px,x_px,y_px\n1,2,3", "a column is there twice"),
         ("a.csv", f"x_px,y_px\n1,{'2' * 200_000}", "not a CSV file"),

@@ -178,6 +178,17 @@ def test_maps_for_remap(lens: str) -> None:
     assert straight[row, column] == 7
 
 
+def test_a_fisheye_is_known_by_either_word_and_four_coefficients_without_one_are_asked_about(tmp_path: Path) -> None:
+    """OpenCV's tutorial writes `fisheye_model`; a script that saves K and D writes neither."""
+    path, camera = tmp_path / "a.yml", over_field(with_lens("kannala-brandt"))
+    export(camera, "opencv", path)
+    told = path.read_text()
+    path.write_text(told.replace("distortion_model: fisheye", "fisheye_model: 1"))
+    assert same_camera(import_calibration(path).station(), camera.station())
+    path.write_text(told.replace("distortion_model: fisheye", ""))
+    assert "if they are of cv2.fisheye, add `distortion_model: fisheye`" in import_calibration(path).warnings[0]
+
+
 # ---- what is at fault -----------------------------------------------------------------------------------------------
 
 

@@ -283,6 +283,14 @@ def test_yaml_in_base_60_is_text() -> None:
     assert time.process_time() - begin < 3.0  # 0.3 s; as a number 10 s
 
 
+def test_like_images_of_a_model_of_colmap_stay_apart(tmp_path: Path) -> None:
+    """A folder for each camera: 0001.jpg of the second one took the place of the first."""
+    export(two_cameras("brown"), "colmap", tmp_path)
+    images = tmp_path / "images.txt"
+    images.write_text(images.read_text().replace("camera0", "left/1.jpg").replace("camera1", "right/1.jpg"))
+    assert sorted(import_calibration(tmp_path).stations) == ["left/1.jpg", "right/1.jpg"]
+
+
 def test_a_model_of_colmap_is_of_regular_files(tmp_path: Path) -> None:
     """The library itself would wait for a pipe's writer for ever."""
     os.mkfifo(tmp_path / "cameras.txt")

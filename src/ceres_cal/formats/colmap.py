@@ -108,16 +108,23 @@ def _read(request: ImportRequest) -> Any:
         cameras[name] = _foreign(image.camera, Pose(pose.rotation.matrix(), pose.translation))
     if not cameras:
         raise InputError("none of its images has a pose")
+    stems = {_stem(name): camera for name, camera in cameras.items()}
+    if len(stems) == len(cameras):  # else like images in different folders: whole names tell them apart
+        cameras = stems
     warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")
     return calibration_of("COLMAP", cameras, warnings=warnings)
 
 
 def _name(image: Any) -> str:
     try:
-        path = Path(image.name)
+        return str(image.name)
     except UnicodeDecodeError:
         raise InputError(f"the name of image {image.image_id} is not UTF-8: rename it") from None
-    return path.stem if path.suffix else str(image.name)
+
+
+def _stem(name: str) -> str:
+    path = Path(name)
+    return path.stem if path.suffix else name
 
 
 def _foreign(camera: Any, pose: Pose) -> ForeignCamera:

@@ -84,6 +84,11 @@ def _csv_rows(request: ImportRequest) -> tuple[Sequence[Mapping[str, Any]], tupl
         rows, names = list(reader), tuple(reader.fieldnames or ())
     except csv.Error as error:
         raise InputError(f"not a CSV file (line {reader.line_num}): {error}") from None
+    if longer := next((number for number, row in enumerate(rows, start=2) if None in row), 0):
+        raise InputError(
+            f"line {longer} has more values than there are columns: put names with commas into quotes, and write "
+            "semicolons between the columns where decimals have a comma"
+        )
     for name in names if between != "," else ():
         if name.endswith(("_px", "_m")):
             for row in rows:
@@ -174,7 +179,7 @@ def _place(row: Mapping[str, Any], number: int) -> tuple[float, float, float]:
 
 
 def _place_name(place: tuple[float, float, float]) -> str:
-    return " ".join(f"{v:g}" for v in place)
+    return " ".join(f"{v:.15g}" for v in place)
 
 
 def _number(row: Mapping[str, Any], name: str, number: int) -> float:

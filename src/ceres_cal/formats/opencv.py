@@ -19,6 +19,7 @@ from ceres_cal.scene import FISHEYE, LARGEST, ForeignCamera, image_grid, opencv_
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D1", "D")
+_FOUR = "its four coefficients are read as k1, k2, p1, p2: if they are of cv2.fisheye, add `distortion_model: fisheye`"
 ImageSize = Annotated[str, "WIDTHxHEIGHT px, where the file does not say it"]
 """An option of several formats."""
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
@@ -135,7 +136,10 @@ def _read(
             cameras[stations[1]] = replace(cameras[stations[1]], cam_from_world=between @ first)
         return calibration_of("OpenCV", cameras)
     name = stations[0] if stations else camera
-    return calibration_of("OpenCV", {name: _camera(storage, image_size, "")})
+    one = _camera(storage, image_size, "")
+    unsaid = one.model != FISHEYE and not {"distortion_model", "fisheye_model"} & {*names}
+    told = [_FOUR] if unsaid and _mat(storage, _COEFFICIENTS, None).size == 4 and any(one.coefficients) else []
+    return calibration_of("OpenCV", {name: one}, warnings=told)
 
 
 def _camera(storage: Any, image_size: str, number: str) -> ForeignCamera:
@@ -146,7 +150,8 @@ def _camera(storage: Any, image_size: str, number: str) -> ForeignCamera:
     if poses.shape == (1, 6):  # of several, each is of one view of a board
         pose = Pose.exp(poses[0])
         pose = pose if np.any(poses) else None
-    fisheye = _text(storage, "distortion_model") == FISHEYE
+    # `distortion_model` is ours, `fisheye_model` that of OpenCV's tutorial (camera_calibration.cpp).
+    fisheye = _text(storage, "distortion_model") == FISHEYE or bool(_real(storage, ("fisheye_model",)))
     return ForeignCamera.opencv(_size(storage, image_size), matrix, coefficients, pose, fisheye=fisheye)
 
 
