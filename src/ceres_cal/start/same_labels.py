@@ -8,17 +8,19 @@ moments agree on is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from ceres_cal.base import CalibrationError, Frozen, Pose, attempt, median, replace, rotation_exp
-from ceres_cal.observations import Observations, SightKey, View, gather_sights
+from ceres_cal.observations import Observations, gather_sights
 from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import posed_sights
 
 _START = Options(lens="radial")
+Both = Mapping[str, tuple[Pose, Pose]]
+"""Placement -> cam_from_target of the first camera and of another one, each by itself."""
 
 
 class Labels(Frozen, eq=True):
@@ -52,10 +54,10 @@ def with_same_labels(observations: Observations) -> Labels:
     for station, turns in _beside_the_first(observations, symmetries):
         if turns is None:
             unsaid.append(station)
-        for key, turn in turns or ():
-            turned.append((station, str(key.placement)))
-            labelled = _relabelled(labelled, key, turn)
-    return Labels(labelled, tuple(dict.fromkeys(turned)), tuple(unsaid))
+        for placement, turn in (turns or {}).items():
+            turned.append((station, placement))
+            labelled = _relabelled(labelled, station, placement, turn)
+    return Labels(labelled, tuple(turned), tuple(unsaid))
 
 
 def listed_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
@@ -63,46 +65,46 @@ def listed_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
     # quiet: this only adds a cause to what the user reads
     compared = attempt(lambda: list(_beside_the_first(observations, _listings)))
     return {
-        (station, str(key.placement)): (
+        (station, placement): (
             f"its points are {'mirrored' if turn.rotation[2, 2] < 0.0 else 'turned'} against those that other cameras "
             "see: list them in the same order"
         )
         for station, turns in ([] if isinstance(compared, CalibrationError) else compared)
-        for key, turn in turns or ()
+        for placement, turn in (turns or {}).items()
     }
+
+
+def beside_the_first(observations: Observations, boards: Container[str]) -> Iterator[tuple[str, str, Both]]:
+    """The first station that shows some boards, by the names of their targets, where another one shows them, and each
+    that does, with the poses that both have.
+
+    Raises:
+        CalibrationError: a sight whose pose cannot be told.
+    """
+    sights = gather_sights(observations)
+    shown = {(v.station, v.placement) for v in observations.views if v.placement is not None and v.target in boards}
+    shared = {key for key in sights.keys if key.placement not in sights.seen_once and key[1:] in shown}
+    poses: dict[str, dict[str, Pose]] = {}
+    for key, pose in posed_sights(sights, _START).by_key(sights).items() if shared else ():
+        if key in shared:
+            poses.setdefault(key.station, {})[str(key.placement)] = pose
+    first, *others = poses or ("",)
+    for station in others:
+        both = {name: (poses[first][name], pose) for name, pose in poses[station].items() if name in poses[first]}
+        if both:
+            yield first, station, both
 
 
 def _beside_the_first(
     observations: Observations, turns_of: Callable[[Target], list[Pose]]
-) -> Iterator[tuple[str, list[tuple[SightKey, Pose]] | None]]:
-    """Stations that see boards with the first one, and which of their sights must be turned by what; None where nothing
-    tells.
+) -> Iterator[tuple[str, dict[str, Pose] | None]]:
+    """Stations that see boards with the first one, and by what their sights must be turned, by placement; None where
+    nothing tells.
     """
-    poses = _board_poses(observations, turns_of)
-    first, *others = dict.fromkeys(key.station for key in poses) or ("",)
-    for station in others:
-        shared = [(a, b) for a in poses for b in poses if _is_pair(a, b, first, station)]
-        if shared:
-            yield station, _turns(observations, shared, poses, turns_of)
-
-
-def _is_pair(a: SightKey, b: SightKey, first: str, station: str) -> bool:
-    return a.placement == b.placement and a.station == first and b.station == station
-
-
-def _board_poses(observations: Observations, turns_of: Callable[[Target], list[Pose]]) -> dict[SightKey, Pose]:
-    """cam_from_target of every sight of a board that may be turned, at a placement that several stations show."""
-    sights = gather_sights(observations)
-    target_of = {SightKey(view.camera, view.station, view.placement): view.target for view in observations.views}
-    several = {
-        key
-        for key in sights.keys
-        if key.placement not in (None, *sights.seen_once) and len(turns_of(observations.targets[target_of[key]])) > 1
-    }
-    if not several:
-        return {}
-    posed = posed_sights(sights, _START).by_key(sights)
-    return {key: pose for key, pose in posed.items() if key in several}
+    turns = {name: turns_of(target) for name, target in observations.targets.items()}
+    target_of = {view.placement: view.target for view in observations.views}
+    for _, station, both in beside_the_first(observations, [name for name, own in turns.items() if len(own) > 1]):
+        yield station, _turns(both, [turns[target_of[placement]] for placement in both])
 
 
 def symmetries(target: Target) -> list[Pose]:
@@ -125,31 +127,26 @@ def _listings(target: Target) -> list[Pose]:
     return [Pose(rotation, middle - rotation @ middle) for rotation in rotations]
 
 
-def _turns(
-    observations: Observations,
-    shared: Sequence[tuple[SightKey, SightKey]],
-    poses: dict[SightKey, Pose],
-    turns_of: Callable[[Target], list[Pose]],
-) -> list[tuple[SightKey, Pose]] | None:
-    """Which second sights of the pairs must be turned, and how; None where nothing tells."""
+def _turns(both: Both, turns: Sequence[Sequence[Pose]]) -> dict[str, Pose] | None:
+    """By what the second station's sights must be turned, of those that each may be, by placement; None where nothing
+    tells.
+    """
     # Of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike.
     # By how much another labelling must be worse, as a factor, to be out of the question.
     clearly = 3.0
     alike = 0.15
-    target_of = {view.placement: observations.targets[view.target] for view in observations.views}
-    turns = [turns_of(target_of[b.placement]) for _, b in shared]
-    between = [[poses[b] @ turn @ poses[a].inverse for turn in own] for (a, b), own in zip(shared, turns, strict=True)]
-    depth = median(np.array([poses[b].position @ poses[b].position for _, b in shared])) ** 0.5
+    between = [[b @ turn @ a.inverse for turn in own] for (a, b), own in zip(both.values(), turns, strict=True)]
+    depth = median(np.array([b.position @ b.position for _, b in both.values()])) ** 0.5
     answers, most = [], max(map(len, turns))
     for pose in (one for own in between for one in own):
         off = [[apart(pose, other, depth) for other in own] for own in between]
         answers.append((float(np.mean(np.min([row + [np.inf] * (most - len(row)) for row in off], axis=1))), off, pose))
     cost, off, best = min(answers, key=lambda answer: answer[0])
     others = [answer[0] for answer in answers if apart(answer[2], best, depth) > alike]
-    if len(shared) < 2 or (others and min(others) < clearly * max(cost, 0.01)):
+    if len(both) < 2 or (others and min(others) < clearly * max(cost, 0.01)):
         return None
     numbers = [int(np.argmin(row)) for row in off]
-    return [(key, own[number]) for (_, key), own, number in zip(shared, turns, numbers, strict=True) if number]
+    return {name: own[number] for name, own, number in zip(both, turns, numbers, strict=True) if number}
 
 
 def apart(a: Pose, b: Pose, depth: float) -> float:
@@ -158,17 +155,12 @@ def apart(a: Pose, b: Pose, depth: float) -> float:
     return float(turn + np.linalg.norm(a.position - b.position) / depth)
 
 
-def _relabelled(observations: Observations, key: SightKey, turn: Pose) -> Observations:
+def _relabelled(observations: Observations, station: str, placement: str, turn: Pose) -> Observations:
     points, feature = observations.points, observations.points.feature.copy()
-    for number, view in _views_of(observations, key):
-        places = observations.targets[view.target].point_array
-        rows = np.flatnonzero(points.view == number)
-        sought = turn.inverse.transform(places[points.feature[rows]])
-        feature[rows] = np.argmin(np.linalg.norm(sought[:, None] - places, axis=2), axis=1)
-    return replace(observations, points=replace(points, feature=feature))
-
-
-def _views_of(observations: Observations, key: SightKey) -> Iterator[tuple[int, View]]:
     for number, view in enumerate(observations.views):
-        if SightKey(view.camera, view.station, view.placement) == key:
-            yield number, view
+        if (view.station, view.placement) == (station, placement):
+            places = observations.targets[view.target].point_array
+            rows = np.flatnonzero(points.view == number)
+            sought = turn.inverse.transform(places[points.feature[rows]])
+            feature[rows] = np.argmin(np.linalg.norm(sought[:, None] - places, axis=2), axis=1)
+    return replace(observations, points=replace(points, feature=feature))

@@ -6,17 +6,16 @@ A camera shows by itself where a board is. At one moment that is where the other
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
 from ceres_cal.base import Array, CalibrationError, Pose, SolutionError, attempt, counted, median
 from ceres_cal.effects.evidence import LEAST_PX
-from ceres_cal.observations import Observations, gather_sights
-from ceres_cal.problem import Estimate, Options, Problem
+from ceres_cal.observations import Observations
+from ceres_cal.problem import Estimate, Problem
 from ceres_cal.problem.residuals import residuals, write_equations
-from ceres_cal.start.initialise import posed_sights
-from ceres_cal.start.same_labels import apart, listed_otherwise
+from ceres_cal.start.same_labels import Both, apart, beside_the_first, listed_otherwise
 
 _FEWEST = 4  # moments that say how cameras stand: of three, two agree by chance
 _ADVICE = (
@@ -104,7 +103,7 @@ def shown_otherwise(observations: Observations) -> dict[tuple[str, str], str]:
 class _Moments:
     """Two stations, and where both see boards by themselves, moment by moment."""
 
-    def __init__(self, first: str, second: str, poses: Mapping[str, tuple[Pose, Pose]]) -> None:
+    def __init__(self, first: str, second: str, poses: Both) -> None:
         most = 40  # in a row, of which all are compared with all, by all shifts
         self.first, self.second, self._names = first, second, list(poses)[:most]
         seen = [poses[name] for name in self._names]
@@ -152,19 +151,9 @@ def _is_clear(own: float, other: float) -> bool:
     return own > clearly * max(other, alike)
 
 
-def _moments(observations: Observations) -> Iterator[_Moments]:
+def _moments(observations: Observations) -> list[_Moments]:
     """Of the first station and each other that sees boards with it."""
-    sights = gather_sights(observations)
     # quiet: this only adds a cause to what the user reads of it
-    posed = attempt(lambda: posed_sights(sights, Options(lens="radial")))
-    if isinstance(posed, CalibrationError):
-        return
-    boards: dict[str, dict[str, Pose]] = {}
-    for key, pose in posed.by_key(sights).items():
-        if key.placement is not None:
-            boards.setdefault(key.station, {})[key.placement] = pose
-    first, *others = boards or [""]
-    for second in others:
-        both = {name: (boards[first][name], pose) for name, pose in boards[second].items() if name in boards[first]}
-        if len(both) >= _FEWEST:
-            yield _Moments(first, second, both)
+    pairs = attempt(lambda: list(beside_the_first(observations, observations.targets)))
+    several = [] if isinstance(pairs, CalibrationError) else pairs
+    return [_Moments(*pair) for pair in several if len(pair[-1]) >= _FEWEST]
