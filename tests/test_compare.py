@@ -9,10 +9,11 @@ import pytest
 from accuracy.moves import CAMERA, DAY, HOME, MOVED, seen
 from accuracy.moves import calibrated as calibrated_at_home
 
+from ceres_cal import Options, calibrate
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.formats import export, import_calibration
-from ceres_cal.moves.comparisons import compare
+from ceres_cal.moves.comparisons import compare, compare_cameras
 from ceres_cal.moves.refits import refit
 from ceres_cal.report.maps import comparison_svg
 
@@ -42,6 +43,14 @@ def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
     probabilities = np.sort([pair.probability for pair in pairs])
     assert len(probabilities) == 12
     assert np.max(np.abs(probabilities - (np.arange(12) + 0.5) / 12)) < 0.45  # 0.2
+
+
+def test_another_lens_is_compared_on_the_field_alone(calibration: Calibration) -> None:
+    """Numbers of one lens are none of another's: this was a KeyError wherever the lens was chosen otherwise."""
+    other = calibrate(seen(HOME, DAY, 1).observations, Options(lens="brown", coefficients=("k1", "k2")))
+    answer = compare(calibration, other)["overhead"]
+    assert answer.holds is None and answer.change is not None and answer.change.maps[0].rms_mm < 40.0  # 5 mm
+    assert compare_cameras(calibration, other)["overhead"].holds is None
 
 
 def test_a_move_is_found(calibration: Calibration) -> None:

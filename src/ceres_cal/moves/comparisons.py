@@ -69,16 +69,20 @@ def _compared(a: Calibration, b: Calibration, station: str, other: str, height_m
     if len(known) < 2 or station != other:
         return Agreement(name=station, change=change, solution=b)
     keys, others = (c.uncertainty.posterior.keys_of(c.estimate, name) for c, name in known)
-    tested = _tested(a, b, keys, difference(_only(b, station), _only(a, station), keys), set(others))
+    tested = _tested(a, b, _only(a, station), _only(b, station), keys, others)
     return Agreement(name=station, change=change, solution=b, **tested)
 
 
-def _tested(a: Calibration, b: Calibration, keys: Sequence[Key], off: Array, others: Collection[Key]) -> dict[str, Any]:
-    """Holds, probability, statistic and degrees of an answer: whether a and b, so far `off` from each other in the same
-    numbers, contradict each other; nothing where they have other free numbers, or share none.
+def _tested(
+    a: Calibration, b: Calibration, one: Estimate, other: Estimate, keys: Sequence[Key], others: Collection[Key]
+) -> dict[str, Any]:
+    """Holds, probability, statistic and degrees of an answer: whether a and b, of which `one` and `other` are what is
+    compared, contradict each other; nothing where they have another lens or other free numbers, or share none.
     """
-    if set(keys) != set(others) or not keys:
+    lenses = [[(camera.lens.kind, camera.lens.names) for camera in part.cameras.values()] for part in (one, other)]
+    if set(keys) != set(others) or not keys or lenses[0] != lenses[1]:
         return {}
+    off = difference(other, one, keys)
     first, second = (c.uncertainty.posterior for c in (a, b))
     apart = contrast(
         NormalDistribution(first.normal.marginal(keys), np.zeros(len(keys)), first.degrees_of_freedom),
@@ -163,7 +167,5 @@ def _intrinsics_tested(a: Calibration, b: Calibration, camera: str) -> dict[str,
     if a.posterior is None or b.posterior is None:
         return {}
     keys, others = ([key for key in c.uncertainty.posterior.keys if key[:2] == ("camera", camera)] for c in (a, b))
-    if set(keys) != set(others):
-        return {}
     first, second = (Estimate({camera: c.cameras[camera]}, {}, {}, EXACT) for c in (a, b))
-    return _tested(a, b, keys, difference(second, first, keys), others)
+    return _tested(a, b, first, second, keys, others)
