@@ -185,6 +185,6 @@ def test_sigmas_that_are_none(sigma: float) -> None:
 
 def test_nothing_moves_without_a_tolerance() -> None:
     assert make_structure({"field": FIELD}, {"field": Tolerance()}) is EXACT
-    built = EXACT.built({"field": FIELD})["field"]
-    assert np.array_equal(built.points, FIELD.point_array)
-    assert np.array_equal(built.tracks, FIELD.tracks)
+    points, tracks = EXACT.built({"field": FIELD})["field"]
+    assert np.array_equal(points, FIELD.point_array)
+    assert np.array_equal(tracks, FIELD.tracks)

@@ -55,14 +55,6 @@ class Tolerance(Frozen, eq=True):
                 raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")
 
 
-class BuiltTarget(Frozen):
-    """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
-
-    target: Target
-    points: Array
-    tracks: Array
-
-
 class Structure(Frozen):
     """The corrections of all targets.
 
@@ -168,8 +160,10 @@ class Structure(Frozen):
             return sights
         return replace(sights, points=self.points(sights), tracks=self.tracks(sights))
 
-    def built(self, targets: Mapping[str, Target]) -> dict[str, BuiltTarget]:
-        """Every target as built; `targets` are those that the corrections were made for, in that order."""
+    def built(self, targets: Mapping[str, Target]) -> dict[str, tuple[Array, Array]]:
+        """Where the points (P, 3) of every target lie as built, m, and its tracks (3, C, 3, 3) as `Target.tracks` has
+        them; `targets` are those that the corrections were made for, in that order.
+        """
         points = np.concatenate([target.point_array for target in targets.values()])
         tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
         is_arc = np.concatenate([np.tile(target.is_arc, 3) for target in targets.values()])
@@ -178,7 +172,7 @@ class Structure(Frozen):
         for name, target in targets.items():
             own, points = np.split(points, [len(target.points)])
             curves, tracks = np.split(tracks, [3 * len(target.curves)])
-            built[name] = BuiltTarget(target, own, curves.reshape(3, -1, 3, 3))
+            built[name] = own, curves.reshape(3, -1, 3, 3)
         return built
 
     def _points(self, points: Array, feature: Indices) -> Array:

@@ -19,7 +19,7 @@ from ceres_cal.base import Array, Image, Image8, Indices32, Mask, Pose, first_of
 from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.diagnostics.advice import Measurement
-from ceres_cal.problem import BuiltTarget, Estimate
+from ceres_cal.problem import Estimate
 from ceres_cal.scene import Camera, Target, along_track, curve_points, in_image
 
 Colour = tuple[int, int, int]
@@ -229,25 +229,22 @@ def model_seen(
     for name, placement in shown:
         camera = estimate.camera_at(station, placement)
         camera = camera.at(camera.cam_from_world @ lift)
-        lines += _lines(built[name], camera)
-        points.append(camera.project(built[name].points))
+        lines += _lines(targets[name], *built[name], camera)
+        points.append(camera.project(built[name][0]))
     return Model(estimate.camera_at(station).image_size, tuple(lines), np.concatenate(points))
 
 
-def _lines(built: BuiltTarget, camera: Camera) -> Iterator[tuple[Array, ...]]:
+def _lines(target: Target, points: Array, tracks: Array, camera: Camera) -> Iterator[tuple[Array, ...]]:
     wide_px = 5.0  # paint that appears wider is drawn by its two edges, so that it stays in sight
     steps = 240  # along a curve
-    target = built.target
     for number, curve in enumerate(target.curves.values()):
         s, is_arc = np.linspace(*curve.parameter_range, steps), bool(target.is_arc[number])
-        middle, left, right = (
-            camera.project(along_track(built.tracks[side, number], is_arc, s)) for side in (0, 1, -1)
-        )
+        middle, left, right = (camera.project(along_track(tracks[side, number], is_arc, s)) for side in (0, 1, -1))
         width = np.linalg.norm(left - right, axis=1)[in_image(middle, camera.image_size)]
         wide = len(width) > 0 and float(np.median(width)) >= wide_px
         yield (middle, left, right) if wide else (middle,)
     if target.grid is not None:
-        grid = built.points.reshape(target.grid.rows, -1, 3)
+        grid = points.reshape(target.grid.rows, -1, 3)
         yield from ((camera.project(_between(row)),) for row in (*grid, *grid.swapaxes(0, 1)))
 
 
