@@ -20,12 +20,14 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
 from ceres_cal.observations import Observations, Prior, taken
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.problem.bundle import Chart, Progress, _left_to_gain, chart_of, solve
+from ceres_cal.problem.bundle import Progress, _left_to_gain, solve
 from ceres_cal.problem.parameters import (
+    Chart,
     Estimate,
     Layout,
     Options,
     Station,
+    chart_of,
     intrinsics_vector,
     make_layout,
     with_intrinsics,

@@ -10,21 +10,12 @@ from typing import Any
 import numpy as np
 import pyceres
 
-from ceres_cal.base import Array, DegenerateError, Frozen, Indices, InputError, SolutionError, at_most, available
+from ceres_cal.base import Array, DegenerateError, Frozen, InputError, SolutionError, at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.observations.sights import STRUCTURE, Owner, Sights
-from ceres_cal.problem.costs import (
-    ROWS_WORTH_A_THREAD,
-    CachedCost,
-    CostFunction,
-    EliminatedCost,
-    PriorCost,
-    Run,
-    SightCost,
-)
-from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, unit_px, with_intrinsics
+from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, CachedCost, EliminatedCost, PriorCost, Run, SightCost
+from ceres_cal.problem.parameters import Estimate, Layout, Station, charts_of, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.problem import Problem, Weighting
-from ceres_cal.scene.camera import Camera
 
 _NOTHING_LEFT = "Nothing left to gain."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
@@ -59,77 +50,6 @@ class Solution(Frozen, eq=True):
     termination: str
     history: tuple[float, ...]
     failed: bool = False
-
-
-# ---- the numbers of a camera as Ceres moves them --------------------------------------------------------------------
-
-# A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
-# height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps.
-# In coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
-
-_PHI = 0  # of the intrinsics
-
-
-class Chart:
-    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
-    have made in Python.
-    """
-
-    def __init__(self, camera: Camera, free: Indices) -> None:
-        powers = np.array([0.0] * 4 + [order - 1.0 for order in camera.lens.orders] + [0.0])
-        self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
-
-    def moved(self, numbers: Array) -> Array:
-        """(K,) what Ceres moves, of the free numbers (K,)."""
-        return np.asarray(numbers / self._scales(numbers))
-
-    def numbers(self, moved: Array) -> Array:
-        """(K,) the free numbers again."""
-        return np.asarray(moved * self._scales(moved))
-
-    def chained(self, jacobian: Array, numbers: Array) -> Array:
-        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
-        chained = jacobian * self._scales(numbers)
-        chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
-        return np.asarray(chained)
-
-    def _scales(self, numbers: Array) -> Array:
-        nothing = 1e-30  # phi may be 0 on the way: no camera, which shows nothing
-        return np.asarray((numbers[self._phi] / self._unit or nothing) ** self._powers)
-
-
-def chart_of(camera: Camera, free: Indices) -> Chart | None:
-    """None where the numbers are moved as they are."""
-    return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
-
-
-def _charts(estimate: Estimate, layout: Layout) -> dict[Owner, Chart]:
-    """Of the cameras whose numbers are not moved as they are."""
-    charts = {("camera", name): chart_of(camera, layout.free[name]) for name, camera in estimate.cameras.items()}
-    return {owner: chart for owner, chart in charts.items() if chart is not None}
-
-
-class ChartedCost(CostFunction):
-    """A cost function over what Ceres moves, of one over the numbers themselves."""
-
-    def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:
-        super().__init__()
-        self._run, self._cost, self._charts = run, cost, charts
-        self.set_num_residuals(cost.num_residuals())
-        self.set_parameter_block_sizes(cost.parameter_block_sizes())
-
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        with self._run:
-            numbers = [
-                chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
-            ]
-            if not self._cost.Evaluate(numbers, residuals, jacobians):
-                return False
-            for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
-                if chart:
-                    jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
-            return True
-        return False
 
 
 # ---- the problem --------------------------------------------------------------------------------------------------
@@ -263,14 +183,13 @@ def solve(
     run, layout = Run(), problem.layout
     with at_most(problem.options.threads):
         costs, threads = _costs_of(run, problem, estimate)
-    ceres, blocks, charts = pyceres.Problem(), packed(estimate, layout, problem.private), _charts(estimate, layout)
+    ceres, blocks, charts = pyceres.Problem(), packed(estimate, layout, problem.private), charts_of(estimate, layout)
     for cost in costs:
-        own = [charts.get(owner) for owner in cost.owners]
+        cost.charts = charts
         if posed and isinstance(cost, EliminatedCost):
             cost.posed(posed)
-        if own:  # else it depends on nothing free
-            arrays = [blocks[owner] for owner in cost.owners]
-            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
+        if cost.owners:  # else it depends on nothing free
+            ceres.add_residual_block(cost, None, [blocks[owner] for owner in cost.owners])
     for owner, chart in charts.items():
         blocks[owner][:] = chart.moved(blocks[owner])
     settings = _solver_options(problem, blocks, precision)

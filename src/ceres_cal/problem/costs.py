@@ -16,7 +16,7 @@ from ceres_cal import kernels
 from ceres_cal.base import Array, Frozen, Pose, left_jacobian, parts_of, replace, rotation_log, run_parts, skew
 from ceres_cal.observations.sights import STRUCTURE, Owner, SightKey, Sights
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
-from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
+from ceres_cal.problem.parameters import Chart, Estimate, Layout, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.priors import USUAL_BENDS, GaussianPrior
 from ceres_cal.problem.problem import Problem, Weighting
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
@@ -61,13 +61,16 @@ class CachedCost(CostFunction):
 
     Attributes:
         owners: whose blocks the solver hands over; the others are held.
+        charts: of the owners whose numbers Ceres does not move as they are.
     """
 
     evaluated: Callable[[Array, Sequence[Array]], CostValue | None]
     owners: list[Owner]
+    charts: Mapping[Owner, Chart]
 
     def __init__(self, run: Run) -> None:
         super().__init__()
+        self.charts = {}
         self._run = run
         self._known: CostValue | None = None
 
@@ -78,21 +81,24 @@ class CachedCost(CostFunction):
         self.set_parameter_block_sizes(list(sizes.values()))
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        known = None
         with self._run:
-            at = np.concatenate(parameters)
+            charts = [self.charts.get(owner) for owner in self.owners]
+            blocks = [chart.numbers(one) if chart else one for chart, one in zip(charts, parameters, strict=True)]
+            at = np.concatenate(blocks)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or self._known.at.tobytes() != at.tobytes():
-                self._known = self.evaluated(at, parameters)
-            known = self._known
-        if known is None:
-            return False
-        residuals[:] = known.residuals
-        for jacobian, there in zip(jacobians or (), known.jacobians, strict=False):
-            jacobian[:] = there
-        if jacobians is not None:
-            self._accept()
-        return True
+                self._known = self.evaluated(at, blocks)
+            if self._known is None:
+                return False
+            residuals[:] = self._known.residuals
+            for chart, block, jacobian, there in zip(
+                charts, blocks, jacobians or (), self._known.jacobians, strict=False
+            ):
+                jacobian[:] = chart.chained(there.reshape(len(residuals), -1), block).reshape(-1) if chart else there
+            if jacobians is not None:
+                self._accept()
+            return True
+        return False
 
     def _accept(self) -> None:
         """Jacobians are asked for where a step was accepted, and nowhere else."""

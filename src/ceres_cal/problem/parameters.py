@@ -15,7 +15,7 @@ import numpy as np
 
 from ceres_cal.base import Array, Indices, InputError, Pose, Poses, brief, chained, inverted, no_such, take_types
 from ceres_cal.base.frozen import Frozen, cached_property, field, replace
-from ceres_cal.observations import Observations, Prior, SightKey
+from ceres_cal.observations import Observations, Owner, Prior, SightKey
 from ceres_cal.problem.structure import Structure, Tolerance, make_structure
 from ceres_cal.scene import Camera, Target
 from ceres_cal.scene.lens import Lens, lens_class, make_lens
@@ -397,3 +397,51 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
         if root(name) not in tied_groups:
             anchors.setdefault(root(name), name)
     return frozenset(anchors.values())
+
+
+# ---- the numbers of a camera as Ceres moves them --------------------------------------------------------------------
+
+# A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
+# height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps.
+# In coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line (a chart).
+
+_PHI = 0  # of the intrinsics
+
+
+class Chart:
+    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
+    have made in Python.
+    """
+
+    def __init__(self, camera: Camera, free: Indices) -> None:
+        powers = np.array([0.0] * 4 + [order - 1.0 for order in camera.lens.orders] + [0.0])
+        self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
+
+    def moved(self, numbers: Array) -> Array:
+        """(K,) what Ceres moves, of the free numbers (K,)."""
+        return np.asarray(numbers / self._scales(numbers))
+
+    def numbers(self, moved: Array) -> Array:
+        """(K,) the free numbers again."""
+        return np.asarray(moved * self._scales(moved))
+
+    def chained(self, jacobian: Array, numbers: Array) -> Array:
+        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
+        chained = jacobian * self._scales(numbers)
+        chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
+        return np.asarray(chained)
+
+    def _scales(self, numbers: Array) -> Array:
+        nothing = 1e-30  # phi may be 0 on the way: no camera, which shows nothing
+        return np.asarray((numbers[self._phi] / self._unit or nothing) ** self._powers)
+
+
+def chart_of(camera: Camera, free: Indices) -> Chart | None:
+    """None where the numbers are moved as they are."""
+    return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
+
+
+def charts_of(estimate: Estimate, layout: Layout) -> dict[Owner, Chart]:
+    """Of the cameras whose numbers are not moved as they are."""
+    charts = {("camera", name): chart_of(camera, layout.free[name]) for name, camera in estimate.cameras.items()}
+    return {owner: chart for owner, chart in charts.items() if chart is not None}
