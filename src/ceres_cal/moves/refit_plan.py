@@ -24,19 +24,15 @@ def relabelled(observations: Observations, image: Array) -> Observations | None:
     """The observations of what lies in the world, renamed after the features that x, y, z times `image` sends theirs
     to; None where one has no such feature.
     """
-    in_world = {view.target for view in observations.views if view.placement is None}
-    maps = {name: counterparts(observations.targets[name], image) for name in in_world}
     points, curves = observations.points, observations.curves
     p, c, side = points.feature.copy(), curves.feature.copy(), curves.side.copy()
-    for number, view in enumerate(observations.views):
-        if view.placement is not None:
-            continue
-        to_point, to_curve, flips = maps[view.target]
-        rows = np.flatnonzero(points.view == number)
-        p[rows] = to_point[points.feature[rows]]
-        rows = np.flatnonzero(curves.view == number)
-        c[rows] = to_curve[curves.feature[rows]]
-        side[rows] = curves.side[rows] * flips[curves.feature[rows]]
+    shown = [view.target if view.placement is None else "" for view in observations.views]
+    for name in {*shown} - {""}:
+        to_point, to_curve, flips = counterparts(observations.targets[name], image)
+        of_it = np.array([one == name for one in shown])
+        own, along = of_it[points.view], of_it[curves.view]
+        p[own], c[along] = to_point[p[own]], to_curve[c[along]]
+        side[along] *= flips[curves.feature[along]]
     if np.any(p < 0) or np.any(c < 0):
         return None
     return replace(observations, points=replace(points, feature=p), curves=replace(curves, feature=c, side=side))

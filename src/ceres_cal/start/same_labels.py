@@ -131,10 +131,7 @@ def _turns(both: Both, turns: Sequence[Sequence[Pose]]) -> dict[str, Pose] | Non
     """By what the second station's sights must be turned, of those that each may be, by placement; None where nothing
     tells.
     """
-    # Of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike.
-    # By how much another labelling must be worse, as a factor, to be out of the question.
-    clearly = 3.0
-    alike = 0.15
+    alike = 0.15  # of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike
     between = [[b @ turn @ a.inverse for turn in own] for (a, b), own in zip(both.values(), turns, strict=True)]
     depth = median(np.array([b.position @ b.position for _, b in both.values()])) ** 0.5
     answers, most = [], max(map(len, turns))
@@ -143,10 +140,16 @@ def _turns(both: Both, turns: Sequence[Sequence[Pose]]) -> dict[str, Pose] | Non
         answers.append((float(np.mean(np.min([row + [np.inf] * (most - len(row)) for row in off], axis=1))), off, pose))
     cost, off, best = min(answers, key=lambda answer: answer[0])
     others = [answer[0] for answer in answers if apart(answer[2], best, depth) > alike]
-    if len(both) < 2 or (others and min(others) < clearly * max(cost, 0.01)):
+    if len(both) < 2 or not all(is_clearly_more(other, cost) for other in others):
         return None
     numbers = [int(np.argmin(row)) for row in off]
     return {name: own[number] for name, own, number in zip(both, turns, numbers, strict=True) if number}
+
+
+def is_clearly_more(off: float, least: float) -> bool:
+    """Whether one of two such distances is out of the question beside the other."""
+    clearly, alike = 3.0, 0.01  # as a factor, and what a start leaves at least
+    return off > clearly * max(least, alike)
 
 
 def apart(a: Pose, b: Pose, depth: float) -> float:

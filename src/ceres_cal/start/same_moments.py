@@ -15,7 +15,7 @@ from ceres_cal.effects.evidence import LEAST_PX
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Problem
 from ceres_cal.problem.residuals import residuals, write_equations
-from ceres_cal.start.same_labels import Both, apart, beside_the_first, listed_otherwise
+from ceres_cal.start.same_labels import Both, apart, beside_the_first, is_clearly_more, listed_otherwise
 
 _FEWEST = 4  # moments that say how cameras stand: of three, two agree by chance
 _ADVICE = (
@@ -72,7 +72,7 @@ def shifted(observations: Observations) -> Iterator[str]:
     for moments in _moments(observations):
         costs = {shift: moments.cost(shift) for shift in range(-moments.most_shift, moments.most_shift + 1)}
         best = min(costs, key=costs.__getitem__)
-        if _is_clear(costs[0], costs[best]) and costs[best] < alike:
+        if is_clearly_more(costs[0], costs[best]) and costs[best] < alike:
             where = f"{counted(abs(best), 'frame')} {'later' if best > 0 else 'earlier'}"
             yield (
                 f"{moments.first!r} and {moments.second!r} do not show the same moments: what {moments.first!r} shows "
@@ -139,16 +139,10 @@ class _Moments:
         for number, name in enumerate(self._names):
             best = int(np.argmin(suits[:, number]))
             # As well as the others do, or it is something else: labels that are turned suit another frame by chance.
-            as_well = not _is_clear(suits[best, number], usual)
-            if as_well and _is_clear(suits[number, number], suits[best, number]):
+            as_well = not is_clearly_more(suits[best, number], usual)
+            if as_well and is_clearly_more(suits[number, number], suits[best, number]):
                 yield (self.second, name), self._names[best]
                 yield (self.first, self._names[best]), name
-
-
-def _is_clear(own: float, other: float) -> bool:
-    """Whether another frame suits better than its own, by these distances."""
-    clearly, alike = 3.0, 0.01  # as a factor, and what a start leaves at least (see `same_labels`)
-    return own > clearly * max(other, alike)
 
 
 def _moments(observations: Observations) -> list[_Moments]:
