@@ -6,12 +6,12 @@ old calibration saw; the least robust cost wins.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Pose, distinct, median, replace
+from ceres_cal.base import Array, Frozen, Indices, Pose, distinct, median, replace
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, GaussianPrior, Weighting, over, placement_costs, pose_keys
@@ -114,6 +114,22 @@ def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) 
         around = [pose.turned(turn) for pose in seeds for turn in _GRID]
         candidates = _distinct([*candidates, *_refined(search, around)])
     return candidates
+
+
+def found_poses(
+    sights: Sights, estimate: Estimate, scales: tuple[float, float], old: Mapping[str, Pose], patience: int = 2
+) -> tuple[Indices, Array]:
+    """Numbers (K,) of the sights of which a pose is found through known lenses, and the likeliest (K, 3, 4) of each.
+
+    Args:
+        scales: see `PoseSearch`. old: where stations stood before. patience: see `pose_candidates`.
+    """
+    found = {}
+    for number, key in enumerate(sights.keys):
+        before = [old[key.station]] if key.placement is None and key.station in old else []
+        if candidates := pose_candidates(PoseSearch(sights[number], estimate, scales), before, patience):
+            found[number] = candidates[0].pose.matrix
+    return np.array(list(found), dtype=np.int64), np.array(list(found.values())).reshape(-1, 3, 4)
 
 
 def alike(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:

@@ -29,6 +29,7 @@ from ceres_cal.moves.poses import (
     PoseSearch,
     alike,
     equations,
+    found_poses,
     least_moved,
     moved_from,
     moved_words,
@@ -40,7 +41,7 @@ from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.posterior import OtherLenses, with_other_lenses
 from ceres_cal.problem import Estimate, SolveProgress, Station, Weighting, difference
 from ceres_cal.robust.other_minima import solved_soon
-from ceres_cal.start import Start, what_poses
+from ceres_cal.start import Start, chained_poses
 
 # Equations with which a pose is the only one: six numbers, and two that contradict a wrong one. Nothing changes at
 # half of it; at double four corners are refused.
@@ -140,7 +141,9 @@ def _start(plan: RefitPlan) -> Estimate:
         require_labels(plan, poses)
     placed = {name: Station(plan.stations[name], pose) for name, pose in poses.items()}
     estimate = replace(plan.known, cameras=cameras, stations={**plan.known.stations, **placed})
-    return replace(estimate, placements=_placements(plan, estimate))
+    boards = plan.sights.take(np.flatnonzero([key.placement is not None for key in plan.sights.keys]))
+    found = found_poses(boards, estimate, plan.scales, {}, patience=0)
+    return replace(estimate, placements=chained_poses(boards, *found, estimate.stations)[1])
 
 
 def _moved_sights(plan: RefitPlan) -> list[Sights]:
@@ -179,24 +182,6 @@ def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
         f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which determine a "
         f"small move, not a large one: show {_UNIQUE} (two a point or straight line, three an arc)"
     )
-
-
-def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
-    """Every placement that the observations show, from the first sight that can tell its pose."""
-    poses: dict[str, Pose] = {}
-    for sight in plan.sights:
-        key = sight.key
-        if key.placement is None or key.placement in poses:
-            continue
-        search = PoseSearch(sight, estimate, plan.scales)
-        candidates = pose_candidates(search, [], patience=0)
-        if candidates:
-            poses[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ candidates[0].pose
-    for sight in plan.sights:
-        key = sight.key
-        if key.placement is not None and key.placement not in poses:
-            raise DegenerateError(f"{key}: its pose is not determined: {what_poses(sight)}")
-    return poses
 
 
 # ---- what came out --------------------------------------------------------------------------------------------------

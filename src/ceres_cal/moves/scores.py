@@ -10,16 +10,8 @@ from ceres_cal.base import InputError, Mask, Pose, checked, numerical, replace, 
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.solving import Task, solved_from
-from ceres_cal.moves.agreement import (
-    FALSE_ALARMS,
-    NOISIER,
-    Agreement,
-    Agreements,
-    Misfit,
-    matched,
-    require_stations,
-)
-from ceres_cal.moves.poses import PoseSearch, pose_candidates
+from ceres_cal.moves.agreement import FALSE_ALARMS, NOISIER, Agreement, Agreements, Misfit, matched, require_stations
+from ceres_cal.moves.poses import found_poses
 from ceres_cal.observations import Observations, Sights, gather_sights
 from ceres_cal.problem import EXACT, Estimate, Options, Problem, Station, gather_priors, make_layout
 from ceres_cal.problem.residuals import Residuals, residuals
@@ -94,16 +86,8 @@ def _start(calibration: Calibration, sights: Sights, known: Mapping[str, Station
     stations = {name: Station(camera, Pose.identity()) for name, camera in sights.observations.stations.items()}
     cameras = {name: calibration.cameras[name] for name in sights.observations.cameras}  # some of a rig's
     blank = Estimate(cameras, stations, {}, EXACT)
-    numbers, poses = [], []
-    for number, key in enumerate(sights.keys):
-        old = calibration.estimate.stations.get(key.station)
-        before = [old.cam_from_world] if old is not None and key.placement is None else []
-        candidates = pose_candidates(PoseSearch(sights[number], blank, (1.0, 1.0)), before)
-        if candidates:
-            numbers.append(number)
-            poses.append(candidates[0].pose.matrix)
-    found = np.array(numbers, dtype=np.int64), np.array(poses).reshape(-1, 3, 4)
-    stations, placements = chained_poses(sights, *found, known)
+    old = {name: station.cam_from_world for name, station in calibration.estimate.stations.items()}
+    stations, placements = chained_poses(sights, *found_poses(sights, blank, (1.0, 1.0), old), known)
     return Estimate(cameras, stations, placements, EXACT)
 
 

@@ -98,7 +98,7 @@ def placed(
                 return _answered(lines, profile, replace(found, poses=given, costs=found.costs[:1]))
             return _answered(*_at_rest(sight, lines, profile, found))
     if not may_search:
-        raise SolutionError(f"station {sight.keys[0].station!r}: {what_poses(sight)}")
+        raise SolutionError(f"station {sight.keys[0].station!r}: {_what_poses(sight)}")
     known = replace(known, bend_sd=bend_sd if may_bend else 0.0)
     none = RadialProfile((0.0, 0.0), profile.unit_px)
     profiles = (profile, none) if may_bend else (profile,)
@@ -294,7 +294,7 @@ def chained_poses(
     )
 
 
-def what_poses(sight: Sights) -> str:
+def _what_poses(sight: Sights) -> str:
     """What to do where no pose of a sight is found."""
     if len(sight.points) > 3 and np.linalg.matrix_rank(sight.points - sight.points[0]) > 1:
         return "none shows its points through this lens: check its labels, try another lens"
@@ -319,6 +319,6 @@ def _require_all(
             state = f", state {' or '.join(dict.fromkeys(stated))} as a prior" if stated else ""
             what = f"{', '.join(names)} of the camera stay open: add a point or a line beside these{state}"
         else:
-            what = what_poses(sight)
+            what = _what_poses(sight)
         text = f"frame {frames} ({key}): {said}: {what}, or remove the view"
         raise DegenerateError(text, sights.observations.stations[key.station])
