@@ -237,10 +237,7 @@ def _is_named_by_chance(board: str | None) -> bool:
 
 
 def _calibrated(
-    args: RunArguments,
-    cameras: Sequence[RunArguments],
-    detected: Sequence[dict[str, Any]],
-    observations: Sequence[str],
+    args: RunArguments, cameras: Sequence[RunArguments], detected: Sequence[dict[str, Any]], observations: Sequence[str]
 ) -> _Step:
     priors = arguments.repeated("--prior", args.prior)
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]

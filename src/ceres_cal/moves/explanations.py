@@ -240,10 +240,7 @@ class Rival(NamedTuple):
 
 
 def supported(
-    plan: RefitPlan,
-    result: Calibration,
-    searches: Sequence[PoseSearch],
-    solved_with: Callable[..., Calibration],
+    plan: RefitPlan, result: Calibration, searches: Sequence[PoseSearch], solved_with: Callable[..., Calibration]
 ) -> tuple[Rival, ...]:
     """What else may be true beside the chosen explanation, where the user stated none.
 
