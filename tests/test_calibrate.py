@@ -584,6 +584,15 @@ def lines_named(*names: str) -> Observations:
     return kept(observations, None, np.isin(observations.curves.feature, index))
 
 
+def test_what_agrees_with_no_camera_is_not_called_too_few() -> None:
+    """Nine corners, four of them as row, column: "1 measured numbers cannot determine ..." was all that was said."""
+    seen = corners_at(lambda p: np.arange(len(p)) < 9)
+    pixels = seen.points.pixels.copy()
+    pixels[::2] = np.minimum(pixels[::2, ::-1], 950.0)
+    with pytest.raises(DegenerateError, match="others agree with no camera: check the names of features, and whether"):
+        calibrate(replace(seen, points=replace(seen.points, pixels=pixels)))
+
+
 def fourth_board_with(*rows: int) -> Observations:
     """Eight boards, the fourth one with these corners only."""
     observations = observed("radial-2-3/boards").observations

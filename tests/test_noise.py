@@ -14,6 +14,7 @@ from scenery import field_scene, overhead_pose
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.checks import check
@@ -25,7 +26,7 @@ from ceres_cal.report.quality import quality_of
 from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
-from ceres_cal.scene.targets import ssl_field
+from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, simulate
 
 UNKNOWNS = 5 + 6 * 13
@@ -135,6 +136,43 @@ def test_a_camera_of_which_nothing_is_judged_has_no_noise_of_its_own() -> None:
     judged[[observations.views[view].camera == "c0" for view in views.tolist()]] = False
     noise = noise_of_cameras(calibration.problem(observations), calibration.estimate, judged)
     assert noise.get("c0", 1.0) in (1.0, calibration.fit.of_cameras["c0"])
+
+
+def clicked_beside_boards(seed: int) -> tuple[Observations, Camera]:
+    """A field clicked to 1 px beside boards detected to 0.1 px, both of sigma 1, and the camera that sees them."""
+    rng, field, board, size = np.random.default_rng(seed), ssl_field("B"), checkerboard(9, 6, 0.1), (1280, 960)
+    camera = Camera(
+        size, 800.0, (640.0, 480.0), Radial((-5e-5, 6e-7)), 1.0, overhead_pose(0.3, 0.2, 4.0, 8.0, -5.0, 20.0)
+    )
+    places = np.array(list(field.points.values()))
+    seen = camera.project(places)
+    inside = np.all((seen > 5.0) & (seen < (1275.0, 955.0)), axis=1)
+    chosen = rng.permutation(np.flatnonzero(inside))[:11]
+    clicks = np.full(seen.shape, np.nan)
+    clicks[chosen] = seen[chosen] + rng.normal(0.0, 1.0, (11, 2))
+    corners = np.array(list(board.points.values())) - (0.4, 0.25, 0.0)
+    shown = {}
+    for x in (-1.2, 0.0, 1.2):
+        for y in (-0.8, 0.8):
+            turn = rotation_exp(np.array([*rng.normal(0.0, 0.4, 2), rng.uniform(-3.0, 3.0)]))
+            pixels = camera.project(corners @ turn.T + (x, y, 0.7))
+            shown[f"{x} {y}"] = pixels + rng.normal(0.0, 0.1, pixels.shape)
+    of_field = Observations.from_points([clicks], field, size)
+    return of_field + Observations.from_points(shown, board, size), camera
+
+
+def test_clicks_count_by_their_own_noise_beside_detected_boards() -> None:
+    """At the noise of the boards the pose went through four clicks, the others were outliers, and places were up to
+    6.1 times as far off as what holds 95 %.
+    """
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 7), np.linspace(-1.0, 1.0, 5)))
+    for seed in range(4):
+        observations, camera = clicked_beside_boards(seed)
+        calibration = calibrate(observations)
+        located = calibration.uncertainty.located(camera.project(np.column_stack([x, y, 0.0 * x])))
+        radii = np.linalg.norm(located.located - np.column_stack([x, y]), axis=1) / located.radius_95_m
+        assert np.max(radii) < 2.0, seed  # 1.1
+        assert calibration.fit.of_cameras["camera/field"] > 3.0 and not calibration.outliers
 
 
 @pytest.mark.thorough

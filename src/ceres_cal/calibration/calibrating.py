@@ -173,7 +173,7 @@ def _of_same_moments(calibration: Calibration, observations: Observations) -> Ca
 
 def _noise_of_cameras(calibration: Calibration, observations: Observations) -> Mapping[str, float]:
     """See `noise_of_cameras`: by all observations but copies and those that were found to be something else."""
-    if not calibration.rounds or len(observations.cameras) < 2 or calibration.options.noise_scale == "stated":
+    if not calibration.rounds or len({*observations.noise_names}) < 2 or calibration.options.noise_scale == "stated":
         return {}
     masks = zip(calibration.inlier_masks(observations), calibration.outlier_masks(observations), strict=True)
     judged = np.concatenate([inliers | outliers for inliers, outliers in masks])

@@ -117,7 +117,8 @@ class Fit(Frozen, eq=True):
         unknowns: free numbers.
         point_sigma_px, curve_sigma_px: root mean square of the stated sigmas of those that took part; None in files of
             0.1, which do not have them.
-        of_cameras: camera -> its own factor on the stated sigmas, before these scales; none where all are alike.
+        of_cameras: camera, or "camera/target" of several targets, -> its own factor on the stated sigmas, before these
+            scales; none where all are alike.
     """
 
     points: int

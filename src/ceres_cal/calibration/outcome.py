@@ -198,12 +198,12 @@ def _heights_of_cameras(estimate: Estimate, views: Sequence[View]) -> Array:
 
 
 def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
-    """Words about cameras whose observations scatter otherwise than the others', beside what is stated of them."""
+    """Words about cameras, or what they see, that scatter otherwise than the others, beside what is stated of them."""
     if noise:
         each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())
         yield (
-            f"beside what was stated of them the cameras are not equally noisy ({each} times the mean): each counts by "
-            "its own noise; look whether the photographs of the noisiest are sharp"
+            f"beside what was stated of them observations are not equally noisy ({each} times the mean): each "
+            "counts by its own noise; look whether the noisiest photographs are sharp, or state sigma_px of clicks"
         )
 
 

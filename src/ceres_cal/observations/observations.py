@@ -6,6 +6,7 @@ The row of an observation in `points` or `curves` is its permanent id: nothing h
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from operator import attrgetter
@@ -35,6 +36,10 @@ from ceres_cal.scene.targets import Target
 _NAMES = attrgetter("camera", "station", "target", "placement")
 
 
+def _with_target(view: View) -> str:
+    return f"{view.camera}/{view.target}"
+
+
 class Observations(Content):
     """Everything that was observed.
 
@@ -47,8 +52,8 @@ class Observations(Content):
             matter then: the solve estimates the scale).
         curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
         priors: what is known beforehand. notes: whatever somebody wants to keep with them, plain data.
-        noise: camera -> factor on the stated sigmas that `sigma_px` has in it already, as a calibration found it; in no
-            file.
+        noise: name of `noise_names` -> factor on the stated sigmas that `sigma_px` has in it already, as a calibration
+            found it; in no file.
 
     Raises:
         InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
@@ -249,11 +254,24 @@ class Observations(Content):
         vars(drawn)["digest"] = self.digest
         return drawn
 
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Whose noise each view has: of its camera, or "camera/target" where that sees several targets, which may be
+        clicked and detected.
+        """
+        seen = {(view.camera, view.target) for view in self.views}
+        several = {name for name, count in Counter(camera for camera, _ in seen).items() if count > 1}
+        return tuple(_with_target(view) if view.camera in several else view.camera for view in self.views)
+
     def at_noise(self, noise: Mapping[str, float]) -> Observations:
-        """The same observations with sigmas at such a `noise` of cameras and no other; their digest stays."""
+        """The same observations with sigmas at such a `noise` and no other; their digest stays."""
         if noise == self.noise:
             return self
-        factors = np.array([noise.get(v.camera, 1.0) / self.noise.get(v.camera, 1.0) for v in self.views])
+        after, before = (
+            np.array([one.get(_with_target(view), one.get(view.camera, 1.0)) for view in self.views])
+            for one in (noise, self.noise)
+        )
+        factors = after / before
         points, curves = (replace(c, sigma_px=c.sigma_px * factors[c.view]) for c in (self.points, self.curves))
         rated = replace(self, points=points, curves=curves, noise=dict(noise))
         vars(rated)["digest"] = self.digest

@@ -261,9 +261,15 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
         return
     known = unknowns - problem.unknowns(estimate)
     if problem.equations + known < unknowns:
+        observed = 2 * len(problem.observations.points) + len(problem.observations.curves)
+        others = (
+            f"; of the {observed} that were observed the others agree with no camera: check the names of features, and "
+            "whether pixels are x, y from the top left"
+        )
         raise DegenerateError(
             f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "
             f"cannot determine {unknowns} unknowns: add observations, or fix some of the unknowns"
+            f"{others if problem.equations < observed else ''}"
         )
 
 

@@ -291,11 +291,15 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
 
 
 def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict[str, float]:
-    """Camera -> factor on the stated sigmas of its observations; none where all are about as noisy as each other.
+    """Name of `Observations.noise_names` -> factor on the stated sigmas of its observations; none where all are about
+    as noisy as each other.
 
-    A photograph out of focus, a camera of fewer pixels or another detector: at the mean noise of all cameras what is
-    stated of the noisiest is too sure, and of the others too unsure. Of few observations the mean counts as much as in
-    `judge`, and each camera's own numbers and poses are counted against its own observations.
+    A photograph out of focus, a camera of fewer pixels or another detector, a field that was clicked beside boards that
+    were detected: at the mean noise what is stated by the noisiest is too sure, and by the others too unsure. Of few
+    observations the mean counts as much as in `judge`. A camera's own numbers are counted against what it sees by the
+    number of equations, poses against what shows them; as many of the shortest residuals say nothing, for a pose may go
+    through some of few clicks, and the others then seem to be outliers (Rousseeuw and Leroy 1987, Robust Regression and
+    Outlier Detection, 3.4).
 
     Args:
         problem: at the noise of all together. judged: (N + M,) those that are not known to be something else.
@@ -305,19 +309,23 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
     observations, layout, usual = problem.observations, problem.layout, problem.weighting.scales
     lengths = relative_lengths(observations, residuals(problem.sights, estimate, problem.feet))
     kinds, columns = np.split(judged, [len(observations.points)]), (observations.points, observations.curves)
-    owners, noise, differ = np.array([view.camera for view in observations.views]), dict[str, float](), False
-    for name, free in layout.free.items():
-        stations = {station for station, camera in observations.stations.items() if camera == name}
-        seen = {view.placement for view in observations.views if view.camera == name}
-        unknowns = len(free) + 6 * (len(layout.stations & stations) + len(layout.placements & seen))
-        rows = [own & (owners == name)[column.view] for own, column in zip(kinds, columns, strict=True)]
-        points, curves = (EachLength(length[own]) for length, own in zip(lengths, rows, strict=True))
-        equations = 2 * points.count, curves.count
-        if not any(equations):  # all of it is something else, or cannot be shown
+    owners, noise, differ = np.array(observations.noise_names), dict[str, float](), False
+    seen = {str(name): [observations.views[row] for row in np.flatnonzero(owners == name)] for name in owners}
+    rows = {name: [own & (owners == name)[c.view] for own, c in zip(kinds, columns, strict=True)] for name in seen}
+    each = {name: [at[own & np.isfinite(at)] for at, own in zip(lengths, rows[name], strict=True)] for name in seen}
+    counts = {name: (2 * len(points), len(curves)) for name, (points, curves) in each.items()}
+    for name, views in seen.items():
+        if not any(counts[name]):  # all of it is something else, or cannot be shown
             continue
-        found = noise_of(points, curves, by_count(sum(equations), unknowns), problem.options, usual)
+        camera, equations = views[0].camera, sum(counts[name])
+        of_camera = sum(sum(counts[other]) for other, shown in seen.items() if shown[0].camera == camera)
+        poses = len(layout.stations & {view.station for view in views})
+        poses += len(layout.placements & {view.placement for view in views})
+        taken_up = min(len(layout.free.get(camera, ())) / of_camera + 6 * poses / equations, 1.0)
+        points, curves = (EachLength(np.sort(one)[int(taken_up * len(one)) :]) for one in each[name])
+        found = noise_of(points, curves, (1.0, 1.0), problem.options, usual)
         ratios = np.maximum(found[:2], _LEAST_SCALE) / usual
-        ratio = float(np.sqrt(np.average(ratios**2, weights=equations)))
+        ratio = float(np.sqrt(np.average(ratios**2, weights=counts[name])))
         differ |= abs(np.log(ratio)) > max(np.log(alike), by_chance / (2.0 * found.degrees_of_freedom) ** 0.5)
         noise[name] = ratio * observations.noise.get(name, 1.0)
     return noise if differ else dict(observations.noise)

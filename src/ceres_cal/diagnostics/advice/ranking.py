@@ -176,7 +176,7 @@ def _weighting(fit: Fit, camera: str) -> Weighting:
     points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
         raise InputError("the calibration found no noise at all: advice would promise miracles")
-    own = fit.of_cameras.get(camera, 1.0)
+    own = max((factor for name, factor in fit.of_cameras.items() if f"{name}/".startswith(f"{camera}/")), default=1.0)
     return Weighting(own * points, own * curves, "trivial")
 
 
