@@ -180,7 +180,8 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
     if calibration.refitted is not None and not new_data:
         model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(inliers, model, weights.robust, estimate.cameras)
-    labels, tried = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
+    judged = taking_part, inliers.scales, problem.options.reject_sigma
+    labels, tried = find_mislabelled(observations, estimate, *judged)
     known = (calibration,) if new_data else (None, calibration.as_built, calibration.effects)
     case = DiagnosisCase(problem, estimate, model, inliers, table, labels, tried, *known)
     used = _recalled(case)

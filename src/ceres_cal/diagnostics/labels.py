@@ -19,7 +19,6 @@ from ceres_cal.base import Array, Frozen, Indices, Mask, cached_property, distin
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Curves, Observations
 from ceres_cal.problem import EXACT, Estimate, camera_optics
-from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene import Camera, Curve, Target, curve_points, nearest_to_rays, turned_on
 
 
@@ -42,9 +41,17 @@ class Mislabelled(Frozen):
 
 
 def find_mislabelled(
-    observations: Observations, estimate: Estimate, inliers: Inliers, reject_sigma: float
+    observations: Observations,
+    estimate: Estimate,
+    taking_part: tuple[Mask, Mask],
+    scales: tuple[float, float],
+    reject_sigma: float,
 ) -> tuple[list[Mislabelled], int]:
-    """Every group of observations that another feature explains within the noise, and how many were looked at."""
+    """Every group of observations that another feature explains within the noise, and how many were looked at.
+
+    Args:
+        taking_part: of points (N,) and of curve observations (M,). scales: of the noise of either.
+    """
     most = 20_000  # rejected observations looked at: of more, evenly spread ones
     mislabelled: list[Mislabelled] = []
     tried = 0
@@ -53,12 +60,9 @@ def find_mislabelled(
     def sight(target: str, station: str, placement: str | None) -> _Sight:
         return _Sight(observations.targets[target], estimate.camera_at(station, placement))
 
-    points, curves = observations.copies.originals
-    both: tuple[tuple[Columns, Mask, float], ...] = (
-        (observations.points, points & ~inliers.points, inliers.point_scale),
-        (observations.curves, curves & ~inliers.curves, inliers.curve_scale),
-    )
-    for column, rejected, scale in both:
+    both: tuple[Columns, ...] = (observations.points, observations.curves)
+    for column, original, used, scale in zip(both, observations.copies.originals, taking_part, scales, strict=True):
+        rejected = original & ~used
         looked_at = rejected | _may_lie_beyond(observations, column)
         rows = np.flatnonzero(looked_at)
         rows = rows[:: max(1, len(rows) // most)]
@@ -67,9 +71,8 @@ def find_mislabelled(
             if view.placement is None or view.placement in estimate.placements:
                 bound = reject_sigma * scale * column.sigma_px[own]
                 seen = sight(view.target, view.station, view.placement)
-                groups = _of_view(seen, column, int(number), own, bound)
+                mislabelled += _of_view(seen, column, int(number), own, bound)
                 tried += len(distinct(column.feature[own[rejected[own]]]))
-                mislabelled += groups
     return mislabelled, tried
 
 
@@ -192,10 +195,8 @@ def renamings(observations: Observations, calibration: Calibration) -> Iterator[
     more of a curve, or two features that lie where each other's should.
     """
     least_rows = 2  # of a feature that is renamed: one observation lies on some curve by chance
-    points, curves = calibration.inlier_masks(observations)
-    nothing, fit = np.empty(0), calibration.fit
-    inliers = Inliers(points, curves, fit.point_scale, fit.curve_scale, nothing, nothing)
-    found, _ = find_mislabelled(observations, calibration.estimate, inliers, calibration.options.reject_sigma)
+    judged = calibration.inlier_masks(observations), calibration.fit.scales, calibration.options.reject_sigma
+    found, _ = find_mislabelled(observations, calibration.estimate, *judged)
     whole = {(one.is_curve, one.view, one.feature): one for one in found if _is_whole(one, observations, calibration)}
     for one in whole.values():
         back = whole.get((one.is_curve, one.view, one.instead))
