@@ -293,14 +293,14 @@ def solved_for(kind: str, one: AsBuilt, tested: TestResults) -> Finding:
     offsets[numbers] = structure.values[numbers]
     shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)
     rows = (shift != 0.0) & case.model.used
-    effect = case.effect(shift, rows)
+    px, mm, observations = case.effect(shift, rows)
     most = int(numbers[np.argmax(np.abs(offsets[numbers]))])
     alone = offsets[most] ** 2 > 0.5 * float(offsets @ offsets) and len(numbers) > 2
     return Finding(
         kind, "observations", feature_of(structure.names[most]) if alone else one.target, None,
         f"{one.target} is not as drawn: {one.words}, most of all {structure.names[most]} by "
         f"{1e3 * offsets[most]:+.2f} mm; it was solved for", advice,
-        effect.px, effect.mm, effect.px / case.noise_px(tested.selection.model.left_over, rows),
+        px, mm, px / case.noise_px(tested.selection.model.left_over, rows),
         (Amount("sigma", 1e3 * one.sigma_m, 0.0, "mm"),), float(np.log10(max(1.0 - one.probability, 1e-300))),
-        effect.observations,
+        observations,
     )  # fmt: skip

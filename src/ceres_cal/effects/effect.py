@@ -140,14 +140,6 @@ class Finding(Frozen, eq=True):
         return self.wrong == "model"
 
 
-class Displacement(NamedTuple):
-    """Root mean square over observations of what moves them, in the image and on their targets' planes."""
-
-    px: float
-    mm: float
-    observations: int
-
-
 class Case(Frozen):
     """What effects are looked for in: a problem where its solve ended.
 
@@ -183,14 +175,16 @@ class Case(Frozen):
         """(E, BUILT) the offsets of that structure, and of the estimate's own: see `Equations`."""
         return self.equations.slots(self.whole_structure), self.equations.slots(self.estimate.structure)
 
-    def effect(self, shift: Array, rows: Mask) -> Displacement:
-        """What a displacement (E,) px does to the observations of some equations."""
+    def effect(self, shift: Array, rows: Mask) -> tuple[float, float, int]:
+        """What a displacement (E,) px does to the observations of some equations: its root mean square over them in the
+        image, px, and on their targets' planes, mm; and how many they are.
+        """
         count = len(distinct(self.equations.observation[rows]))
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = plane_shift(self.equations, shift)
         twice = np.where(self.equations.is_curve, 1.0, 2.0)  # both equations of a point carry its whole shift in mm
         squared = np.nansum(((x**2 + y**2) / twice)[rows])
-        return Displacement(float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count)
+        return float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count
 
     def noise_px(self, left_over: Array, rows: Mask) -> float:
         """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
@@ -213,15 +207,15 @@ class Evidence(Frozen):
     """A group of an effect that the residuals speak for.
 
     Attributes:
-        others: the model with the other chosen effects free. shift: (E,) px that it moves.
-        noise_ratio: its effect over the noise of the same observations.
+        others: the model with the other chosen effects free. shift: (E,) px that it moves. effect: see `Case.effect`.
+        noise_ratio: its effect, px, over the noise of the same observations.
     """
 
     case: Case
     score: ScoreTest
     others: Linearised
     shift: Array
-    effect: Displacement
+    effect: tuple[float, float, int]
     noise_ratio: float
 
     @property
@@ -311,7 +305,7 @@ class Effect(Frozen):
         if self.absorbed:
             shift = case.model.left_of_column(shift * case.model.weight) / case.model.weight
         effect = case.effect(shift, rows)
-        return Evidence(case, score, others, shift, effect, effect.px / case.noise_px(left_over, rows))
+        return Evidence(case, score, others, shift, effect, effect[0] / case.noise_px(left_over, rows))
 
     def findings(self, case: Case, selection: Selection) -> Iterator[Finding]:
         """Of its groups that were chosen."""
@@ -339,7 +333,7 @@ class Effect(Frozen):
         for other in (*chosen[:number], *chosen[number + 1 :]):
             others = others.with_columns(other.columns)
         evidence = self.evidence(case, score, others, selection.model.left_over)
-        effect, ratio = evidence.effect, evidence.noise_ratio
+        px, mm, observations = evidence.effect
         sentence, advice, mending = self.words(evidence)
         if score.rivals:
             names = first_of([f"{one.effect.kind} ({one.subject})" for one in score.rivals], 3)
@@ -347,8 +341,8 @@ class Effect(Frozen):
         if self.is_implausible(case, score):
             sentence += ". That is more than usual, so it is probably something else that looks like it"
         return Finding(
-            self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
-            selection.log10_p(score.log_p), effect.observations,
+            self.kind, self.wrong, score.subject, score.frame, sentence, advice, px, mm, evidence.noise_ratio, mending,
+            selection.log10_p(score.log_p), observations,
         )  # fmt: skip
 
 

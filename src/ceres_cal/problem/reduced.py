@@ -170,10 +170,9 @@ class _InformationSums:
         for prior in [one for one in priors if not one.is_of_target]:
             pull[known.columns(prior.keys)] += prior.information.matrix @ prior.offsets(self._estimate)
         given = [prior for prior in self._problem.stated_at(self._estimate) if not prior.is_usual]
-        of_targets = [prior.is_of_target for prior in given]
-        each = list(zip(given, of_targets, strict=True))
         stated, built = (
-            Information.nothing().beside_all(one.information for one, own in each if own == of) for of in (False, True)
+            Information.nothing().beside_all(one.information for one in given if one.is_of_target == of)
+            for of in (False, True)
         )
         every = points, curves, known, stated, built, pull, tuple(eliminated)
         return ReducedInformation(*every, *self._leverages.tolist())
