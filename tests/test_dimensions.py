@@ -17,6 +17,7 @@ from scenery import board_scene, field_scene, join, overhead_pose
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.lens_forms import AS_GOOD_BESIDE_LENGTHS, PAPER, decide, standard_errors
@@ -141,6 +142,43 @@ def test_beside_tolerances_and_boards() -> None:
     assert structure.own == 65 == len(structure.offsets) and len(structure.values) == 67
     known = calibration.uncertainty.verdict("dimension", "field", "field_length_m")
     assert known.low < 8.28 < known.high and 0.002 < known.sd < 0.02  # 5 mm: its lines may lie aside
+
+
+def shared_board(square_m: float) -> Observations:
+    """Two cameras over a field see a board of such squares at the same moments, which is taken to have 0.1 m."""
+    rng, field, board = np.random.default_rng(1), ssl_field("B"), checkerboard(9, 6, 0.1)
+    true, places = checkerboard(9, 6, square_m).point_array - (0.4, 0.25, 0.0), field.point_array
+    shown: list[Observations] = []
+    for name, x_m in (("a", -0.5), ("b", 0.5)):
+        pose = overhead_pose(x_m, 0.2, 4.5, 8.0, -5.0, 20.0)
+        camera = Camera((1280, 960), 800.0, (640.0, 480.0), Radial((-5e-5, 6e-7)), 1.0, pose)
+        seen = camera.project(places) + rng.normal(0.0, 0.2, (len(places), 2))
+        inside = np.all((seen > 0.0) & (seen < (1279.0, 959.0)), axis=1)
+        shown.append(
+            Observations.from_points([np.where(inside[:, None], seen, np.nan)], field, (1280, 960), camera=name)
+        )
+        boards = {}
+        for number, (right, up) in enumerate(np.ndindex(3, 2)):
+            turn = rotation_exp(np.array([0.3 * (-1) ** number, 0.2 * right, 0.5 * number]))
+            pixels = camera.project(true @ turn.T + (0.8 * right - 0.8, 0.9 * up - 0.4, 0.6))
+            boards[str(number)] = pixels + rng.normal(0.0, 0.1, pixels.shape)
+        shown.append(Observations.from_points(boards, board, (1280, 960), camera=name))
+    return sum(shown[1:], shown[0])
+
+
+def test_a_board_that_contradicts_the_field_is_named_and_solved_for() -> None:
+    """Of a rig that sees it together it was said that a camera had moved, or that points were shifted."""
+    observations = shared_board(0.099)
+    (found,) = (one for one in diagnose(calibrate(observations), observations).findings if one.kind == "other length")
+    assert found.subject == "board/square_m" and re.search(r"is 0\.0990\d ± 0\.000\d+ m, not 0\.1 m", found.sentence)
+    solved = calibrate(observations, Options(dimensions=("board/square_m",)))
+    assert solved.targets["board"].dimensions["square_m"] == pytest.approx(0.099, abs=1e-4)
+    assert np.linalg.norm(solved.station("a").position - (-0.5, 0.2, 4.5)) < 0.02
+
+
+def test_a_board_as_it_was_measured_is_not_named() -> None:
+    observations = shared_board(0.1)
+    assert not diagnose(calibrate(observations), observations).findings
 
 
 def test_no_lens_that_is_too_simple_beside_lengths() -> None:

@@ -109,9 +109,17 @@ def _of_point(evidence: Evidence) -> Words:
 
 
 def _lengths(case: Case) -> Iterator[EffectColumns]:
-    """A length that a target is drawn by is another one: many of its lines and points lie elsewhere, in proportion."""
-    structure, targets = case.whole_structure, case.problem.observations.targets
-    asked = [name for name in dimensions_of(targets) if name not in case.estimate.structure.dimensions]
+    """A length that a target is drawn by is another one: many of its lines and points lie elsewhere, in proportion.
+
+    The size of a board that one station at a time sees is no other than its distance, and without a field that of all
+    boards of a rig is no other than that of its baselines: neither is asked.
+    """
+    structure, problem = case.whole_structure, case.problem
+    views, targets = problem.observations.shown_views, problem.observations.targets
+    is_free = problem.private if any(view.placement is None for view in views) else problem.layout.placements
+    told = {view.target for view in views if view.placement not in is_free}
+    asked = [name for name in dimensions_of(targets) if name.partition("/")[0] in told]
+    asked = [name for name in asked if name not in case.estimate.structure.dimensions]
     slopes = dimension_slopes(structure.names, targets, asked)[1]
     for name, moved in zip(asked, case.equations.built_along(structure, slopes).T, strict=True):
         yield EffectColumns(moved[:, None], np.where(moved != 0.0, 0, -1), (name,))
@@ -122,7 +130,7 @@ def _of_length(evidence: Evidence) -> Words:
     target, _, dimension = name.partition("/")
     drawn_m = evidence.case.problem.observations.targets[target].dimensions[dimension]
     by, sd = evidence.score.amount, evidence.score.sd
-    sentence = f"{name} is {drawn_m + by[0]:.3f} ± {sd[0]:.3f} m, not {drawn_m:g} m as the target says"
+    sentence = f"{name} is {with_sd(drawn_m + by[0], sd[0])} m, not {drawn_m:g} m as the target says"
     advice = f"measure it and correct the target, or have it solved for: --estimate {target}.{dimension}"
     return evidence.words(sentence, advice, (dimension,), "mm")
 

@@ -41,7 +41,8 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
         ((grid.columns + 1) * grid.spacing_m, (grid.rows + 1) * grid.spacing_m),
         partial(checkered, grid),
     )
-    return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper)
+    sizes = {"square_m": grid.spacing_m}
+    return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper, dimensions=sizes)
 
 
 def checkered(grid: Grid, parity: int = 0) -> Iterator[Shape]:
@@ -105,7 +106,8 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
         (float(flat[:, 0].max() + border), float(flat[:, 1].max() + border)),
         partial(_discs, places, 0.5 * float(diameter_m)),
     )
-    return Target(spec, places, {}, movable=True, bows=True, grid=None if asymmetric else size, paper=paper)
+    sizes, shown = {"spacing_m": size.spacing_m}, None if asymmetric else size
+    return Target(spec, places, {}, movable=True, bows=True, grid=shown, paper=paper, dimensions=sizes)
 
 
 def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) -> Iterator[Shape]:
@@ -144,7 +146,8 @@ def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
     x, y = ([(n // 2 * (1.0 + gap) + n % 2) * tag_m for n in range(2 * count)] for count in (columns, rows))
     points = {f"{c},{r}": (x[c], y[r], 0.0) for r in range(2 * rows) for c in range(2 * columns)}
     numbers = {"columns": int(columns), "rows": int(rows), "tag_m": float(tag_m), "gap": float(gap)}
-    return Target({"kind": "april-grid", **numbers}, points, {}, movable=True, bows=True)
+    sizes = {"tag_m": float(tag_m)}
+    return Target({"kind": "april-grid", **numbers}, points, {}, movable=True, bows=True, dimensions=sizes)
 
 
 APRIL_GRID = TargetKind(
