@@ -109,10 +109,11 @@ def is_diagonal(matrix: Array) -> bool:
     return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
 
 
-def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
-    """Which of the known names each one is."""
-    order = {name: number for number, name in enumerate(known)}
-    return np.array([order[name] for name in names], dtype=np.int64)
+def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable] | None = None) -> Indices:
+    """Which of the known names each one is; without these, of their own in the order in which they appear."""
+    every = list(names)
+    order = {name: number for number, name in enumerate(dict.fromkeys(every) if known is None else known)}
+    return np.array([order[name] for name in every], dtype=np.int64)
 
 
 def evenly(count: int, most: int) -> Indices:

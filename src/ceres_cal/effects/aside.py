@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Indices32, Mask, distinct, median, replace, two_digits
+from ceres_cal.base import Array, Frozen, Indices, Indices32, Mask, distinct, median, numbers_of, replace, two_digits
 from ceres_cal.effects.columns import EffectColumns, SparseColumns
 from ceres_cal.effects.evidence import (
     FEATURE_ASIDE,
@@ -193,14 +193,13 @@ def _features(observations: Observations, owner: Indices, frames: Indices) -> Fe
     view, feature = (column_of(observations, name).astype(np.int64) for name in ("view", "feature"))
     is_curve = np.arange(len(view)) >= len(observations.points)
     takes_part = (owner[view] >= 0) & (is_curve | (frames[view] > 1))
-    targets = {name: number for number, name in enumerate(observations.targets)}  # each counts its features from 0
-    target = np.array([targets[one.target] for one in observations.views])
-    names = int(feature.max(initial=0)) + 1
-    number = ((owner[view] * 2 + is_curve) * len(targets) + target[view]) * names + feature
+    targets, names = len(observations.targets), int(feature.max(initial=0)) + 1
+    target = numbers_of((one.target for one in observations.views), observations.targets)
+    number = ((owner[view] * 2 + is_curve) * targets + target[view]) * names + feature  # each target's begin with 0
     return FeatureGroups(
         observations,
         np.where(takes_part, number, -1).astype(np.int32),
-        (int(owner.max()) + 1) * 2 * len(targets) * names,
+        (int(owner.max()) + 1) * 2 * targets * names,
         frames,
     )
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, replace, student_95, two_digits
+from ceres_cal.base import Array, Frozen, Indices, Mask, evenly, numbers_of, replace, student_95, two_digits
 from ceres_cal.effects.columns import SparseColumns, places_in_view, smooth_image, smooth_view
 from ceres_cal.effects.evidence import DEPENDENCE, LENS_LEAVES, LIKELY, READ_OUT, SMOOTH_ERRORS, RepeatedAmounts
 from ceres_cal.effects.groups import FEWEST_GROUPS, GroupNormals, GroupScatter, compare_groups
@@ -76,7 +76,7 @@ def correlated(model: Linearised, group: Indices, informations: Array) -> tuple[
     scores, private, kinds, equations = informations.copy(), [1.0], [], model.equations
     owners = [key.camera for key in equations.sights.keys]
     names = list(dict.fromkeys(owners))
-    owner, inverse = np.array([names.index(name) for name in owners])[equations.sight], [0.0] * len(names)
+    owner, inverse = numbers_of(owners, names)[equations.sight], [0.0] * len(names)
     for number, (is_curve, kind) in product(range(len(names)), ((False, "points"), (True, "curves"))):
         rows = (owner == number) & (equations.is_curve == is_curve)
         if np.count_nonzero(rows) < fewest_rows:

@@ -21,7 +21,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array, Frozen, Indices, Indices32, Mask, cached_property, distinct, evenly, replace
+from ceres_cal.base import Frozen, cached_property, replace
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, evenly, numbers_of
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene import Camera, nearest_to_rays
 
@@ -301,15 +302,13 @@ def gather_sights(observations: Observations, *, predicted: bool = False) -> Sig
 def sights_of(observations: Observations) -> Sights:
     """The sights of all observations; a sight without any is left out."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
-    order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    sights, views_of = [order[key] for key in keys], [list[int]() for _ in order]
-    for number, sight in enumerate(sights):
+    order = tuple(dict.fromkeys(keys))
+    sight_of_view, views_of = numbers_of(keys, order), [list[int]() for _ in order]
+    for number, sight in enumerate(sight_of_view.tolist()):
         views_of[sight].append(number)
-    sight_of_view = np.array(sights, dtype=np.int64)
 
-    names = {name: number for number, name in enumerate(observations.targets)}
     targets = list(observations.targets.values())
-    target_of_view = np.array([names[view.target] for view in observations.views], dtype=np.int64)
+    target_of_view = numbers_of((view.target for view in observations.views), observations.targets)
     first_point = bounds_of([len(t.points) for t in targets])[target_of_view]
     first_track = bounds_of([3 * len(t.curves) for t in targets])[target_of_view]
     curve_count = np.array([len(t.curves) for t in targets], dtype=np.int64)[target_of_view]
@@ -322,7 +321,7 @@ def sights_of(observations: Observations) -> Sights:
     track_index = first_track[curves.view[c]] + side * curve_count[curves.view[c]] + curves.feature[c]
     every = Sights(
         observations,
-        tuple(order),
+        order,
         tuple(tuple(views) for views in views_of),
         point_bounds,
         np.arange(len(points))[p],

@@ -14,12 +14,12 @@ of whole pixels may well give it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, first_of, median
+from ceres_cal.base import Array, Frozen, Indices, InputError, Mask, cached_property, first_of, median, numbers_of
 from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block, in_blocks, view_label
 from ceres_cal.observations.files import Content
 
@@ -242,13 +242,13 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
     themselves are compared.
     """
     columns: tuple[Columns, Columns] = (points, curves)
-    place = _numbered((view.station, view.target, view.placement is None) for view in views)
+    place = numbers_of((view.station, view.target, view.placement is None) for view in views)
     if not any(_may_repeat(column, place) for column in columns):
         none = [np.broadcast_to(np.int64(-1), len(column)) for column in columns]
         return Copies(none[0], none[1])
     sources = tuple(np.full(len(column), -1, dtype=np.int64) for column in columns)
     hashes = [_row_hashes(column) for column in columns]
-    frame = _numbered((view.frame, number) for view, number in zip(views, place, strict=True))
+    frame = numbers_of((view.frame, number) for view, number in zip(views, place, strict=True))
     for column, own, source in zip(columns, hashes, sources, strict=True):
         _mark_rows(column, own, frame, source)
     _mark_views(columns, hashes, place, sources)
@@ -298,12 +298,6 @@ def _repeated(hashes: Hashes) -> Mask:
     """(N,) whether another one is the same."""
     _, number, count = np.unique(hashes, return_inverse=True, return_counts=True)
     return np.asarray(count[number] > 1)
-
-
-def _numbered(names: Iterable[Hashable]) -> Indices:
-    """The number of each name, in order of appearance."""
-    numbers: dict[Hashable, int] = {}
-    return np.array([numbers.setdefault(name, len(numbers)) for name in names], dtype=np.int64)
 
 
 def _parts(column: Columns, rows: Indices) -> tuple[NDArray[np.generic], ...]:
