@@ -9,9 +9,10 @@ import pytest
 from accuracy.as_built import Board, observed
 from scenery import field_scene, overhead_pose
 
-from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.moves.checks import check
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
 from ceres_cal.problem.parameters import Options
@@ -74,6 +75,15 @@ def test_seen_alike_after_half_a_turn() -> None:
     position = Prior("station", "hall", "position_m", tuple((PLACE + 0.2).tolist()), (0.3, 0.3, 0.3))
     told = calibrate(replace(middle, priors=(position,)), KNOWN)
     assert told.ambiguities == () and off_in_sd(told) < 3.0  # 3e-4
+
+
+def test_a_camera_of_which_it_is_not_known_where_it_stood_did_not_move() -> None:
+    """Calibrated at the other of two places, it was said to have moved by 5.7 m."""
+    calibration = calibrate(seen(("HalfwayLine", "CenterLine", "CenterCircle"), 3.0), KNOWN)
+    assert calibration.station("hall").position[0] == pytest.approx(-2.8, abs=0.1)
+    told = ("TopTouchLine", "BottomTouchLine", "RightGoalLine", "CenterLine", "CenterCircle", "BottomRightCorner")
+    with pytest.raises(InputError, match=r"seen alike from .* until then nobody can say that it moved"):
+        check(calibration, seen(told, 3.0))
 
 
 def test_seen_alike_from_two_places() -> None:

@@ -80,7 +80,8 @@ def check(
             may come more often.
 
     Raises:
-        InputError: a station that the calibration does not have, or that it says nothing of.
+        InputError: a station that the calibration does not have, or that it says nothing of, or that seems to have
+            moved where its calibration is one of several that show the same.
         SolutionError: another camera or another field than those calibrated.
     """
     if not 0.0 < false_alarms < 1.0:
@@ -97,6 +98,10 @@ def check(
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
     level = false_alarms / (len(world) * checks)
     stations = {name: _checked(calibration, sight, level) for name, sight in world.items()}
+    for name in (name for name, answer in stations.items() if answer.holds is False):
+        for words in calibration.ambiguities:
+            if words.startswith(f"station {name!r}: "):
+                raise InputError(f"{words}, and calibrate again: until then nobody can say that it moved")
     return Agreements(stations, false_alarms, checks)
 
 

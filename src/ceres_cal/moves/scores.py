@@ -111,7 +111,8 @@ def _verdict(misfit: Misfit, spare: Sequence[tuple[float, float]]) -> tuple[bool
     behind = [one[misfit.noise.index(noise)] for one in spare] if noise > NOISIER else []
     if behind and log_f_tail(noise**2, *behind) < np.log(FALSE_ALARMS):
         much = f"the noise is {two_digits(noise)} times that of its calibration"
-        return False, f"is not good for these, {size} only: {much}: another focus, zoom or target, or too simple a lens"
+        why = "noisier clicks or pictures, another focus, zoom or target, or too simple a lens"
+        return False, f"is not good for these, {size} only: {much}: {why}"
     if np.isnan(noise):
         return None, f"predicts these {size}; its calibration states no noise to compare this with"
     if noise > LARGER:
