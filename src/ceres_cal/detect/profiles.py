@@ -32,7 +32,8 @@ _MOST_STEP_PX = 0.7
 # Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
 # the pixels alone tell such a step and the line's place hardly apart.
 _LEVEL_SIGMA = 5.0
-_STEPS = 6
+# Of Newton's steps, the most; and one after which a window's next ones are below a hundredth of its sigma.
+_STEPS, _AT_REST_PX = 6, 1e-4
 _TINY = 1e-9
 
 
@@ -130,24 +131,27 @@ def fit_profiles(
     offset = np.zeros(len(windows.values))
     steps = _Steps(edges, *(np.broadcast_to(np.asarray(one, float), offset.shape) for one in (blur_px, smear_px, lean)))
     normal, right = steps.equations(windows, offset, None)
-    heights = _solve(normal, right)[:, 2:]
-    squares = np.sum(windows.values**2, axis=1)
-    variance = (squares - np.sum(_solve(normal, right) * right, axis=1)) / windows.values.shape[1]
+    solution = _solve(normal, right)
+    heights, squares = solution[:, 2:], np.sum(windows.values**2, axis=1)
+    variance = (squares - np.sum(solution * right, axis=1)) / windows.values.shape[1]
     level = np.zeros(normal.shape[1] + 1)
     level[2:-1] = 1.0 if edges.shape[1] > 1 else 0.0
+    known, step, moving = np.outer(level, level) / _LEVEL_SIGMA**2, np.zeros(len(offset)), np.arange(len(offset))
+    held = np.empty((len(offset), *known.shape))
     for _ in range(_STEPS):
-        known = np.maximum(variance, 0.0)[:, None, None] * np.outer(level, level) / _LEVEL_SIGMA**2
-        normal, right = steps.equations(windows, offset, heights)
-        solution = _solve(normal + known, right)
-        variance = _misfit(squares, normal, right, solution) / windows.values.shape[1]
-        step = np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
-        offset, heights = np.clip(offset + step, -reach_px - 1.0, reach_px + 1.0), solution[:, 2:-1]
-        if np.all(np.abs(step) < 1e-3):
+        normal, right = steps.take(moving).equations(windows.take(moving), offset[moving], heights[moving])
+        held[moving] = normal + np.maximum(variance[moving], 0.0)[:, None, None] * known
+        solution = _solve(held[moving], right)
+        variance[moving] = _misfit(squares[moving], normal, right, solution) / windows.values.shape[1]
+        step[moving] = np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
+        offset[moving] = np.clip(offset[moving] + step[moving], -reach_px - 1.0, reach_px + 1.0)
+        heights[moving] = solution[:, 2:-1]
+        moving = moving[np.abs(step[moving]) > _AT_REST_PX]
+        if not len(moving):
             break
-    freedom = windows.values.shape[1] - right.shape[1]
-    misfit = np.maximum(_misfit(squares, normal, right, solution), 0.0)
-    noise = np.sqrt(misfit / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
-    sigma = noise * np.sqrt(np.maximum(np.linalg.inv(normal + known + _ridge(normal + known))[:, -1, -1], 0.0))
+    misfit = np.maximum(variance, 0.0) * (windows.values.shape[1] / (windows.values.shape[1] - len(level)))
+    noise = np.sqrt(misfit + 1.0 / 12.0)  # what rounding to whole levels hides
+    sigma = noise * np.sqrt(np.maximum(np.linalg.inv(held + _ridge(held))[:, -1, -1], 0.0))
     good = windows.inside & (np.abs(step) < 0.05) & (np.abs(offset) <= reach_px) & np.isfinite(sigma) & (sigma > 0.0)
     return Profiles(np.where(good, offset, np.nan), np.where(good, sigma, np.inf), heights, noise)
 
@@ -175,18 +179,17 @@ def fit_shape(
     ones = np.ones(len(windows.values))
     length, lean = (ones, 0.0 * ones) if along is None else (np.abs(along), np.sign(along))
     shape, offset, free = begin.copy(), np.zeros(len(windows.values)), len(begin)
-    heights = None
+    heights, squares = None, np.sum(windows.values**2, axis=1)
     for _ in range(rounds):
         now = np.exp(shape)
         steps = _Steps(edges * now[1], now[0] * ones, (now[2] if free > 2 else 0.0) * length, lean)
         if heights is None:
             heights = _solve(*steps.equations(windows, offset, None))[:, 2:]
         normal, right = steps.equations(windows, offset, heights, free=free)
-        own, squares = normal[:, :-free, :-free], np.sum(windows.values**2, axis=1)
-        solution = _solve(own, right[:, :-free])
+        own, cross = normal[:, :-free, :-free], normal[:, :-free, -free:]
+        both = np.linalg.solve(own + _ridge(own), np.concatenate([right[:, :-free, None], cross], axis=2))
+        solution, away = both[:, :, 0], both[:, :, 1:]
         noise = np.maximum(squares - np.sum(solution * right[:, :-free], axis=1), 1.0) / windows.values.shape[1]
-        cross = normal[:, :-free, -free:]
-        away = np.linalg.solve(own + _ridge(own), cross)
         schur = normal[:, -free:, -free:] - np.matmul(np.swapaxes(cross, 1, 2), away)
         left = right[:, -free:] - np.einsum("npq,np->nq", cross, solution)
         pull = np.diag(1.0 / sigma[:free] ** 2)
@@ -207,7 +210,7 @@ def fit_shape(
 # ---- least squares over many small problems -------------------------------------------------------------------------
 
 
-class _Steps(Frozen):
+class _Steps(Rows):
     """Steps at `edges` (N, E) beside each c, blurred by `blur` (N,), smeared over `smear` (N,) px that `lean` (N,)."""
 
     edges: Array
