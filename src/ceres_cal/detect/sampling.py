@@ -37,13 +37,16 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
     aside: Array = np.zeros(len(course))
     if len(threes) < _FEWEST:
         return aside, aside
+    at_rest_px = 1e-5  # a hundredth of the least standard deviation of a place, and less
     # Standard deviation of the error's amplitude, beforehand: what is wide has edges that are drawn aside alike.
     prior_px = 0.1 / max(median(course.width_px), 1.0)
     bends = offset_px[threes] @ _CURVATURE
     for _ in range(_ROUNDS):  # where in the pixel a line lies is where it is drawn but for that
         turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
         amplitude, sigma = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends, prior_px)
-        aside = np.nan_to_num(turns.imag @ amplitude)
+        before, aside = aside, np.nan_to_num(turns.imag @ amplitude)
+        if np.max(np.abs(aside - before)) < at_rest_px:
+            break
     left = np.hypot(_REMAINS * amplitude, sigma)
     remains = left * np.nan_to_num(np.abs(turns) * np.sqrt(_alike(course, offset_px, turns)))
     return aside, np.linalg.norm(remains, axis=1)
@@ -61,13 +64,12 @@ def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
 
 def _smooth(curve: Indices32, offset_px: Array) -> Array:
     """(N,) the mean of the places around on the same curve: one place's own error would explain itself."""
-    measured, box = np.isfinite(offset_px), np.ones(2 * _AROUND + 1)
-    smooth = np.zeros(len(curve))
-    for number in distinct(curve):
-        rows = np.flatnonzero(curve == number)
-        total, count = (np.convolve(one[rows], box)[_AROUND:-_AROUND] for one in (np.nan_to_num(offset_px), measured))
-        smooth[rows] = total / np.maximum(count, 1.0)
-    return smooth
+    sums = np.cumsum([np.nan_to_num(offset_px), np.isfinite(offset_px)], axis=1)
+    sums, rows = np.pad(sums, ((0, 0), (1, 0))), np.arange(len(curve))
+    first = np.maximum(rows - _AROUND, np.searchsorted(curve, curve))
+    after = np.minimum(rows + _AROUND + 1, np.searchsorted(curve, curve, "right"))
+    total, count = sums[:, after] - sums[:, first]
+    return np.asarray(total / np.maximum(count, 1.0))
 
 
 def _amplitudes(columns: Array, bends: Array, prior_px: float) -> tuple[Array, Array]:

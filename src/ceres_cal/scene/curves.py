@@ -134,8 +134,8 @@ def nearest_on_track(tracks: Array, is_arc: bool | Mask, points: Array) -> Array
     c, a, b = tracks[..., 0, :], tracks[..., 1, :], tracks[..., 2, :]
     away = points - c
     along = dots(away, a)
-    straight, turned = along / dots(a, a), np.arctan2(dots(away, b), along)
-    return np.asarray(np.where(is_arc, turned, straight))
+    straight = along / dots(a, a)
+    return np.asarray(np.where(is_arc, np.arctan2(dots(away, b), along), straight)) if np.any(is_arc) else straight
 
 
 def nearest_to_rays(tracks: Array, is_arc: bool | Mask, origin: Array, rays: Array) -> Array:
