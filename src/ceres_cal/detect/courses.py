@@ -53,10 +53,7 @@ def _places(
     target: Target, camera: Camera, curves: Indices32, spacing_px: float, margin_px: float
 ) -> tuple[Indices32, Array]:
     """Curve (N,) and parameter (N,) of the places; what is projected is projected at once, which spares most of it."""
-    pieces = 240  # of a curve, to measure its length in the image
-    low, high = _ends(target)[curves].T
-    s = np.ascontiguousarray(np.linspace(low, high, pieces + 1, axis=1))
-    places = along_track(target.tracks[0][curves][:, None], target.is_arc[curves][:, None], s)
+    s, places = (one[curves] for one in target.evenly)
     x, y = camera.project(places.reshape(-1, 3)).T.reshape(2, *s.shape)
     size = np.array(camera.image_size)
     with np.errstate(invalid="ignore"):

@@ -20,12 +20,12 @@ class Growing {
           terms_below_(terms_below),
           above_(above),
           below_(below),
-          width_(width),
+          share_(1.0 / width),
           limit_(limit),
           end_(limit < FAR ? at(limit).value : FAR) {}
 
-    // x up to the limit where the map is `target`, by Newton safeguarded with bisection; NaN where none is.
-    double inverse(double target) const {
+    // x up to the limit where the map is `target`, by Newton from a start, and bisection; NaN where none is.
+    double inverse(double target, double start) const {
         constexpr double NONE = std::numeric_limits<double>::quiet_NaN();
         if (!(target >= 0.0 && target < FAR && target <= end_)) return NONE;
         double low = 0.0, high = limit_ < FAR ? limit_ : target, last = FAR;
@@ -33,7 +33,7 @@ class Growing {
             for (int i = 0; i < STEPS && at(high).value < target; ++i) high *= 2.0;
             if (!(target <= at(high).value)) return NONE;
         }
-        double x = std::min(target, high);
+        double x = std::clamp(start, low, high);
         for (int i = 0; i < STEPS; ++i) {
             const Value there = at(x);
             const double error = there.value - target;
@@ -68,10 +68,10 @@ class Growing {
     }
 
     Value at(double x) const {
-        const double place = x / width_;
+        const double place = x * share_;
         const int piece = place < pieces_ - 1 ? static_cast<int>(place) : pieces_ - 1;
         Value found = polynomial(terms_, above_ + terms_ * piece, place - piece);
-        found.slope /= width_;
+        found.slope *= share_;
         if (terms_below_ == 0) return found;
         const Value below = polynomial(terms_below_, below_, x);
         found.value /= below.value;
@@ -81,7 +81,7 @@ class Growing {
 
     int pieces_, terms_, terms_below_;
     const double *above_, *below_;
-    double width_, limit_, end_;  // the last: how large the map is at its limit
+    double share_, limit_, end_;  // of a width, one; the last: how large the map is at its limit
 };
 
 // Rays of a lens on square pixels whose images are some offsets, each sought in the plane that touches its start.

@@ -68,7 +68,12 @@ void inverse_of_growing(const Read<N, N>& above, double width, const Read<N>& be
     require(places.size() == targets.size(), "targets and places are (N,)");
     unlocked([&] {
         const Growing map(whole(pieces), whole(terms), above.data(), width, whole(below.size()), below.data(), limit);
-        for (size_t i = 0; i < targets.size(); ++i) places.data()[i] = map.inverse(targets.data()[i]);
+        double last = 1.0, before = 1.0;  // shares of the targets: most lie on lines
+        for (size_t i = 0; i < targets.size(); ++i) {
+            const double target = targets.data()[i], place = map.inverse(target, (2.0 * last - before) * target);
+            places.data()[i] = place;
+            before = last, last = place > 0.0 ? place / target : 1.0;
+        }
     });
 }
 

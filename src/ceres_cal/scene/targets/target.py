@@ -19,7 +19,7 @@ from msgspec import Struct
 from ceres_cal.base import Array, Frozen, LazyTable, Mask, cached_property, convert, did_you_mean, field, median
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.words import plural
-from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve
+from ceres_cal.scene.curves import Arc, Curve, aliases, along_curve, along_track
 
 
 class Shape(Struct, frozen=True):
@@ -190,6 +190,13 @@ class Target(Frozen):
     def is_arc(self) -> Mask:
         """(C,) whether each curve is an arc."""
         return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
+
+    @cached_property
+    def evenly(self) -> tuple[Array, Array]:
+        """(C, 241) parameters evenly along each curve, from end to end, and (C, 241, 3) m the places there."""
+        low, high = np.array([curve.parameter_range for curve in self.curves.values()]).reshape(-1, 2).T
+        s = np.ascontiguousarray(np.linspace(low, high, 241, axis=1))
+        return s, along_track(self.tracks[0][:, None], self.is_arc[:, None], s)
 
     @cached_property
     def places(self) -> Array:
