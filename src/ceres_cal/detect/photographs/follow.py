@@ -15,7 +15,7 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.beside import among_others
-from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
+from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.painted import painted_curves, visible_curves
 from ceres_cal.detect.photographs.refit import (
     TARGET,
@@ -142,7 +142,7 @@ class Tracker:
         is_sure: dict[Followed, bool] = {}
         for one in self._reached(starts):
             if one not in is_sure:
-                is_sure[one] = one.holds and one.share >= SURE_SHARE
+                is_sure[one] = one.is_sure
                 if is_sure[one]:
                     yield one
         left = [one for one in is_sure if not is_sure[one]]
@@ -273,9 +273,11 @@ class Tracker:
         A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
         dimensions free the camera is right: its own lines are next to where that puts them.
         """
-        there = self.as_built(other)[1].camera
-        drawn = self.of_painted(there).at_rest(there, _free(there))
-        if drawn.share < SURE_SHARE or not drawn.holds:
+        there = self.as_built(other)[1]
+        if not there.is_sure:
+            return other
+        drawn = self.of_painted(there.camera).at_rest(there.camera, _free(there.camera))
+        if not drawn.is_sure:
             return other
         drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
         return other if drawn.built.is_other or drawn.built.dimensions else drawn

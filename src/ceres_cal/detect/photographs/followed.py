@@ -87,6 +87,11 @@ class Followed(Frozen):
         return self.share >= LEAST_SHARE and self._has_all
 
     @property
+    def is_sure(self) -> bool:
+        """Whether it holds, with so much paint that no other start is tried."""
+        return self.holds and self.share >= SURE_SHARE
+
+    @property
     def is_field(self) -> bool:
         """Whether it holds, and its curves lie as those of the target do."""
         return self.holds and not self.built.is_other
@@ -95,7 +100,7 @@ class Followed(Frozen):
     def is_decided(self) -> bool:
         """Whether its lines are there, and other dimensions alone explain them: no other start would tell more."""
         is_another = self.built.is_other and bool(self.built.dimensions) and not self.built.aside_m
-        return is_another and self.holds and self.share >= SURE_SHARE
+        return is_another and self.is_sure
 
     @property
     def may_be_worn(self) -> bool:
