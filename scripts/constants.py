@@ -89,7 +89,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("calibration.lens_forms", "AS_GOOD ALIKE CLEARLY", "lens"),
     *_of("calibration.lens_comparison", "_QUIETER _SOUND_PX PRICE", "lens"),
     *_of("calibration.lens_seen", "_REFUTED _UNSEEN_GROUPS", "lens"),
-    *_of("calibration.lens_seen", "_KEPT _NEAR _FAR", "lens"),
+    *_of("calibration.lens_seen", "_AT_BEST _KEPT _NEAR _FAR", "lens"),
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),
     *_of("calibration.lens_of_few", "_STRONG", "lens"),
     *_of("calibration.stretched", "_STRETCHED _BY _WORTH_A_SOLVE", "calibrate"),

@@ -26,7 +26,13 @@ from ceres_cal.base import (
 )
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
-from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort, one_power_more
+from ceres_cal.calibration.lens_comparison import (
+    asks_for_more,
+    compared_kinds,
+    explained_by_another,
+    last_resort,
+    one_power_more,
+)
 from ceres_cal.calibration.lens_forms import (
     AS_GOOD,
     AS_GOOD_BESIDE_LENGTHS,
@@ -196,13 +202,12 @@ class Comparison(Frozen):
         return dict.fromkeys(longer, likely[self.chosen]) | likely, longer
 
     def _possible(self, least: float) -> list[Candidate]:
-        """The lenses with a formula, without those that another of them refutes, where they are as probable as that:
+        """The lenses without those that another of them refutes, where they are as probable as that:
         what no choice may take is no alternative to what was chosen.
         """
-        told = [one for one in self.tried if not one.form.blank.roughness]
-        likely = _probabilities(told)
-        asked = [p >= least and one is not self.chosen for one, p in zip(told, likely, strict=True)]
-        return [one for i, one in enumerate(told) if not (asked[i] and _is_refuted(told, i))]
+        likely = _probabilities(self.tried)
+        asked = [p >= least and one is not self.chosen for one, p in zip(self.tried, likely, strict=True)]
+        return [one for i, one in enumerate(self.tried) if not (asked[i] and _is_refuted(self.tried, i))]
 
     @staticmethod
     def _ends(
@@ -356,11 +361,12 @@ def _among(
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
-    more = tuple(last_resort(seen, found.chosen, by_most=by_most))
+    is_asked = asks_for_more(seen, found.chosen, by_most=by_most)
+    more = tuple(last_resort(seen, found.chosen, is_asked=is_asked))
     found = replace(found, tried=(*found.tried, *more))
     # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.
     least = AS_GOOD if by_most else CLEARLY
-    clearly = next((one for one in more if one.beats(found.chosen, least)), None)
+    clearly = next((one for one in more if is_asked and one.beats(found.chosen, least)), None)
     return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)
 
 

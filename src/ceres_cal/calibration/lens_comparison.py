@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 
 from ceres_cal.base import CalibrationError, DegenerateError, Mask, Poses, attempt, or_none, replace
-from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
+from ceres_cal.calibration.lens_forms import PAPER, Form, kinds, without_formula
 from ceres_cal.calibration.lens_seen import (
     MOST_ROUNDS,
     Candidate,
@@ -175,20 +175,27 @@ def _noise_px(end: RobustSolution) -> float:
 _TOGETHER = 1.5
 
 
-def last_resort(seen: InlierRows, chosen: Candidate, *, by_most: bool = False) -> Iterator[Candidate]:
-    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together, or most
-    of the observations are asked. Within views, too: eight of a lens that no formula has do not agree by two sd.
+def asks_for_more(seen: InlierRows, chosen: Candidate, *, by_most: bool) -> bool:
+    """Whether a lens without a formula may be chosen: where even the longest lens of the chosen kind leaves what goes
+    together, or most of the observations are asked. Within views, too: eight of a lens that no formula has do not agree
+    by two sd.
+    """
+    return by_most or _goes_together(seen, chosen.of)
+
+
+def last_resort(seen: InlierRows, chosen: Candidate, *, is_asked: bool) -> Iterator[Candidate]:
+    """The lenses without a formula, where they are asked for; and where the paper's lens is not as good in a camera's
+    only view, of a floor, from a start of their own. There another formula puts the camera elsewhere, and leaves
+    nothing that goes together: of a moustache's phi of 313 px it made 186, and places were 10 mm off, 5 sd.
 
     Not of so few placements that their features are held out one by one: what goes together within each would be
-    predicted, too. Nor where some camera has one view, of a floor: a line that is painted aside bends there as by a
-    lens.
+    predicted, too.
     """
-    if seen.splits_placements:
+    is_one_view = min(len(seen.sights.of_camera(name)) for name in seen.sights.cameras) == 1
+    if seen.splits_placements or not (is_asked or (is_one_view and chosen.form.label != PAPER)):
         return
-    if by_most or _goes_together(seen, chosen.of):
-        fewest = min(len(seen.sights.of_camera(name)) for name in seen.sights.cameras)
-        for forms in without_formula(of_one_view=fewest == 1):
-            yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
+    for forms in without_formula(of_one_view=is_one_view):
+        yield from seen.solved(forms, None if is_one_view else chosen.of.estimate).candidates(first=True)
 
 
 def one_power_more(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:

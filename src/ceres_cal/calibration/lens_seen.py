@@ -1,7 +1,4 @@
-"""What a solve saw, and how each kind of lens sees it.
-
-Each kind of lens near its best, and what follows for each of its lenses.
-"""
+"""What a solve saw: each kind of lens near its best, and what follows for each of its lenses."""
 
 from __future__ import annotations
 
@@ -34,6 +31,7 @@ from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.as_built import Built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.closed_forms import LensProfile, edge_over
+from ceres_cal.start.initialise import initialise
 
 # Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.01
 # the paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could
@@ -228,7 +226,10 @@ _PRECISION = 1e-2  # relative change of the cost from which on normal equations 
 # Share of its squares by which a kind may be off its best, else it is solved for finely: it is up to .06, and three
 # times them in a valley of phi over a field, which falls by less than the precision at each step. A lens without k3
 # seemed to leave 6 variances more there, not 110.
-_FAR, _FINELY = 0.1, 1e-4
+_FAR = 0.1
+# Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected; and of
+# all, where the next step is of a thousandth of a standard deviation.
+_AT_BEST = 1e-6
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
 # Variances by which a kind was off its best, and by which one of its lenses is off that. So far a solve moved lenses
 # of 24 simulated sets of boards by less than a tenth of a standard deviation, at three times as many by a third.
@@ -241,6 +242,10 @@ def found(solution: Solution) -> Solution:
     if solution.failed:
         raise DegenerateError(f"cannot be solved for: {solution.termination}")
     return solution
+
+
+def _at_best(problem: Problem, estimate: Estimate) -> Estimate:
+    return found(solve(problem, estimate, precision=_AT_BEST)).estimate
 
 
 def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
@@ -297,24 +302,24 @@ class InlierRows(Frozen):
                     self._shown(estimate)  # where that is why, its own words are said
                 estimate = found(solution).estimate
             kind = self._near_best(forms, problem, estimate)
-            if is_solved or not kind.may_fall > _FAR:
-                return kind
-            return self._near_best(forms, problem, found(solve(problem, estimate, precision=_FINELY)).estimate)
+            return kind if not kind.may_fall > _FAR else self._near_best(forms, problem, _at_best(problem, estimate))
 
         return _or_failed(near_best, forms, start)
 
-    def solved(self, forms: tuple[Form, ...], near: Estimate) -> Kind:
-        """A kind whose roughness the data tell, by all rounds of a robust solve from an estimate with another lens."""
+    def solved(self, forms: tuple[Form, ...], near: Estimate | None) -> Kind:
+        """A kind whose roughness the data tell, by all rounds of a robust solve near an estimate or from nothing."""
         options = forms[0].of(self.options)
-        start = seen_through(near, options, profiles_of(near, self.sights))
 
         def near_best() -> Kind:
+            start = initialise(self.sights, options).estimate if near is None else near
+            start = seen_through(start, options, profiles_of(start, self.sights))
             problem = problem_of(self.every, options, start)
             end = solve_robustly(problem, start, most_rounds=MOST_ROUNDS)
             problem = self._problem(options, end.estimate, end.problem.smoothness)
-            return self._near_best(forms, problem, end.estimate)
+            there = end.estimate if near is not None else _at_best(problem, end.estimate)
+            return self._near_best(forms, problem, there)
 
-        return _or_failed(near_best, forms, start)
+        return _or_failed(near_best, forms, self.end.estimate)
 
     def holding(self, options: Options) -> InlierRows:
         """The same with what other options hold of cameras."""
@@ -366,15 +371,12 @@ class InlierRows(Frozen):
         Raises:
             CalibrationError: it cannot be solved for.
         """
-        # Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected;
-        # and of all, where the next step is of a thousandth of a standard deviation.
-        at_best = 1e-6
         options = candidate.form.of(self.options)
         start = as_held(there or candidate.estimate, options)
         problem = self._problem(options, start, candidate.of.smoothness)
         if held is not None:
             problem = problem.holding(held.owner, intrinsic_names(start.cameras[held.owner].lens).index(held.quantity))
-        solution = found(solve(problem, start, precision=at_best, posed=at_best))
+        solution = found(solve(problem, start, precision=_AT_BEST, posed=_AT_BEST))
         if as_promised and 2.0 * solution.cost > self._kept(candidate):
             raise DegenerateError("is not at its best where normal equations have it")
         return solution
