@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -194,7 +194,7 @@ def test_a_thousand_frames_cost_milliseconds() -> None:
     views, points = views_of(*map(str, range(1000))), points_of(*pixels)
     seconds = []
     for _ in range(5):
-        start = perf_counter()
+        start = process_time()
         assert not np.any(find_copies(views, points, NO_CURVES).points >= 0)
-        seconds.append(perf_counter() - start)
+        seconds.append(process_time() - start)
     assert min(seconds) < 0.01  # 0.4 to 0.6 ms measured
