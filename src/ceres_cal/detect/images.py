@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array32, Image, InputError, Mask, quantile, read_bytes, require_room
+from ceres_cal.base import AnyArray, Array32, Image, InputError, Mask, median, quantile, read_bytes, require_room
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
@@ -113,7 +113,7 @@ def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
 def filled(grey: Array32, left_out: Mask) -> Array32:
     """A photograph (height, width) whose pixels under a mask are as light as what is around them, without a line."""
     shown, plane = (~left_out).astype(np.float32), grey.copy()
-    plane[left_out] = float(np.median(grey[~left_out])) if not left_out.all() else 0.0
+    plane[left_out] = median(grey[~left_out]) if not left_out.all() else 0.0
     for size in _AROUND_PX:
         weight = np.asarray(cv2.blur(shown, (size, size)))
         light = np.asarray(cv2.blur(grey * shown, (size, size)))

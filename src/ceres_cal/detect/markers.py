@@ -11,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ceres_cal.base import Array, Array32, Image, Image8, InputError
+from ceres_cal.base import Array, Array32, Image, Image8, InputError, median
 from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.charuco_boards import dictionary_of
@@ -114,11 +114,11 @@ def _side(place: Array, offset_px: Array, sigma_px: Array, length_px: float) -> 
     for _ in range(3):
         if np.count_nonzero(used) < _FEWEST_PLACES:
             return None
-        spread = max(float(np.median(sigma_px[used])), 1e-3)
+        spread = max(median(sigma_px[used]), 1e-3)
         rows = np.vstack([terms[used] / spread, [0.0, 0.0, 1.0 / (sag * length_px)]])
         solution = np.linalg.lstsq(rows, np.append(offset_px[used] / spread, 0.0), rcond=None)[0]
         away = np.abs(offset_px - terms @ solution)
-        used = np.isfinite(offset_px) & (away <= _FAR * max(float(np.median(away[used])), spread))
+        used = np.isfinite(offset_px) & (away <= _FAR * max(median(away[used]), spread))
     return np.asarray(solution)
 
 

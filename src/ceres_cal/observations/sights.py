@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from ceres_cal.base import Frozen, cached_property, replace
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, evenly, numbers_of
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask, distinct, evenly, median, numbers_of
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene import Camera, nearest_to_rays
 
@@ -211,7 +211,7 @@ class Sights(Frozen, Sequence["Sights"]):
         for one in np.unique(curve):
             rows = np.flatnonzero(curve == one)
             along = self.curve_pixels[rows][:, np.argmax(np.ptp(self.curve_pixels[rows], axis=0))]
-            half[rows] = along > np.median(along)
+            half[rows] = along > median(along)
         return half
 
     def displaced(self, points: Array, curves: Array) -> Sights:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ceres_cal.base import Array, Mask, SolutionError, distinct
+from ceres_cal.base import Array, Mask, SolutionError, distinct, median
 from ceres_cal.effects import AsBuilt
 from ceres_cal.observations import Observations, Sights
 from ceres_cal.problem import Estimate, Problem, Residuals, floor_of
@@ -221,7 +221,7 @@ def is_another(one: AsBuilt, target: Target) -> bool:
         return False
     places = target.point_array
     away = np.linalg.norm(places[:: -(-len(places) // most_probes), None] - places, axis=2)
-    return one.rms_m > _NOT_BUILT * float(np.median(np.partition(away, 1, axis=1)[:, 1]))
+    return one.rms_m > _NOT_BUILT * median(np.partition(away, 1, axis=1)[:, 1])
 
 
 def misnamed(every: Sequence[AsBuilt], targets: Mapping[str, Target]) -> Iterator[str]:
