@@ -107,6 +107,8 @@ def test_the_target() -> None:
     assert target_from_spec(dict(TARGET.spec), "here") == TARGET
     turned = markers(NAME, {3: Marker((1.0, 2.0, 0.5), 0.2, 90.0)})
     assert turned.points["3.top_right"] == pytest.approx((0.9, 2.1, 0.5))
+    with pytest.raises(InputError, match="marker '7': it needs a number from 0 on"):  # it was a TypeError
+        markers("DICT_4X4_50", {"7": Marker((0.0, 0.0), 0.1)})  # type: ignore[dict-item]
     with pytest.raises(InputError, match="marker 3: it needs"):
         markers(NAME, {3: Marker((1.0, 2.0), -0.2)})
     with pytest.raises(InputError, match="by its number, not 'x'"):

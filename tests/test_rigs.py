@@ -19,7 +19,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.detect.images import read_grey
-from ceres_cal.observations import Observations, combine
+from ceres_cal.observations import Observations, View, combine
 from ceres_cal.observations.same_frame import with_same_frames
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate, Options, Station
@@ -156,6 +156,24 @@ def test_baseline_and_angle_with_their_sd() -> None:
         off.append((pair.angle_rad - _ANGLE_RAD) / pair.angle_sd_rad)
         assert pair.baseline_sd_m < 1e-3 and pair.angle_sd_rad < 1e-3
     assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5  # 0.9
+
+
+def test_cameras_without_a_common_moment_have_no_baseline() -> None:
+    """Frames named by time stamps that differ: the baseline was 0 ± 0 mm, and nothing was said."""
+    rig = _rig(checkerboard(9, 6, 0.1))
+    late = {view.station for view in rig.views[-1:]}
+
+    def apart(view: View) -> View:
+        return (
+            replace(view, frame=view.frame + ".004", placement=f"{view.placement}.004")
+            if view.station in late
+            else view
+        )
+
+    calibration = calibrate(replace(rig, views=tuple(map(apart, rig.views))))
+    assert calibration.uncertainty.rig == () and len(calibrate(rig).uncertainty.rig) == 1
+    (said,) = (text for text in calibration.remarks if "nothing ties" in text)
+    assert "join --same-frame" in said and not any("nothing ties" in text for text in calibrate(rig).remarks)
 
 
 def test_few_boards_before_a_pair_are_as_wide_as_they_are_off() -> None:

@@ -19,7 +19,7 @@ from ceres_cal.observations import Observations, SightKey, View
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution
 from ceres_cal.problem.information import Key
-from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, anchored_stations
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import natural_sizes
 from ceres_cal.problem.residuals import residuals
@@ -195,6 +195,17 @@ def _heights_of_cameras(estimate: Estimate, views: Sequence[View]) -> Array:
     """(V,) m, of the camera of each view in the frame of its target."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in views]
     return np.asarray(inverted(estimate.pose_stack(keys))[:, 2, 3])
+
+
+def worlds_apart(observations: Observations) -> Iterator[str]:
+    """Words about stations that nothing ties to the field, or to each other."""
+    alone = sorted(anchored_stations(observations))
+    if len(alone) + any(view.placement is None for view in observations.shown_views) > 1:
+        names = ", ".join(map(repr, alone))
+        yield (
+            f"nothing ties {names} to the other stations, and no pose says how they stand to each other; where they "
+            "saw boards at the same moments, give frames of one moment one name (ceres-cal join --same-frame)"
+        )
 
 
 def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:

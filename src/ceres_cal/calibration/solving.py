@@ -18,6 +18,7 @@ from ceres_cal.calibration.outcome import (
     seen_from_behind,
     unknown_phi,
     unusual_pixels,
+    worlds_apart,
 )
 from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
@@ -271,7 +272,12 @@ def known_of(seen: Explained) -> Calibration:
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
-        remarks = (*resting_phi(seen.end, seen.problem, posterior), *noisier_cameras(seen.problem.observations.noise))
+        observed = seen.problem.observations
+        remarks = (
+            *resting_phi(seen.end, seen.problem, posterior),
+            *noisier_cameras(observed.noise),
+            *worlds_apart(observed),
+        )
     calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)

@@ -45,9 +45,14 @@ class RigPair(Frozen, eq=True):
 
 
 def rig_pairs(estimate: Estimate, posterior: Posterior) -> tuple[RigPair, ...]:
-    """The first station with each one of another camera."""
+    """The first station with each one of another camera; none where several are worlds of their own, which stand in no
+    relation to each other.
+    """
     first, *others = estimate.stations
     camera = estimate.stations[first].camera
+    held = [name for name in estimate.stations if not posterior.knows_station(name)]
+    if len(held) > 1 or (held and held != [first]):
+        return ()
     return tuple(_pair(estimate, posterior, first, o) for o in others if estimate.stations[o].camera != camera)
 
 

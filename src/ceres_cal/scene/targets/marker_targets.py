@@ -61,9 +61,10 @@ def markers(dictionary: str, places: Mapping[int, Marker], *, movable: bool = Fa
     require_size(4 * len(places), "markers")
     for number, marker in places.items():
         finite = np.all(np.isfinite([*marker.at_m, marker.side_m, marker.turn_deg]))
-        if number < 0 or len(marker.at_m) not in (2, 3) or not finite or not marker.side_m > 0.0:
+        is_number = isinstance(number, int | np.integer) and number >= 0
+        if not is_number or len(marker.at_m) not in (2, 3) or not finite or not marker.side_m > 0.0:
             raise InputError(
-                f"marker {number}: it needs a number from 0 on, at_m with two or three finite numbers, and a side_m "
+                f"marker {number!r}: it needs a number from 0 on, at_m with two or three finite numbers, and a side_m "
                 "above 0"
             )
     points = {
