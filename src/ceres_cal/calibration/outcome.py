@@ -96,7 +96,14 @@ def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
             yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
 
 
-def resting_phi(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
+def remarks_of(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
+    """What was made of the observations, which costs no trust."""
+    yield from _resting_phi(end, problem, posterior)
+    yield from _noisier_cameras(problem.observations.noise)
+    yield from _worlds_apart(problem.observations)
+
+
+def _resting_phi(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
     """Words about cameras whose phi rests on what is usual, beside how well the posterior knows it."""
     estimate, reduced = end.estimate, end.reduced
     usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
@@ -197,7 +204,7 @@ def _heights_of_cameras(estimate: Estimate, views: Sequence[View]) -> Array:
     return np.asarray(inverted(estimate.pose_stack(keys))[:, 2, 3])
 
 
-def worlds_apart(observations: Observations) -> Iterator[str]:
+def _worlds_apart(observations: Observations) -> Iterator[str]:
     """Words about stations that nothing ties to the field, or to each other."""
     alone = sorted(anchored_stations(observations))
     if len(alone) + any(view.placement is None for view in observations.shown_views) > 1:
@@ -208,7 +215,7 @@ def worlds_apart(observations: Observations) -> Iterator[str]:
         )
 
 
-def noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
+def _noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
     """Words about cameras, or what they see, that scatter otherwise than the others, beside what is stated of them."""
     if noise:
         each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())

@@ -11,14 +11,12 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import (
     aspects_alone,
     came_out,
-    noisier_cameras,
     of_all,
+    remarks_of,
     require_lens_told,
-    resting_phi,
     seen_from_behind,
     unknown_phi,
     unusual_pixels,
-    worlds_apart,
 )
 from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.effects.effect import AsBuilt, EffectEstimate, ShiftsAt
@@ -272,12 +270,7 @@ def known_of(seen: Explained) -> Calibration:
             *seen_from_behind(seen.end.estimate, seen.problem.observations),
         )
         warnings = (*warnings, *conflicts.words, *unknown_phi(seen.end, posterior), *strange, *alike)
-        observed = seen.problem.observations
-        remarks = (
-            *resting_phi(seen.end, seen.problem, posterior),
-            *noisier_cameras(observed.noise),
-            *worlds_apart(observed),
-        )
+        remarks = tuple(remarks_of(seen.end, seen.problem, posterior))
     calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)
