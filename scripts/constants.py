@@ -152,7 +152,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("effects.columns", "_LEAST_SHARE", "diagnose"),
     *_of("effects.table.targets", "_FEWEST_ON_CURVE _FEWEST_OF_POINT", "diagnose"),
     *_of("diagnostics.diagnosis", "_FEWEST_AGREE _FAR_M", "diagnose"),
-    *_of("moves.checks", "_INLIER_SIGMA _LEAST_SHARE _NEARBY _USUAL_EQUATIONS", "check"),
+    *_of("moves.checks", "_INLIER_SIGMA _LEAST_SHARE _NEARBY _NOISES _USUAL_EQUATIONS", "check"),
     *_of("moves.agreement", "FALSE_ALARMS NOISIER _SEEN_NATS", "check", "refit"),
     *_of("problem.residuals", "_STRAY", "check", "refit"),
     *_of("moves.poses", "_FITS_SHARE _FITS_SIGMA _FITS_SCALE _ALIKE _NATS_ALIKE _WIDE", "check", "refit"),
