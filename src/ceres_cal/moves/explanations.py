@@ -121,7 +121,8 @@ def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solutio
     names = ", ".join(repr(search.sight.key.station) for search in searches)
     return _other_explanation(plan, searches) or SolutionError(
         f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
-        "field: check labels, which camera and which field it is"
+        "field: check labels, which camera and which field it is, or state sigma_px of clicks that are noisier than "
+        "what was calibrated from"
     )
 
 
