@@ -30,7 +30,7 @@ from ceres_cal.formats.ssl_fields import field_of, target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import KannalaBrandt
-from ceres_cal.scene.targets import Segment, custom, ssl_field
+from ceres_cal.scene.targets import Arc, Segment, custom, ssl_field
 
 # name, number, type as published; F is a required float, f an optional one
 CALIB = (
@@ -247,6 +247,8 @@ def test_what_is_no_field_is_refused() -> None:
         target_of({"field_length": 9000})
     court = custom({}, {"edge": Segment((0, 0, 0), (4, 0, 0), 0.05), "side": Segment((0, 0, 0), (0, 3, 0), 0.05)})
     assert field_of(court)["field_length"] == 8000  # as far as it reaches to either side
+    corner = Arc((-4.0, -3.0, 0.0), 1.0, 0.0, 0.5 * np.pi, 0.05)  # its circle would reach 2 m farther
+    assert field_of(custom({}, {**court.curves, "corner": corner}))["field_width"] == 6000
 
 
 # ---- ssl-vision's settings ------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene import Arc, Curve, Segment, Target, custom, ssl_field
+from ceres_cal.scene.curves import curve_points
 
 _SIZES = {  # of the message: the target's
     "field_length": "field_length_m",
@@ -44,10 +45,9 @@ def target_of(field: Mapping[str, Any]) -> Target:
         curves = _curves(field)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"a line or an arc of the field has something else than its numbers: {error}") from None
-    by_rule = ssl_field("A" if field["field_length"] > _A_LENGTH_MM else "B")
+    division = _division_of(field["field_length"])
     given = {ours: 1e-3 * float(field[name]) for name, ours in _SIZES.items() if field.get(name)}
-    division = "A" if field["field_length"] > _A_LENGTH_MM else "B"
-    nominal = ssl_field(division, **given)
+    by_rule, nominal = ssl_field(division), ssl_field(division, **given)
     if nominal.curves == by_rule.curves and nominal.points == by_rule.points:
         nominal = by_rule
     if all(name in nominal.curves and _alike(curve, nominal.curves[name]) for name, curve in curves.items()):
@@ -89,11 +89,16 @@ def field_of(target: Target) -> dict[str, Any]:
     curves = target.curves
     if not curves:
         raise InputError("the target has no lines: it is no field")
-    reach = np.concatenate([_reach(curve) for curve in curves.values()])
+    pieces = 360  # of a curve: a circle's outermost places are at their ends
+    reach = np.concatenate([curve_points(curve, 0, pieces) for curve in curves.values()])
     length, width = (round(2e3 * float(np.max(np.abs(reach[:, axis])))) for axis in (0, 1))
-    division = "A" if length > _A_LENGTH_MM else "B"
-    rules = {name: _sizes_of(ssl_field(division))[name] for name in _SIZES}
-    sizes = {**rules, "field_length": length, "field_width": width, **_RULES, **_sizes_of(target)}
+    sizes = {
+        **_sizes_of(ssl_field(_division_of(length))),
+        "field_length": length,
+        "field_width": width,
+        **_RULES,
+        **_sizes_of(target),
+    }
     lines = [
         {"name": name, "p1": _place(c.start), "p2": _place(c.end), "thickness": _mm(c.width_m), **_type(name)}
         for name, c in curves.items()
@@ -122,11 +127,8 @@ def _sizes_of(target: Target) -> dict[str, int]:
     return {theirs: round(1e3 * target.dimensions[ours]) for theirs, ours in _SIZES.items()}
 
 
-def _reach(curve: Curve) -> Any:
-    if isinstance(curve, Segment):
-        return np.array([curve.start, curve.end])
-    size = np.array([curve.radius_m, curve.radius_m, 0.0])
-    return np.array([curve.centre - size, curve.centre + size])
+def _division_of(length_mm: float) -> str:
+    return "A" if length_mm > _A_LENGTH_MM else "B"
 
 
 def _mm(metres: float) -> float:
