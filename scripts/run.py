@@ -36,7 +36,11 @@ def main(arguments: Sequence[str]) -> int:
         print(f"run.py: there is no script {name!r}: `python scripts/run.py` lists them", file=sys.stderr)
         return 2
     sys.argv = [f"run.py {name}", *given]  # what a parser calls the program
-    code: int = importlib.import_module(f"{path.parent.name}.{name}").main(given)
+    script = importlib.import_module(f"{path.parent.name}.{name}")
+    if {"-h", "--help"} & {*given} and not hasattr(script, "parser") and not hasattr(script, "argparse"):
+        print(script.__doc__)  # it takes paths alone
+        return 0
+    code: int = script.main(given)
     return code
 
 

@@ -82,3 +82,12 @@ def test_every_script_is_found_by_its_name(capsys: pytest.CaptureFixture[str]) -
     named = set(re.findall(r"run[.]py ([a-z]\w*)", text))
     assert len(named) > 10 and named <= set(front.scripts())
     assert front.main(["nothing"]) == 2 and "lists them" in capsys.readouterr().err
+
+
+def test_a_script_that_takes_paths_alone_explains_itself(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("built_in_scenes", "make_honest_picture", "make_picture"):
+        assert front.main([name, "--help"]) == 0 and f"run.py {name}" in capsys.readouterr().out
+    assert not [*tmp_path.iterdir()]
