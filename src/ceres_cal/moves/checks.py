@@ -35,6 +35,7 @@ from ceres_cal.moves.agreement import (
 )
 from ceres_cal.moves.explanations import WORDS
 from ceres_cal.moves.poses import (
+    NOISES,
     PoseCandidate,
     PoseSearch,
     alike,
@@ -58,10 +59,6 @@ _LEAST_SHARE = 0.5
 # m and rad: how far a pose is sought that few observations leave open. Of 640 unmoved cameras with few lines or clicks
 # none is said to have moved, at three times that 2, without a bound 64.
 _NEARBY = (0.1, math.radians(5.0))
-# Times the noise of the calibration that new observations may have, the likeliest of which is theirs: at one alone a
-# pose goes through some of what is clicked after a calibration by boards, and the others seem to be strays (19 of 120
-# cameras that stand still were moved, now 6; of 120 that were moved 105 were found, now 102).
-_NOISES = (1.0, 2.0, 4.0, 8.0)
 # Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
 _USUAL_EQUATIONS = 4.0
 
@@ -204,7 +201,7 @@ def _case(calibration: Calibration, sight: Sights) -> _CheckCase:
 def _checked(calibration: Calibration, sight: Sights, level: float) -> Agreement:
     case = _case(calibration, sight)
     (points, curves), old = calibration.fit.scales, [case.estimate.stations[case.name].cam_from_world]
-    searches = [PoseSearch(sight, case.estimate, (noise * points, noise * curves)) for noise in _NOISES]
+    searches = [PoseSearch(sight, case.estimate, (noise * points, noise * curves)) for noise in NOISES]
     found = [(one, candidates) for one in searches if (candidates := pose_candidates(one, old, patience=0))]
     search, candidates = min(found, key=lambda one: one[1][0].misfit, default=(searches[0], []))
     near = least_moved(alike(candidates), old) if candidates else None

@@ -57,6 +57,10 @@ WORDS = {
 }
 
 
+class NothingFitsError(SolutionError):
+    """No explanation fits at the noise that was asked for."""
+
+
 class OtherChangeError(SolutionError):
     """Something else has changed than what was let go.
 
@@ -119,7 +123,7 @@ def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> Solutio
     another refit explains them.
     """
     names = ", ".join(repr(search.sight.key.station) for search in searches)
-    return _other_explanation(plan, searches) or SolutionError(
+    return _other_explanation(plan, searches) or NothingFitsError(
         f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
         "field: check labels, which camera and which field it is, or state sigma_px of clicks that are noisier than "
         "what was calibrated from"

@@ -7,14 +7,16 @@ the old posterior is one more prior, as a full matrix.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 
-from ceres_cal.base import DegenerateError, Pose, SolutionError, checked, numerical, replace
+from ceres_cal.base import DegenerateError, Pose, SolutionError, attempt, checked, numerical, replace
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
     WORDS,
+    NothingFitsError,
     OtherChangeError,
     Rival,
     judged,
@@ -26,6 +28,7 @@ from ceres_cal.moves.explanations import (
     zoomed_search,
 )
 from ceres_cal.moves.poses import (
+    NOISES,
     PoseSearch,
     alike,
     equations,
@@ -89,6 +92,21 @@ def refit(
             raise
         plan = make_plan(calibration, observations, change.what, moved, options)
         return _refitted(plan, observations, progress, change)
+    except NothingFitsError as nothing:  # reads: "no explanation fits ...", where that holds at more noise, too
+        points, curves = plan.scales
+        every = (replace(plan, scales=(noise * points, noise * curves)) for noise in NOISES[1:])
+        # quiet: nothing fits at more noise, either, and that is what is said
+        found = attempt(partial(_refitted, min(every, key=_misfit), observations, progress))
+        if isinstance(found, Calibration):
+            return found
+        raise nothing from None
+
+
+def _misfit(plan: RefitPlan) -> float:
+    """Of the best poses at the noise of the plan, in nats."""
+    searches = [PoseSearch(sight, plan.known, plan.scales) for sight in _moved_sights(plan)]
+    every = [pose_candidates(search, old_poses(plan, search), patience=0) for search in searches]
+    return sum(candidates[0].misfit if candidates else np.inf for candidates in every)
 
 
 def _refitted(
