@@ -32,8 +32,6 @@ _MOST_STEP_PX = 0.7
 # Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
 # the pixels alone tell such a step and the line's place hardly apart.
 _LEVEL_SIGMA = 5.0
-# Of Newton's steps, the most; and one after which a window's next ones are below a hundredth of its sigma.
-_STEPS, _AT_REST_PX = 6, 1e-4
 _TINY = 1e-9
 
 
@@ -128,6 +126,7 @@ def fit_profiles(
         edges: (N, E) px: where the steps are, relative to c. blur_px: (N,) or one, the Gaussian's standard deviation.
         reach_px: a c farther from the place than this is none. smear_px: (N,) or one, of what smears. lean: of it.
     """
+    most_steps, at_rest_px = 6, 1e-4  # Newton's; after one so small the next are below a hundredth of a window's sigma
     offset = np.zeros(len(windows.values))
     steps = _Steps(edges, *(np.broadcast_to(np.asarray(one, float), offset.shape) for one in (blur_px, smear_px, lean)))
     normal, right = steps.equations(windows, offset, None)
@@ -138,7 +137,7 @@ def fit_profiles(
     level[2:-1] = 1.0 if edges.shape[1] > 1 else 0.0
     known, step, moving = np.outer(level, level) / _LEVEL_SIGMA**2, np.zeros(len(offset)), np.arange(len(offset))
     held = np.empty((len(offset), *known.shape))
-    for _ in range(_STEPS):
+    for _ in range(most_steps):
         normal, right = steps.take(moving).equations(windows.take(moving), offset[moving], heights[moving])
         held[moving] = normal + np.maximum(variance[moving], 0.0)[:, None, None] * known
         solution = _solve(held[moving], right)
@@ -146,7 +145,7 @@ def fit_profiles(
         step[moving] = np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
         offset[moving] = np.clip(offset[moving] + step[moving], -reach_px - 1.0, reach_px + 1.0)
         heights[moving] = solution[:, 2:-1]
-        moving = moving[np.abs(step[moving]) > _AT_REST_PX]
+        moving = moving[np.abs(step[moving]) > at_rest_px]
         if not len(moving):
             break
     misfit = np.maximum(variance, 0.0) * (windows.values.shape[1] / (windows.values.shape[1] - len(level)))

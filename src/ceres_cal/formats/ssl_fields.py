@@ -11,7 +11,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene import Arc, Curve, Segment, Target, custom, ssl_field
-from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.symmetry import samples
 
 _SIZES = {  # of the message: the target's
     "field_length": "field_length_m",
@@ -89,8 +89,7 @@ def field_of(target: Target) -> dict[str, Any]:
     curves = target.curves
     if not curves:
         raise InputError("the target has no lines: it is no field")
-    pieces = 360  # of a curve: a circle's outermost places are at their ends
-    reach = np.concatenate([curve_points(curve, 0, pieces) for curve in curves.values()])
+    reach = samples(curves.values())
     length, width = (round(2e3 * float(np.max(np.abs(reach[:, axis])))) for axis in (0, 1))
     sizes = {
         **_sizes_of(ssl_field(_division_of(length))),

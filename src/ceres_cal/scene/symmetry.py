@@ -68,8 +68,8 @@ def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
     """The turns about the upright through its middle that put the painted curves onto themselves; the first is none."""
     counts = np.arange(12, 1, -1)  # the most first
     painted = _painted(target, curves)
-    middle, samples = middle_of(target, curves), _samples(painted)
-    sent = np.array([_turn(2.0 * np.pi / count, middle).transform(samples) for count in counts])
+    middle, places = middle_of(target, curves), samples(painted)
+    sent = np.array([_turn(2.0 * np.pi / count, middle).transform(places) for count in counts])
     away = np.min([distance_to_curve(curve, sent.reshape(-1, 3)) for curve in painted], axis=0).reshape(len(counts), -1)
     same = np.max(away, axis=1) < _SAME_M * np.maximum(1.0, np.max(np.abs(sent), axis=(1, 2)))
     count = int(counts[same].max(initial=1))
@@ -78,20 +78,21 @@ def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
 
 def middle_of(target: Target, curves: Collection[str]) -> Array:
     """(3,) m: the middle of the box around the painted curves."""
-    samples = _samples(_painted(target, curves))
-    return np.asarray(0.5 * (samples.min(axis=0) + samples.max(axis=0)))
+    places = samples(_painted(target, curves))
+    return np.asarray(0.5 * (places.min(axis=0) + places.max(axis=0)))
 
 
 def size_of(target: Target, curves: Collection[str]) -> float:
     """Longest side of the box around the painted curves, m."""
-    return float(np.max(np.ptp(_samples(_painted(target, curves)), axis=0)))
+    return float(np.max(np.ptp(samples(_painted(target, curves)), axis=0)))
 
 
 def _painted(target: Target, curves: Collection[str]) -> list[Curve]:
     return [curve for name, curve in target.curves.items() if name in curves and curve.width_m > 0.0]
 
 
-def _samples(curves: Collection[Curve]) -> Array:
+def samples(curves: Collection[Curve]) -> Array:
+    """(N, 3) m, places evenly along each curve, its ends among them; a circle's outermost, too."""
     return np.concatenate([curve_points(curve, 0, _PIECES) for curve in curves])
 
 
