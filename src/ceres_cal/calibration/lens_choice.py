@@ -27,10 +27,10 @@ from ceres_cal.base import (
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.calibration.lens_comparison import (
-    asks_for_more,
     compared_kinds,
     explained_by_another,
     last_resort,
+    may_lack_a_formula,
     one_power_more,
 )
 from ceres_cal.calibration.lens_forms import (
@@ -361,7 +361,7 @@ def _among(
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:
         found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
-    is_asked = asks_for_more(seen, found.chosen, by_most=by_most)
+    is_asked = may_lack_a_formula(seen, found.chosen, by_most=by_most)
     more = tuple(last_resort(seen, found.chosen, is_asked=is_asked))
     found = replace(found, tried=(*found.tried, *more))
     # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.

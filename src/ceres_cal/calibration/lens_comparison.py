@@ -6,10 +6,9 @@ what is taken out has its price, and so has every coefficient (Schwarz, Annals o
 
 The observations that take part in the comparison of lenses, and each kind of lens near its best over them.
 
-The last resort: a lens without a formula, where what all others leave behind goes together from place to place.
-
-It takes longer than all of them, so that their residuals must ask for it: by the mean squares of residuals between
-cells of the image and within them (analysis of variance).
+The last resort: a lens without a formula, which takes longer than all others. It is chosen where what these leave
+behind goes together from place to place, by the mean squares of residuals between cells of the image and within them
+(analysis of variance). In one view of a floor it is also a component beside a formula.
 """
 
 from __future__ import annotations
@@ -175,7 +174,7 @@ def _noise_px(end: RobustSolution) -> float:
 _TOGETHER = 1.5
 
 
-def asks_for_more(seen: InlierRows, chosen: Candidate, *, by_most: bool) -> bool:
+def may_lack_a_formula(seen: InlierRows, chosen: Candidate, *, by_most: bool) -> bool:
     """Whether a lens without a formula may be chosen: where even the longest lens of the chosen kind leaves what goes
     together, or most of the observations are asked. Within views, too: eight of a lens that no formula has do not agree
     by two sd.

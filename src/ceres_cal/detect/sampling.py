@@ -63,7 +63,11 @@ def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
 
 
 def _smooth(curve: Indices32, offset_px: Array) -> Array:
-    """(N,) the mean of the places around on the same curve: one place's own error would explain itself."""
+    """(N,) the mean of the places around on the same curve: one place's own error would explain itself.
+
+    Args:
+        curve: (N,) ascending.
+    """
     sums = np.cumsum([np.nan_to_num(offset_px), np.isfinite(offset_px)], axis=1)
     sums, rows = np.pad(sums, ((0, 0), (1, 0))), np.arange(len(curve))
     first = np.maximum(rows - _AROUND, np.searchsorted(curve, curve))

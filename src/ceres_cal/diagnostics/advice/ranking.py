@@ -172,7 +172,9 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
 
 
 def _weighting(fit: Fit, camera: str) -> Weighting:
-    """Noise in px of a camera's points and curves, as the fit found it; of a kind that nobody observed, the other's."""
+    """Noise in px of a camera's points and curves, as the fit found it; of a kind that nobody observed, the other's; of
+    targets that differ in it ("camera/target"), the noisiest's.
+    """
     points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
         raise InputError("the calibration found no noise at all: advice would promise miracles")
