@@ -205,7 +205,7 @@ class Uncertainty(Frozen):
                 named = ", ".join(repr(key.owner) for key in heights)
                 whose = "its height" if named == repr(phi.owner) else f"the height of {named}"
                 known = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
-                return f"phi of {phi.owner!r} and {whose} trade off: {known}; the floor rests on that alone"
+                return f"phi of {phi.owner!r} and {whose} trade off: {known}; places on the floor depend only on that"
         owners = dict.fromkeys(key.owner for key in keys)
         parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
         many, names = len(keys) > 1, " and ".join(parts)
