@@ -167,7 +167,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),
     *_of("detect.photographs.by_hand", "SIGMA_PX _WRONG", "clicks"),
     *_of("detect.photographs.beside", "_REACH _FAINT _LEAST", "auto"),
-    *_of("detect.photographs.followed", "LEAST_SHARE SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
+    *_of("detect.photographs.field_lines", "LEAST_SHARE SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
     *_of("detect.photographs.grid", "_FACES _AS_WELL _NEARER_DEG _SHORT", "auto"),
     *_of("detect.photographs.candidates", "_SURE _COMPARABLE _ALIKE _LIKELY BUDGET_S", "auto"),
     *_of("detect.photographs.painted", "BY_CHANCE _LACKS _SURELY", "auto"),

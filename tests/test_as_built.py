@@ -90,7 +90,7 @@ def test_a_lens_without_a_formula_is_as_smooth_as_the_data_say_of_it_beside_a_bo
         sights, options = gather_sights(observed(Board(points_m=2e-4), seed)[1]), Options(lens="spline", powers=(2, 3))
         start = initialise(sights, options)
         end = explained(Task(), start, problem_of(sights, options, start.estimate), AS_DRAWN).end
-        again, _, off_best = with_smoothness(end.problem, end.estimate, end.told)
+        again, _, off_best = with_smoothness(end.problem, end.estimate, end.information)
         assert len(end.estimate.structure.values) and off_best < 0.01  # variances; 1e-3 measured
         assert again.smoothness["camera"] == pytest.approx(end.problem.smoothness["camera"], rel=0.05)
 

@@ -12,7 +12,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.reduced import information
 from ceres_cal.problem.residuals import relative_lengths, residuals
-from ceres_cal.robust.noise import Fitted, Inliers, NoiseScales, by_deleted_residuals, deleted_lengths
+from ceres_cal.robust.noise import InlierFit, Inliers, NoiseScales, by_deleted_residuals, deleted_lengths
 from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.simulate import Disturbance, simulate
 
@@ -30,16 +30,16 @@ class Scene:
         self.problem: Problem = replace(self.start.problem(self.observations), options=options)
         self.count = len(self.observations.points) + len(self.observations.curves)
 
-    def fitted(self, used: Mask) -> Fitted:
+    def fitted(self, used: Mask) -> InlierFit:
         split = [len(self.observations.points)]
         some = self.problem.used(*np.split(used, split))
         end = solve_robustly(some, self.start.estimate, is_near=True)
         estimate = end.solution.estimate
         there = residuals(self.problem.sights, estimate)
         reduced = information(some, estimate)
-        return Fitted(self.problem, estimate, there, used, reduced)
+        return InlierFit(self.problem, estimate, there, used, reduced)
 
-    def lengths(self, fitted: Fitted) -> Array:
+    def lengths(self, fitted: InlierFit) -> Array:
         every = np.full(self.count, np.nan)
         seen = np.isfinite(np.concatenate(fitted.residuals.lengths))
         rows, lengths = deleted_lengths(seen, self.problem.weighting, fitted)
@@ -82,5 +82,5 @@ def test_one_that_the_others_hardly_tell_of_comes_back_where_it_is_no_farther_of
     assert by_deleted_residuals(inliers, without).rows[row] == belongs
 
 
-def sigmas(scene: Scene, fitted: Fitted) -> Array:
+def sigmas(scene: Scene, fitted: InlierFit) -> Array:
     return np.concatenate(relative_lengths(scene.observations, fitted.residuals))

@@ -24,8 +24,8 @@ from ceres_cal.calibration.lens_forms import AS_GOOD_BESIDE_LENGTHS, PAPER, deci
 from ceres_cal.cli import main
 from ceres_cal.cli.arguments import parse_estimates
 from ceres_cal.detect.photographs.candidates import Auto, candidates, prepare_search
+from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.photographs.follow import Tracker
-from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.moves.checks import check
 from ceres_cal.moves.refits import refit
@@ -235,9 +235,9 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
     clicked = np.round(camera.project(np.array([target.points[name] for name in names]))).astype(int)
     corners = [word for name, (x, y) in zip(names, clicked, strict=True) for word in ("--corner", f"{name}={x},{y}")]
     asked = ["detect", "field", path, "--target", "ssl-b", *corners, "-o", observed]
-    refined, seen = Tracker.refined, list[Followed]()
+    refined, seen = Tracker.refined, list[FieldLines]()
 
-    def counted(tracker: Tracker, followed: Followed) -> Followed:
+    def counted(tracker: Tracker, followed: FieldLines) -> FieldLines:
         seen.append(followed)
         return refined(tracker, followed)
 

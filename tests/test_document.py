@@ -12,8 +12,8 @@ from ceres_cal.report.document import (
     BulletList,
     Card,
     Chapter,
+    Details,
     Document,
-    Folded,
     Section,
     Table,
     Text,
@@ -88,7 +88,7 @@ def test_every_piece_of_a_page_is_escaped() -> None:
         Table((evil, evil), ((evil, evil),), evil),
         (Tile(evil, evil, evil, evil),),
         Card("no", evil, evil, (evil,), "a b.html"),
-        Folded(evil, (Text(evil),)),
+        Details(evil, (Text(evil),)),
     )
     said = html(Chapter("numbers", evil, pieces, "care"))
     assert "<b>" not in said and said.count("&lt;b&gt;&amp;") == 18 and 'href="a%20b.html"' in said

@@ -22,7 +22,7 @@ from ceres_cal.detect.photographs import Auto, Clicks, FieldDetections, FieldOpt
 from ceres_cal.detect.photographs.as_built import FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.by_hand import unknown_optics
 from ceres_cal.detect.photographs.field import _observations
-from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.photographs.grid import Facing
 from ceres_cal.detect.photographs.matching import StrokeMap
 from ceres_cal.detect.photographs.refit import observations_of
@@ -168,7 +168,7 @@ def test_length_and_width_are_solved_for_where_lines_scatter() -> None:
     )
     built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA, None).priors)
     assert built.scatter_m > 0.0 and not built.is_other
-    followed = Followed(CAMERA, FIELD, FIELD.curve_names, (), lines, FIELD.curve_names, built)
+    followed = FieldLines(CAMERA, FIELD, FIELD.curve_names, (), lines, FIELD.curve_names, built)
     seen = _observations("0001", followed, FIELD, FieldOptions())
     pixels, over = CAMERA.project(FIELD.point_array), []
     for priors in (seen.priors, tuple(one for one in seen.priors if one.curve)):

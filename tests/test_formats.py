@@ -11,7 +11,7 @@ from scenes import RADIAL, lines_and_arcs
 
 from ceres_cal import Calibration, InputError, calibrate
 from ceres_cal.cli import main
-from ceres_cal.formats import EXPORT_FORMATS, Exported, ExportFormat, ExportLoss, ExportRequest, LookupTable, export
+from ceres_cal.formats import EXPORT_FORMATS, Export, ExportFormat, ExportLoss, ExportRequest, LookupTable, export
 from ceres_cal.simulate import Disturbance, simulate
 
 
@@ -20,20 +20,20 @@ def write_toy(
     *,
     digits: Annotated[int, "after the point"] = 3,
     comment: Annotated[str, "what to say of it"] = "",
-) -> Exported:
+) -> Export:
     """phi of each station's camera, to so many digits; what was there before stays on top."""
     cameras = {name: request.calibration.station(name) for name in request.stations}
     lines = [f"{name} {camera.phi:.{digits}f}" for name, camera in cameras.items()]
     lines = [comment, *lines] if comment else lines
     losses = tuple(ExportLoss(name, {0.0: (0.1, 0.2), 0.15: (0.3, 0.4)}, (0.01, 0.02)) for name in cameras)
     before = request.existing or b""
-    return Exported(
+    return Export(
         before + "\n".join(lines).encode(), losses, f"{len(lines)} lines", {"lines": len(lines)}, ("toys break",)
     )
 
 
-def write_folder(request: ExportRequest) -> Exported:
-    return Exported({f"{name}.txt": b"here" for name in request.stations}, (), "a file for each station")
+def write_folder(request: ExportRequest) -> Export:
+    return Export({f"{name}.txt": b"here" for name in request.stations}, (), "a file for each station")
 
 
 TOY = ExportFormat("toy", "for this test", (".toy", ".gz.toy"), write_toy, most_stations=None, edits=True)

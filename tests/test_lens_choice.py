@@ -35,7 +35,7 @@ from ceres_cal.calibration.calibrating import calibrate, lenses_by_held_out
 from ceres_cal.calibration.lens_choice import Comparison, choose_lens
 from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, kinds, label_of, papers, pseudo_bma
 from ceres_cal.calibration.lens_seen import Candidate
-from ceres_cal.calibration.solving import Explained, Task
+from ceres_cal.calibration.solving import Task, TaskSolution
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.photographs import detect_field
@@ -51,7 +51,7 @@ from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.problem.problem import Problem
 from ceres_cal.problem.quantities import values_of
 from ceres_cal.problem.residuals import residuals, write_equations
-from ceres_cal.robust.as_built import Built
+from ceres_cal.robust.as_built import Construction
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import LENSES, Brown, KannalaBrandt, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
@@ -327,7 +327,7 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (each of them folds")]
     explained, gone = solving.explained, {"kannala-brandt"}
 
-    def broken(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
+    def broken(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
         if problem.options.lens in gone:
             raise SolutionError("no camera")
         return explained(task, start, problem, built)
@@ -364,7 +364,7 @@ def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: p
     """After every other kind; what it says is said."""
     seen, asked = _seen("radial-2-3", "boards"), list[str]()
 
-    def broken(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
+    def broken(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
         asked.append(label_of(problem.options))
         raise SolutionError(f"no camera with {asked[-1]}")
 

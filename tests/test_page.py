@@ -28,7 +28,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.cli.page.server import serve
 from ceres_cal.cli.page.session import KEPT, Session, opened
-from ceres_cal.cli.page.state import Change, Click, Drag, Made, Place, Region, Sitting, State, load_state
+from ceres_cal.cli.page.state import Change, Click, CommandResults, Drag, PageContext, Place, Region, State, load_state
 from ceres_cal.detect.photographs import Clicks, by_hand, load_clicks
 from ceres_cal.detect.photographs.by_hand import starts_from_clicks
 from ceres_cal.detect.photographs.refit import PointHints
@@ -43,7 +43,7 @@ CORNERS = ("TopLeftCorner", "TopRightCorner", "BottomLeftCorner", "BottomRightCo
 
 def session_of(folder: Path, state: State | None = None, count: int = 1) -> Session:
     photographs = tuple(sorted(PHOTOGRAPHS.glob("0*.jpg"))[:count])
-    sitting = Sitting(photographs, ((1280, 960),) * count, folder)
+    sitting = PageContext(photographs, ((1280, 960),) * count, folder)
     return opened(sitting, state or State(target="ssl-b"))
 
 
@@ -339,7 +339,7 @@ def test_done_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """The first file that finds no room is named; there is none of which half is written."""
     points = {name: Click(100.0 + 10.0 * n, 90.0, 3.0) for n, name in enumerate(CORNERS)}
     session = session_of(tmp_path, State(target="ssl-b", points=points))
-    session._now = replace(session._now, made=Made((), {"field.json": b"{}"}, tmp_path / "calibration.json"))
+    session._now = replace(session._now, made=CommandResults((), {"field.json": b"{}"}, tmp_path / "calibration.json"))
 
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

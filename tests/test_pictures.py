@@ -38,7 +38,7 @@ from ceres_cal.report.pictures.frames import (
     photographs_of,
 )
 from ceres_cal.report.pictures.overlay import Layer, Model, draw_overlay, model_seen
-from ceres_cal.report.pictures.straight import Straight, straighten
+from ceres_cal.report.pictures.straight import Straightening, straighten
 from ceres_cal.report.pictures.warp import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
@@ -56,7 +56,7 @@ def seen(lens: str) -> Camera:
 
 
 @cache
-def straight_of(lens: str, whole: bool) -> Straight:
+def straight_of(lens: str, whole: bool) -> Straightening:
     return straighten(seen(lens), whole=whole)
 
 

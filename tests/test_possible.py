@@ -21,7 +21,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.problem.parameters import Estimate, Options
-from ceres_cal.problem.parameters import Station as Placed
+from ceres_cal.problem.parameters import Station as CameraPlaces
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.problem.structure import EXACT
 from ceres_cal.robust.usable import require_possible
@@ -117,7 +117,7 @@ def judged(points: dict[str, tuple[float, float, float]], pose: Pose) -> None:
     seen = simulate(
         field_scene(target, {"a": above}, {"a": Station("a", overhead_pose(0.0, 0.0, 9.0))}, curves=())
     ).observations
-    estimate = Estimate({"a": above}, {"a": Placed("a", pose)}, {}, EXACT)
+    estimate = Estimate({"a": above}, {"a": CameraPlaces("a", pose)}, {}, EXACT)
     sights = gather_sights(seen)
     require_possible(sights, estimate, residuals(sights, estimate))
 

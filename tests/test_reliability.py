@@ -499,7 +499,7 @@ def test_sigterm_while_a_library_is_loaded(monkeypatch: pytest.MonkeyPatch, caps
     """Native modules make an ImportError of whatever comes while they begin."""
 
     def load(arguments: list[str]) -> None:
-        raise ImportError("initialization failed") from terminal.Terminated()
+        raise ImportError("initialization failed") from terminal.Termination()
 
     monkeypatch.setattr(terminal, "chosen", load)
     assert (main(["calibrate"]), capsys.readouterr().err) == (143, "ceres-cal: terminated: nothing was written\n")

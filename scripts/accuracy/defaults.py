@@ -87,7 +87,7 @@ def observed(scene: Scene, frames: int, seed: int) -> Observations:
 
 
 @dataclass
-class Found:
+class RunResult:
     """Of one run: which intervals hold, by height, how far the farthest known number is off, and how it is headed."""
 
     held: dict[float, Mask] = field(default_factory=dict)
@@ -108,14 +108,14 @@ def _located(calibration: Calibration, scene: Scene, height_m: float) -> Iterato
         yield points.located - _PLACES[inside], points.low - _PLACES[inside], points.high - _PLACES[inside]
 
 
-def _decentred(maker: _Maker, frames: int, seed: int) -> Found:
+def _decentred(maker: _Maker, frames: int, seed: int) -> RunResult:
     scene = maker(seed)
     observations = observed(scene, frames, seed)
     try:
         calibration = calibrate(observations)
     except CalibrationError:
-        return Found(failed=1)
-    found = Found(level=judge_quality(quality_of(calibration, observations)).level)
+        return RunResult(failed=1)
+    found = RunResult(level=judge_quality(quality_of(calibration, observations)).level)
     for height_m in HEIGHTS_M:
         ends = [(low <= 0.0) & (high >= 0.0) for _, low, high in _located(calibration, scene, height_m)]
         found.held[height_m] = np.concatenate(ends).ravel()

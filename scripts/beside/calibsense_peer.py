@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from benchmarks.peers import Corners
 
-from beside.fitted import Fitted
 from beside.opencv_peer import FISHEYE, NAMES, brown, fisheye
+from beside.peer_fit import PeerFit
 from beside.starts import wide_focal
 
 _WARNING = 2  # of its Severity
@@ -44,7 +44,7 @@ def _guess(peer: Any, model: str, corners: Corners) -> Any:
     return peer.CalibrationRecord(camera, (width, height))
 
 
-def _fit(model: str, terms: int, clustered: bool, audited: bool, corners: Corners) -> Fitted:
+def _fit(model: str, terms: int, clustered: bool, audited: bool, corners: Corners) -> PeerFit:
     peer = import_module("calibsense")
     session = session_of(corners, model)
     options = peer.RefitOptions(model=model, distortion_terms=terms)
@@ -59,7 +59,7 @@ def _fit(model: str, terms: int, clustered: bool, audited: bool, corners: Corner
     square = own.covariance if clustered else own.intrinsic
     at = [free.index(name) for name in names]
     covariance = np.asarray(square)[np.ix_(at, at)]
-    return Fitted(
+    return PeerFit(
         names, values, fisheye if model == "fisheye" else brown, corners.board, float(fit.covariance.sigma),
         np.sqrt(np.diag(covariance)), covariance, said=_said(session, options) if audited else (), seconds=seconds,
     )  # fmt: skip
@@ -71,7 +71,7 @@ def _said(session: Any, options: Any) -> tuple[str, ...]:
     return (*audit.caveats(), *(f"{one.severity.label}: {one.title}: {one.summary}" for one in findings))
 
 
-SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+SETTINGS: dict[str, Callable[[Corners], PeerFit]] = {
     "default": partial(_fit, "pinhole", 5, False, False),
     "clustered": partial(_fit, "pinhole", 5, True, False),
     "rational": partial(_fit, "pinhole", 8, False, False),

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from benchmarks.peers import Array, Corners
 
-from beside.fitted import Fitted, warp_said
+from beside.peer_fit import PeerFit, warp_said
 from beside.starts import wide_focal
 
 
-def _fit(config: Callable[[Any, int, int], Any], corners: Corners) -> Fitted:
+def _fit(config: Callable[[Any, int, int], Any], corners: Corners) -> PeerFit:
     peer = import_module("lensboy")
     width, height = corners.image_size.tolist()
     cuts = np.searchsorted(corners.view, np.arange(1, corners.frames))
@@ -43,7 +43,7 @@ def _fit(config: Callable[[Any, int, int], Any], corners: Corners) -> Fitted:
     said = [f"{outliers} outliers"] * bool(outliers) + [f"{left_out} frames excluded"] * bool(left_out)
     said += warp_said(board)
     noise = float(result.residual_sigma_map())
-    return Fitted(
+    return PeerFit(
         ("fx", "fy", "cx", "cy"), values, project, board, noise, said=tuple(said), taken_out=outliers, seconds=seconds
     )
 
@@ -57,7 +57,7 @@ def _splined(knots: tuple[int, int], peer: Any, height: int, width: int) -> Any:
     return peer.PinholeSplinedConfig(image_height=height, image_width=width, num_knots_x=knots[0], num_knots_y=knots[1])
 
 
-SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+SETTINGS: dict[str, Callable[[Corners], PeerFit]] = {
     "default": partial(_fit, partial(_opencv, "STANDARD")),
     "FULL_14": partial(_fit, partial(_opencv, "FULL_14")),
     "spline 30x20": partial(_fit, partial(_splined, (30, 20))),

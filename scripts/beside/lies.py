@@ -19,8 +19,8 @@ from benchmarks.peers import Array, Corners
 
 from beside.boards import Task
 from beside.environments import OURS
-from beside.fitted import Fitted, grid_of, turn_basis
 from beside.opencv_peer import NAMES, brown
+from beside.peer_fit import PeerFit, grid_of, turn_basis
 
 SIZE, GRID, SQUARE_M = (1280, 960), (9, 6), 0.025
 TRUTH = np.array([900.0, 900.0, 655.3, 471.1, -0.22, 0.08, 2e-4, -1e-4, 0.0])
@@ -245,7 +245,7 @@ def _wrong(one: Mapping[str, Any], fault: Fault) -> dict[str, Any]:
         found["sds"] = float(max(abs(off[name]) / max(one["sd"][names[name]], 1e-12) for name in known))
     pixels, rays = grid_of(sound()), np.array(one["rays"], dtype=float)
     kept = np.isfinite(rays[:, 0])
-    true = Fitted(NAMES[:9], TRUTH, brown, _board())
+    true = PeerFit(NAMES[:9], TRUTH, brown, _board())
     there = true.seen(rays[kept])
     basis = turn_basis(true, rays[kept])
     left = (there - pixels[kept]).ravel()

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from benchmarks.peers import Array, Corners, solve_mrcal
 
-from beside.fitted import Fitted, warp_said
+from beside.peer_fit import PeerFit, warp_said
 from beside.starts import wide_focal
 
 SPLINED = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={columns}_Ny={rows}_fov_x_deg={fov}"
@@ -82,7 +82,7 @@ def command_of(lens: str, corners: Corners, cache: Path, folder: Path) -> list[s
     ]  # fmt: skip
 
 
-def _fit(lens: str | Callable[[Corners], str], more: tuple[str, ...], corners: Corners) -> Fitted:
+def _fit(lens: str | Callable[[Corners], str], more: tuple[str, ...], corners: Corners) -> PeerFit:
     mrcal: Any = import_module("mrcal")
     named = lens if isinstance(lens, str) else lens(corners)
     with tempfile.TemporaryDirectory() as folder:
@@ -99,7 +99,7 @@ def _fit(lens: str | Callable[[Corners], str], more: tuple[str, ...], corners: C
     return fitted_of(mrcal, model, corners, seconds, done.stdout)
 
 
-def fitted_of(mrcal: Any, model: Any, corners: Corners, seconds: float, printed: str) -> Fitted:
+def fitted_of(mrcal: Any, model: Any, corners: Corners, seconds: float, printed: str) -> PeerFit:
     """Its model, its board and its uncertainty."""
     lens, intrinsics = model.intrinsics()
     given = model.optimization_inputs()
@@ -119,13 +119,13 @@ def fitted_of(mrcal: Any, model: Any, corners: Corners, seconds: float, printed:
 
     said = [line for line in printed.splitlines() if "outliers" in line and "Noutliers: 0 " not in line]
     said += warp_said(board)  # which its report prints as calobject_warp
-    return Fitted(
+    return PeerFit(
         ("fx",), np.array(intrinsics), project, board, float(np.std(left)), variance=variance,
         said=tuple(said), taken_out=int(np.sum(observed < 0.0)) - (observed.size - len(corners.view)), seconds=seconds,
     )  # fmt: skip
 
 
-def _solve_alone(corners: Corners) -> Fitted:
+def _solve_alone(corners: Corners) -> PeerFit:
     """Its solver from its own seed, as the benchmark of this package times it: no program around it, no warp."""
     found = solve_mrcal(corners)
     mrcal: Any = import_module("mrcal")
@@ -133,10 +133,10 @@ def _solve_alone(corners: Corners) -> Fitted:
     def project(places: Array, values: Array) -> Array:
         return np.asarray(mrcal.project(np.ascontiguousarray(places, dtype=float), "LENSMODEL_OPENCV5", values))
 
-    return Fitted(("fx",), found.intrinsics, project, corners.board, seconds=found.seconds)
+    return PeerFit(("fx",), found.intrinsics, project, corners.board, seconds=found.seconds)
 
 
-SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+SETTINGS: dict[str, Callable[[Corners], PeerFit]] = {
     "solve alone": _solve_alone,
     "default": partial(_fit, "LENSMODEL_OPENCV8", ()),
     "splined, 30 knots": partial(_fit, partial(splined, 30), ()),

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from benchmarks.peers import Array, Corners, solve_opencv
 
-from beside.fitted import Fitted
+from beside.peer_fit import PeerFit
 from beside.starts import wide_focal
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -54,7 +54,7 @@ def numbers_of(matrix: Array, lens: Array, count: int) -> Array:
     return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens.ravel()[:count]])
 
 
-def _fit(flags: int, coefficients: int, fixed: tuple[str, ...], corners: Corners) -> Fitted:
+def _fit(flags: int, coefficients: int, fixed: tuple[str, ...], corners: Corners) -> PeerFit:
     objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
     size = tuple(corners.image_size.tolist())
     start = time.perf_counter()
@@ -70,19 +70,19 @@ def _fit(flags: int, coefficients: int, fixed: tuple[str, ...], corners: Corners
     squares = float(np.sum(np.concatenate(left) ** 2))
     free = 2 * len(corners.view) - len(values) + len(fixed) - 6 * corners.frames
     noise = float(np.sqrt(squares / max(free, 1)))
-    return Fitted(
+    return PeerFit(
         NAMES[: len(values)], values, brown, corners.board, noise, stated, seconds=seconds,
         more={"rms_px": float(np.sqrt(squares / len(corners.view)))},
     )  # fmt: skip
 
 
-def _plain(corners: Corners) -> Fitted:
+def _plain(corners: Corners) -> PeerFit:
     """calibrateCamera, which states no deviations: what is timed."""
     found = solve_opencv(corners)
-    return Fitted(NAMES[:9], found.intrinsics, brown, corners.board, seconds=found.seconds)
+    return PeerFit(NAMES[:9], found.intrinsics, brown, corners.board, seconds=found.seconds)
 
 
-def _released(flags: int, coefficients: int, corners: Corners) -> Fitted:
+def _released(flags: int, coefficients: int, corners: Corners) -> PeerFit:
     """Every view must show every corner: those that do not are left out."""
     count = len(corners.board)
     objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
@@ -92,13 +92,13 @@ def _released(flags: int, coefficients: int, corners: Corners) -> Fitted:
     start = time.perf_counter()
     _, matrix, lens, _, _, board = _cv.calibrateCameraRO(objects, images, size, fixed, None, None, flags=flags)
     seconds = time.perf_counter() - start
-    return Fitted(
+    return PeerFit(
         NAMES[: 4 + coefficients], numbers_of(matrix, lens, coefficients), brown,
         np.asarray(board, dtype=float).reshape(-1, 3), seconds=seconds,
     )  # fmt: skip
 
 
-def _fisheye(corners: Corners) -> Fitted:
+def _fisheye(corners: Corners) -> PeerFit:
     """From nothing, or from a wide lens's focal length. Its start takes no corner beside the camera: where it stops at
     one, it is given those up to 80 degrees off the axis.
     """
@@ -117,7 +117,7 @@ def _fisheye(corners: Corners) -> Fitted:
         middle = 0.5 * (corners.image_size - 1.0)
         near = np.linalg.norm(corners.pixels - middle, axis=1) < np.deg2rad(_BESIDE_DEG) * focal
         found = _by_fisheye(corners, near, matrix, flags)
-    return Fitted(FISHEYE, found, fisheye, corners.board, seconds=time.perf_counter() - start)
+    return PeerFit(FISHEYE, found, fisheye, corners.board, seconds=time.perf_counter() - start)
 
 
 def _by_fisheye(corners: Corners, rows: Any, matrix: Any, flags: int) -> Array:
@@ -131,7 +131,7 @@ def _by_fisheye(corners: Corners, rows: Any, matrix: Any, flags: int) -> Array:
     return numbers_of(found[1], found[2], 4)
 
 
-SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+SETTINGS: dict[str, Callable[[Corners], PeerFit]] = {
     "default": partial(_fit, 0, 5, ()),
     "calibrateCamera": _plain,
     "rational": partial(_fit, cv2.CALIB_RATIONAL_MODEL, 8, ()),

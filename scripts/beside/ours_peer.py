@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.peers import Array, Corners
 
-from beside.fitted import Fitted
+from beside.peer_fit import PeerFit
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
@@ -36,14 +36,14 @@ def observations_of(corners: Corners) -> Observations:
     return Observations(board, {"camera": (width, height)}, views, points, NO_CURVES)
 
 
-def _fit(options: Options, corners: Corners) -> Fitted:
+def _fit(options: Options, corners: Corners) -> PeerFit:
     observations = observations_of(corners)
     start = time.perf_counter()
     calibration = calibrate(observations, options)
     return fitted_of(calibration, corners, time.perf_counter() - start)
 
 
-def fitted_of(calibration: Calibration, corners: Corners, seconds: float) -> Fitted:
+def fitted_of(calibration: Calibration, corners: Corners, seconds: float) -> PeerFit:
     posterior = calibration.uncertainty.posterior
     keys = [key for key in posterior.keys if key.kind == "camera"]
     at = [posterior.keys.index(key) for key in keys]
@@ -56,7 +56,7 @@ def fitted_of(calibration: Calibration, corners: Corners, seconds: float) -> Fit
         moved = camera_moved(camera, quantities, values - start) if np.any(values != start) else camera
         return np.asarray(moved.at(Pose.identity()).project(places))
 
-    return Fitted(
+    return PeerFit(
         tuple(quantities), start, project, _board(calibration, corners), calibration.fit.point_scale,
         np.sqrt(np.diag(covariance)), covariance, taken_out=len(calibration.rejected), seconds=seconds,
     )  # fmt: skip
@@ -72,7 +72,7 @@ def _board(calibration: Calibration, corners: Corners) -> Array:
     return np.asarray(sights_as_built(observations_of(one), calibration).points)
 
 
-def _audited(corners: Corners) -> Fitted:
+def _audited(corners: Corners) -> PeerFit:
     """By its two commands, `calibrate` and `diagnose`, with what they print."""
     with tempfile.TemporaryDirectory() as name:
         given, found = Path(name) / "observations.json", Path(name) / "calibration.json"
@@ -103,7 +103,7 @@ def _sentences(printed: str) -> Iterator[str]:
     yield from (line for line in lines if line and not line.startswith(quiet))
 
 
-SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+SETTINGS: dict[str, Callable[[Corners], PeerFit]] = {
     "default": partial(_fit, Options()),
     "as drawn": partial(_fit, Options(as_built="as drawn")),
     "radial 2,3": partial(_fit, Options(lens="radial")),

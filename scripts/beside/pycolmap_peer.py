@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from benchmarks.peers import Array, Corners, _seed
 
-from beside.fitted import Fitted
 from beside.opencv_peer import fisheye
+from beside.peer_fit import PeerFit
 from beside.starts import wide_focal, wide_poses
 
 HALF = 0.5  # its pixels count from the corner of the first
@@ -58,7 +58,7 @@ def _scene(model: str, corners: Corners) -> Any:
     return scene
 
 
-def _fit(model: str, loss: str, principal_point: bool, corners: Corners) -> Fitted:
+def _fit(model: str, loss: str, principal_point: bool, corners: Corners) -> PeerFit:
     peer = import_module("pycolmap")
     scene = _scene(model, corners)
     options = peer.BundleAdjustmentOptions(
@@ -86,7 +86,7 @@ def _fit(model: str, loss: str, principal_point: bool, corners: Corners) -> Fitt
         return np.where(places[:, 2:] > 1e-6, found.reshape(-1, 2) - HALF, np.nan)
 
     noise, sd, covariance = _stated(peer, adjuster, scene, corners, names, principal_point, project, values)
-    return Fitted(names, values, project, corners.board, noise, sd, covariance, seconds=seconds)
+    return PeerFit(names, values, project, corners.board, noise, sd, covariance, seconds=seconds)
 
 
 def _stated(
@@ -112,7 +112,7 @@ def _stated(
     return noise, np.sqrt(np.diag(covariance)), covariance
 
 
-SETTINGS: dict[str, Callable[[Corners], Fitted]] = {
+SETTINGS: dict[str, Callable[[Corners], PeerFit]] = {
     "default": partial(_fit, "SIMPLE_RADIAL", "TRIVIAL", False),
     "OPENCV": partial(_fit, "OPENCV", "TRIVIAL", True),
     "FULL_OPENCV": partial(_fit, "FULL_OPENCV", "TRIVIAL", True),

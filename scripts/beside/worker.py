@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from benchmarks.peers import Corners, peak_mib
 
-from beside.fitted import Fitted, agreement, grid_of, held_out, turn_basis
+from beside.peer_fit import PeerFit, agreement, grid_of, held_out, turn_basis
 
 MODULES = {name: f"beside.{name}_peer" for name in ("ours", "opencv", "mrcal", "pycolmap", "calibsense", "lensboy")}
 
 
-def fitted(peer: str, job: dict[str, Any], corners: Corners) -> Fitted:
-    found: Fitted = import_module(MODULES[peer]).SETTINGS[job["setting"]](corners)
+def fitted(peer: str, job: dict[str, Any], corners: Corners) -> PeerFit:
+    found: PeerFit = import_module(MODULES[peer]).SETTINGS[job["setting"]](corners)
     return found
 
 
@@ -55,7 +55,7 @@ def answer(peer: str, job: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _stated(found: Fitted, rays: Any) -> list[float] | None:
+def _stated(found: PeerFit, rays: Any) -> list[float] | None:
     shown = rays[np.isfinite(rays[:, 0])]
     if not len(shown):
         return None

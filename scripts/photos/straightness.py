@@ -24,7 +24,7 @@ from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.detect.images import read_colour
 from ceres_cal.problem.parameters import Options
-from ceres_cal.report.pictures.straight import Straight, straighten
+from ceres_cal.report.pictures.straight import Straightening, straighten
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.start.closed_forms import homography_from_points
@@ -60,12 +60,12 @@ def refined(image: Image, grid: Array) -> Array:
     return found.astype(float).reshape(grid.shape)
 
 
-def in_straight(camera: Camera, straight: Straight, photograph: Array) -> Array:
+def in_straight(camera: Camera, straight: Straightening, photograph: Array) -> Array:
     """Where pixels (N, 2) of the photograph come to lie in the straight image; NaN past the lens's fold."""
     return straight.camera.at(Pose.identity()).project(camera.rays(photograph))
 
 
-def clicked_grid(camera: Camera, straight: Straight) -> Array:
+def clicked_grid(camera: Camera, straight: Straightening) -> Array:
     """About where test_image's corners are in its straight image: between the clicks as on a plane."""
     ends = np.array([(0.0, 0.0), (INNER - 1.0, 0.0), (INNER - 1.0, INNER - 1.0), (0.0, INNER - 1.0)])
     homography = homography_from_points(ends, in_straight(camera, straight, np.array(CLICKS)))

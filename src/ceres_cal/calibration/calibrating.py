@@ -15,7 +15,7 @@ from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.calibration.lens_forms import any_lens
 from ceres_cal.calibration.lens_seen import profiles_of, seen_through
 from ceres_cal.calibration.outcome import of_closed_form
-from ceres_cal.calibration.solving import Explained, Task, explained, known_of, solved_from
+from ceres_cal.calibration.solving import Task, TaskSolution, explained, known_of, solved_from
 from ceres_cal.observations import Observations, Sights, gather_sights, is_bulk
 from ceres_cal.observations.validation import odd_sizes, require_filled, unfilled
 from ceres_cal.posterior.assess import with_other_lenses
@@ -29,7 +29,7 @@ from ceres_cal.problem import (
 )
 from ceres_cal.problem.parameters import AUTO, Estimate, Options, Station
 from ceres_cal.problem.priors import freed, loosely
-from ceres_cal.robust.as_built import Built, free_dimensions
+from ceres_cal.robust.as_built import Construction, free_dimensions
 from ceres_cal.robust.conflicts import contradicted_by
 from ceres_cal.robust.noise import noise_of_cameras
 from ceres_cal.robust.robust import solve_robustly
@@ -38,7 +38,7 @@ from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.start.listed import require_as_listed
 
 if TYPE_CHECKING:
-    from ceres_cal.calibration.lenses import ChosenLenses
+    from ceres_cal.calibration.lenses import LensDecisions
     from ceres_cal.robust.bulk import Bulk, Subset
 
 
@@ -266,7 +266,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
     if options.closed_form_only:
         return _of_lens(task, start, sights, _named(options))
 
-    def seen_with(lenses: ChosenLenses) -> Explained:
+    def seen_with(lenses: LensDecisions) -> TaskSolution:
         known = (one.among.chosen.of.smoothness for one in lenses.each.values() if one.among)
         smoothness = {name: sd for each in known for name, sd in each.items()}
         problem = replace(problem_of(sights, lenses.options, lenses.start.estimate), smoothness=smoothness)
@@ -281,7 +281,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
         # all views leave in the same places need not show in the few of them that lenses were compared by. Where only a
         # lens without a formula came near, the others may have ended in a wrong valley, which they leave from there.
         near = replace(seen.end.estimate, structure=EXACT)
-        before, built = chosen, Built(seen.as_built, seen.end.estimate.structure)
+        before, built = chosen, Construction(seen.as_built, seen.end.estimate.structure)
         chosen = chosen.anew(anew, near, built, too_few)
         if chosen.labels != before.labels:
             seen, chosen = chosen.first_solved(seen_with)
@@ -296,7 +296,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
         seen, chosen = found, other
     last = chosen
 
-    def known_with(lenses: ChosenLenses) -> Calibration:
+    def known_with(lenses: LensDecisions) -> Calibration:
         return known_of(seen if lenses is last else seen_with(lenses))
 
     calibration, chosen = last.first_solved(known_with)

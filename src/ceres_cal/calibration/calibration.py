@@ -19,8 +19,8 @@ from ceres_cal.calibration.file import (
     Fit,
     LensChoice,
     PriorFile,
-    Refitted,
-    Rejected,
+    RefitRecord,
+    Rejection,
     StationFile,
     options_from_json,
     options_to_json,
@@ -76,7 +76,7 @@ class Calibration(Frozen):
     estimate: Estimate
     targets: Mapping[str, Target]
     fit: Fit
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[Rejection, ...]
     termination: str
     converged: bool
     rounds: int
@@ -87,7 +87,7 @@ class Calibration(Frozen):
     digest: str
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
-    refitted: Refitted[GaussianPrior] | None = None
+    refitted: RefitRecord[GaussianPrior] | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choices: Mapping[str, LensChoice] = field(default_factory=dict)
     as_built: tuple[AsBuilt, ...] = ()
@@ -197,7 +197,7 @@ class Calibration(Frozen):
         return observations.with_targets(targets).at_noise(self.fit.of_cameras)
 
     @property
-    def outliers(self) -> tuple[Rejected, ...]:
+    def outliers(self) -> tuple[Rejection, ...]:
         """What was taken out for its residual: all that was but copies of other observations."""
         return tuple(entry for entry in self.rejected if not entry.reason.startswith(COPY))
 
@@ -299,7 +299,7 @@ class Calibration(Frozen):
         )
 
 
-def _rows_of(entries: Iterable[Rejected], observations: Observations) -> tuple[Mask, Mask]:
+def _rows_of(entries: Iterable[Rejection], observations: Observations) -> tuple[Mask, Mask]:
     """(N,) of points and (M,) of curve observations: those that are named."""
     masks = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
     for entry in entries:

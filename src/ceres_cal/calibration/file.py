@@ -24,7 +24,7 @@ COPY = "a copy"
 """How the reason begins of an observation that repeats another one, and was not taken out for its residual."""
 
 
-class Rejected(Frozen, eq=True):
+class Rejection(Frozen, eq=True):
     """One observation that was taken out: its permanent id (kind and row), what it shows, and why it was taken out."""
 
     kind: str
@@ -159,7 +159,7 @@ _P = TypeVar("_P")
 _Q = TypeVar("_Q")
 
 
-class Refitted(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unknown_fields=True):
+class RefitRecord(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unknown_fields=True):
     """How a calibration came from an earlier one.
 
     Attributes:
@@ -177,9 +177,9 @@ class Refitted(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unknow
     scales: tuple[float, float]
     digests: tuple[str, ...]
 
-    def with_prior(self, prior: _Q) -> Refitted[_Q]:
+    def with_prior(self, prior: _Q) -> RefitRecord[_Q]:
         """The same with the prior in its other form."""
-        return Refitted(self.what, self.moved, self.explanation, prior, self.scales, self.digests)
+        return RefitRecord(self.what, self.moved, self.explanation, prior, self.scales, self.digests)
 
 
 @cache
@@ -267,7 +267,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     targets: dict[str, Any]
     structure_m: dict[str, float]
     fit: Fit
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[Rejection, ...]
     termination: str
     converged: bool
     rounds: int
@@ -278,7 +278,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     digest: str
     versions: dict[str, str]
     posterior: PosteriorFile | None = None
-    refitted: Refitted[PriorFile] | None = None
+    refitted: RefitRecord[PriorFile] | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choices: dict[str, LensChoice] = {}
     aspects_alone: dict[str, tuple[float, float]] = {}

@@ -49,14 +49,14 @@ from ceres_cal.posterior.other_lenses import OpenDirection, OtherLenses
 from ceres_cal.posterior.posterior import LEAST_PROBABILITY, Posterior
 from ceres_cal.problem import Estimate, Options, moved
 from ceres_cal.problem.priors import VAGUE
-from ceres_cal.robust.as_built import AS_DRAWN, Built
+from ceres_cal.robust.as_built import AS_DRAWN, Construction
 from ceres_cal.start.initialise import Start
 
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
 
 
-class Chosen(Frozen):
+class LensDecision(Frozen):
     """The lens that was chosen for a camera: options with it, where to start from, and what it was compared with.
 
     Attributes:
@@ -69,7 +69,7 @@ class Chosen(Frozen):
     among: Comparison | None = None
     untold: Observations | None = None
 
-    def otherwise(self, failure: str, options: Options, start: Start) -> Chosen | None:
+    def otherwise(self, failure: str, options: Options, start: Start) -> LensDecision | None:
         """Where all of the observations make no calibration with it, the best lens of another kind, or at last the
         paper's; None after that. Of too few to compare lenses by, the likeliest that was not tried.
 
@@ -82,14 +82,14 @@ class Chosen(Frozen):
             return None
         return self.among.without_kind(failure) or self._papers(failure, options, start)
 
-    def _papers(self, failure: str, options: Options, start: Start) -> Chosen:
+    def _papers(self, failure: str, options: Options, start: Start) -> LensDecision:
         """The paper's lens in its place, from the first start."""
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
-        return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
+        return LensDecision(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
 
     @property
-    def built(self) -> Built:
+    def built(self) -> Construction:
         """How targets seemed to be built when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
 
@@ -239,11 +239,15 @@ class Comparison(Frozen):
         return [near] if isinstance(ends, CalibrationError) else ends
 
     @property
-    def outcome(self) -> Chosen:
+    def outcome(self) -> LensDecision:
         """The options with the lens that was chosen, and where to start from."""
-        return Chosen(self.chosen.form.of(self.seen.options), _moved_to(self.there, self.start), _choice(self), self)
+        return LensDecision(
+            self.chosen.form.of(self.seen.options), _moved_to(self.there, self.start), _choice(self), self
+        )
 
-    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float], *, is_alone: bool) -> Chosen | None:
+    def instead(
+        self, taken_out: tuple[Mask, Mask], scales: tuple[float, float], *, is_alone: bool
+    ) -> LensDecision | None:
         """The lens in place of the chosen one, where others explain what it takes out of the observations; None where
         none does. Of very many observations some were compared, and the rest is not looked at. What predicts clearly
         better, a lens without a formula, stays.
@@ -259,7 +263,7 @@ class Comparison(Frozen):
         found = self._excluding(lambda one: one is self.chosen, _EXPLAINED)
         return None if found is None else found.outcome
 
-    def without_kind(self, failure: str) -> Chosen | None:
+    def without_kind(self, failure: str) -> LensDecision | None:
         """The best of the other kinds, how much worse it predicts said with it; None where none gives an answer."""
         found = self._excluding(lambda one: one.of is self.chosen.of, failure)
         return None if found is None else replace(found, passed=self.passed or self.chosen).outcome
@@ -282,8 +286,8 @@ def _moved_to(there: Estimate, start: Start) -> Start:
 
 
 def choose_lens(
-    observations: Observations, options: Options, start: Start, built: Built = AS_DRAWN, *, by_most: bool = False
-) -> Chosen:
+    observations: Observations, options: Options, start: Start, built: Construction = AS_DRAWN, *, by_most: bool = False
+) -> LensDecision:
     """The lens that the observations of a camera ask for; the paper's where there is too little to tell by.
 
     Args:
@@ -294,7 +298,7 @@ def choose_lens(
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=(*options.priors, *_about_guesses(observations, options, start)))
 
-    def compared() -> Chosen:
+    def compared() -> LensDecision:
         seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate, built, by_most=by_most)
         return _among(seen, share, as_good, start, kinds, by_most=by_most).outcome
 
@@ -308,7 +312,7 @@ def choose_lens(
 
 def _of_few(
     observations: Observations, options: Options, start: Start, tried: tuple[TriedLens, ...], failure: str = ""
-) -> Chosen | None:
+) -> LensDecision | None:
     """The paper's lens, or one of another kind that is far likelier, where lenses cannot be compared; None where none
     is left.
 
@@ -325,9 +329,9 @@ def _of_few(
     label = PAPER if likeliest is None else likeliest[0].label
     choice = LensChoice(label, (replace(first, label=label), *out), 0, 0.0)
     if likeliest is None:
-        return Chosen(papers(options), start, choice, untold=observations)
+        return LensDecision(papers(options), start, choice, untold=observations)
     form, there = likeliest
-    return Chosen(form.of(options), _moved_to(there, start), choice, untold=observations)
+    return LensDecision(form.of(options), _moved_to(there, start), choice, untold=observations)
 
 
 def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:

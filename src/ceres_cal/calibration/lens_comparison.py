@@ -32,7 +32,7 @@ from ceres_cal.calibration.lens_seen import (
 from ceres_cal.observations import Observations, Sights, gather_sights, thinned
 from ceres_cal.posterior.other_lenses import cells_of
 from ceres_cal.problem import EXACT, Estimate, Options, problem_of
-from ceres_cal.robust.as_built import AS_DRAWN, Built, estimate_as_built
+from ceres_cal.robust.as_built import AS_DRAWN, Construction, estimate_as_built
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
@@ -93,7 +93,12 @@ _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong va
 
 
 def compared_kinds(
-    observations: Observations, options: Options, start: Estimate, built: Built = AS_DRAWN, *, by_most: bool = False
+    observations: Observations,
+    options: Options,
+    start: Estimate,
+    built: Construction = AS_DRAWN,
+    *,
+    by_most: bool = False,
 ) -> tuple[InlierRows, list[Kind], float]:
     """The observations that take part, each kind near its best over them, at the noise of the one that explains the
     most, and their share of all.

@@ -28,7 +28,7 @@ from ceres_cal.problem import (
 )
 from ceres_cal.problem.parameters import as_held
 from ceres_cal.problem.residuals import Residuals, residuals
-from ceres_cal.robust.as_built import Built
+from ceres_cal.robust.as_built import Construction
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.closed_forms import LensProfile, edge_over
 from ceres_cal.start.initialise import initialise
@@ -278,7 +278,7 @@ class InlierRows(Frozen):
     end: RobustSolution
     options: Options
     every: Sights
-    built: Built
+    built: Construction
 
     @property
     def sights(self) -> Sights:

@@ -8,20 +8,20 @@ from typing import TypeVar
 import numpy as np
 
 from ceres_cal.base import CalibrationError, Frozen, Mask, Poses, cached_property, replace
-from ceres_cal.calibration.lens_choice import Chosen, choose_lens
+from ceres_cal.calibration.lens_choice import LensDecision, choose_lens
 from ceres_cal.calibration.lens_forms import papers
 from ceres_cal.observations import Sights
 from ceres_cal.posterior.other_lenses import OtherLenses, together
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem import Estimate, Options
-from ceres_cal.robust.as_built import AS_DRAWN, Built
+from ceres_cal.robust.as_built import AS_DRAWN, Construction
 from ceres_cal.start.initialise import Start
 from ceres_cal.start.world import chained_poses
 
 _T = TypeVar("_T")
 
 
-class ChosenLenses(Frozen):
+class LensDecisions(Frozen):
     """What was chosen for each camera.
 
     Attributes:
@@ -32,7 +32,7 @@ class ChosenLenses(Frozen):
     sights: Sights
     asked: Options
     first: Start
-    each: Mapping[str, Chosen]
+    each: Mapping[str, LensDecision]
 
     @cached_property
     def options(self) -> Options:
@@ -56,7 +56,7 @@ class ChosenLenses(Frozen):
         return replace(self.first, estimate=estimate, others=others)
 
     @property
-    def built(self) -> Built:
+    def built(self) -> Construction:
         """How targets seemed to be built when lenses were compared."""
         return next((one.built for one in self.each.values() if one.built.every), AS_DRAWN)
 
@@ -77,7 +77,7 @@ class ChosenLenses(Frozen):
         said = {name: one.choice.caveat for name, one in self.each.items()}
         return [f"camera {name!r}: {words}" if several else words for name, words in said.items() if words]
 
-    def first_solved(self, solved: Callable[[ChosenLenses], _T]) -> tuple[_T, ChosenLenses]:
+    def first_solved(self, solved: Callable[[LensDecisions], _T]) -> tuple[_T, LensDecisions]:
         """What is solved with them, or with others in place of those with which all of the observations make no
         calibration; and with which.
 
@@ -95,7 +95,9 @@ class ChosenLenses(Frozen):
                 raise
         return self._with(others).first_solved(solved)
 
-    def anew(self, cameras: Collection[str], near: Estimate, built: Built, by_most: Collection[str]) -> ChosenLenses:
+    def anew(
+        self, cameras: Collection[str], near: Estimate, built: Construction, by_most: Collection[str]
+    ) -> LensDecisions:
         """Chosen once more for some cameras, from another estimate and over targets as they are built; of some of these
         by most of their observations.
         """
@@ -104,7 +106,7 @@ class ChosenLenses(Frozen):
             name: _chosen(self.sights, self.asked, start, name, built, by_most=name in by_most) for name in cameras
         })  # fmt: skip
 
-    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float]) -> ChosenLenses | None:
+    def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float]) -> LensDecisions | None:
         """With other lenses where these explain what is taken out, see `Comparison.instead`; None where none does."""
         seen, others = self.sights.observations, {}
         for name, one in self.each.items():
@@ -126,23 +128,23 @@ class ChosenLenses(Frozen):
         each = [one.others(posterior, ends[name], options) for name, one in self.each.items()]
         return together(each, floors, end)
 
-    def _with(self, others: Mapping[str, Chosen]) -> ChosenLenses:
+    def _with(self, others: Mapping[str, LensDecision]) -> LensDecisions:
         return replace(self, each={**self.each, **others})
 
 
-def choose_lenses(sights: Sights, options: Options, start: Start) -> ChosenLenses:
+def choose_lenses(sights: Sights, options: Options, start: Start) -> LensDecisions:
     """The lens that the observations of each camera ask for.
 
     Args:
         options: their lens is not looked at. start: of everything, with the paper's lens.
     """
     each = {name: _chosen(sights, options, start, name, AS_DRAWN) for name in sights.observations.cameras}
-    return ChosenLenses(sights, options, start, each)
+    return LensDecisions(sights, options, start, each)
 
 
 def _chosen(
-    sights: Sights, options: Options, start: Start, camera: str, built: Built, *, by_most: bool = False
-) -> Chosen:
+    sights: Sights, options: Options, start: Start, camera: str, built: Construction, *, by_most: bool = False
+) -> LensDecision:
     own = sights.observations.of_camera(camera)
     asked = replace(options, priors=own.about_shown(options.priors))
     return choose_lens(own, asked, start_of(start, sights, camera), built, by_most=by_most)

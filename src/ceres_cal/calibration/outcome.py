@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.base import Array, DegenerateError, Indices, bounds_text, first_of, inverted, replace, two_digits
 from ceres_cal.calibration.calibration import Calibration
-from ceres_cal.calibration.file import COPY, Fit, Rejected
+from ceres_cal.calibration.file import COPY, Fit, Rejection
 from ceres_cal.effects.aside import Explanation
 from ceres_cal.observations import Observations, SightKey, View
 from ceres_cal.posterior.posterior import Posterior
@@ -29,7 +29,7 @@ from ceres_cal.robust.usable import require_possible
 from ceres_cal.start.initialise import Start
 
 if TYPE_CHECKING:
-    from ceres_cal.robust.bulk import Settled
+    from ceres_cal.robust.bulk import BulkSolution
 
 
 _UNKNOWN = (
@@ -265,7 +265,7 @@ def of_closed_form(start: Start, problem: Problem) -> Calibration:
     return came_out(start.phi_from, problem, end)
 
 
-def of_all(calibration: Calibration, settled: Settled) -> Calibration:
+def of_all(calibration: Calibration, settled: BulkSolution) -> Calibration:
     """What came out of all observations, where a part of them decided."""
     observations, used, scales = settled.observations, settled.used, calibration.fit.scales
     points, curves = used.sums
@@ -315,9 +315,9 @@ def _rms(values: Array) -> float:
 
 def _rejected(
     observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
-) -> tuple[Rejected, ...]:
+) -> tuple[Rejection, ...]:
     """The rows of points and of curve observations that did not take part, and how far off they are."""
-    wholes = [one for one in explanations if one.is_taken]
+    groups = [one for one in explanations if one.is_taken]
     entries, views, copies = [], observations.views, observations.copies
     for kind, out, far, column, copy_of, first in (
         ("point", rows[0], sigmas[0], observations.points, copies.points, 0),
@@ -325,9 +325,9 @@ def _rejected(
     ):
         for row, sigma in zip(out.tolist(), far.tolist(), strict=True):
             reason = f"{sigma:.1f} sigma off" if np.isfinite(sigma) else "cannot be seen from there"
-            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
+            reason = next((one.words for one in groups if one.rows[first + row]), reason)
             if copy_of[row] >= 0:
                 reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
             frame = views[column.view[row]].frame
-            entries.append(Rejected(kind, row, frame, observations.feature_name(kind, row), reason))
+            entries.append(Rejection(kind, row, frame, observations.feature_name(kind, row), reason))
     return tuple(entries)

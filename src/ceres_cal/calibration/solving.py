@@ -24,7 +24,7 @@ from ceres_cal.effects.table import estimated
 from ceres_cal.observations.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.posterior.assess import assess, with_doubts
-from ceres_cal.posterior.other_lenses import AGREES, LeftOver, of_placements, shifts_by_roughness
+from ceres_cal.posterior.other_lenses import AGREES, LensResiduals, of_placements, shifts_by_roughness
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Solution, SolveProgress
 from ceres_cal.problem.information import Key, over
@@ -36,7 +36,7 @@ from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
 from ceres_cal.robust.as_built import (
     AS_DRAWN,
-    Built,
+    Construction,
     require_measured,
     shifts_as_drawn,
     solve_as_built,
@@ -48,7 +48,7 @@ from ceres_cal.robust.competing import Solver, Subproblem, compete
 from ceres_cal.robust.conflicts import Conflicts, find_conflicts
 from ceres_cal.robust.other_minima import least_of_few, seen_alike
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
-from ceres_cal.robust.unsteady import Unsteady, find_unsteady
+from ceres_cal.robust.unsteady import ViewDisplacement, find_unsteady
 from ceres_cal.robust.usable import all_shown, misnamed, require_fits, require_possible, require_usable
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.start.initialise import Start, initialise
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from ceres_cal.effects.aside import Explanation
-    from ceres_cal.robust.bulk import Settled
+    from ceres_cal.robust.bulk import BulkSolution
     from ceres_cal.robust.effects import EffectsEnd
 
 
@@ -75,7 +75,7 @@ class Task(Frozen):
     """
 
     progress: SolveProgress | None = None
-    settle: Callable[..., Settled] | None = None
+    settle: Callable[..., BulkSolution] | None = None
     tested: bool = True
     knows: bool = True
     bends: bool = True
@@ -85,7 +85,7 @@ class Task(Frozen):
     stated: tuple[Observations, Options] | None = None
 
 
-class Explained(Frozen):
+class TaskSolution(Frozen):
     """A solution of a task, and what explains the observations that it does not fit.
 
     Attributes:
@@ -102,7 +102,7 @@ class Explained(Frozen):
     as_built: tuple[AsBuilt, ...] = ()
     beside: EffectsEnd | None = None
     others: tuple[Solution, ...] = ()
-    unsteady: Unsteady | None = None
+    unsteady: ViewDisplacement | None = None
     digest: Future[str] | None = None
 
     @cached_property
@@ -114,7 +114,7 @@ class Explained(Frozen):
         problem = self.end.problem
         every = problem.sights.of_camera(camera)
         asked = every if problem.options.of_camera(camera).is_rough else of_placements(every)
-        return bool(len(asked)) and LeftOver.of_end(self.end, asked).asks_for_more
+        return bool(len(asked)) and LensResiduals.of_end(self.end, asked).asks_for_more
 
     @property
     def outlier_masks(self) -> tuple[Mask, Mask]:
@@ -160,7 +160,7 @@ class Explained(Frozen):
         return shifts_at
 
     @property
-    def as_stated(self) -> Explained:
+    def as_stated(self) -> TaskSolution:
         """The answer with everything as it was stated, solved for from where it counted little."""
         if self.task.stated is None:
             return self
@@ -188,7 +188,7 @@ class Explained(Frozen):
         return replace(self, problem=problem, start=begun, end=end).at_least
 
     @property
-    def at_least(self) -> Explained:
+    def at_least(self) -> TaskSolution:
         """At the least of few minima."""
         end = self.end
         is_whole = end.problem.sights.equations == self.problem.sights.equations
@@ -197,11 +197,11 @@ class Explained(Frozen):
             end = replace(end.moved_to(least, self.problem), reduced=None)
         return replace(self, end=end, others=others)
 
-    def doubted_as(self, before: Explained) -> Explained:
+    def doubted_as(self, before: TaskSolution) -> TaskSolution:
         """With the less probable of two explanations as far off as it was before all was stated."""
         if before.task.stated is None:
             return self
-        there, here, keys = before.end.estimate, self.end.estimate, self.end.told.shared.keys
+        there, here, keys = before.end.estimate, self.end.estimate, self.end.information.shared.keys
 
         def other(one: Explanation) -> Estimate:
             return moved(here, keys, difference(one.other, there, keys))
@@ -209,7 +209,7 @@ class Explained(Frozen):
         doubted = (replace(one, other=other(one)) if one.is_doubtful else one for one in self.explanations)
         return replace(self, explanations=tuple(doubted))
 
-    def without(self, conflicts: Conflicts) -> Explained:
+    def without(self, conflicts: Conflicts) -> TaskSolution:
         """The answer without what was stated and everything else contradicts."""
         if conflicts.answer is None:
             return self
@@ -227,7 +227,7 @@ def solved_from(task: Task, start: Start, problem: Problem) -> Calibration:
     return known_of(explained(task, start, problem, AS_DRAWN))
 
 
-def explained(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
+def explained(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
     """Solve and explain what is left; see `solved_from`."""
     long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
     takes_long = problem.observations.rows > long_to_digest
@@ -241,7 +241,7 @@ def explained(task: Task, start: Start, problem: Problem, built: Built) -> Expla
     return replace(steady or seen, digest=digest)
 
 
-def known_of(seen: Explained) -> Calibration:
+def known_of(seen: TaskSolution) -> Calibration:
     """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
     task, conflicts = seen.task, Conflicts()
     before, seen = seen, seen.as_stated
@@ -274,8 +274,8 @@ def known_of(seen: Explained) -> Calibration:
     calibration = seen.came_out
     if settled is not None:
         calibration = of_all(calibration, settled)
-    wholes = [one.rows for one in seen.explanations if one.is_taken]
-    usable = require_usable(seen.end, seen.problem, wholes, is_refit=task.before is not None)
+    groups = [one.rows for one in seen.explanations if one.is_taken]
+    usable = require_usable(seen.end, seen.problem, groups, is_refit=task.before is not None)
     warnings = (*calibration.warnings, *usable, *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     apart = tuple(text for text, is_apart in alike.items() if is_apart)
@@ -285,7 +285,7 @@ def known_of(seen: Explained) -> Calibration:
     return replace(calibration, options=options, as_built=seen.as_built, effects=effects, aspects_alone=alone)
 
 
-def _made_steady(first: Explained, problem: Problem) -> Explained | None:
+def _made_steady(first: TaskSolution, problem: Problem) -> TaskSolution | None:
     """With what displaces single views taken off, and again as it is found then; None where nothing does.
 
     It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
@@ -305,23 +305,23 @@ def _made_steady(first: Explained, problem: Problem) -> Explained | None:
         again = problem_of(problem.sights, options, start)
         steady = unsteady.taken_off(again)
         end = solve_robustly(steady, start, None, task.progress, is_near=True)
-        solved = Explained(task, steady, replace(first.start, estimate=start, is_near=True), end)
+        solved = TaskSolution(task, steady, replace(first.start, estimate=start, is_near=True), end)
         seen = _explained(replace(solved, unsteady=unsteady), steady.sights, AS_DRAWN)
     return seen
 
 
-def _solved(task: Task, start: Start, problem: Problem, built: Built) -> Explained:
+def _solved(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
     """Solve, reject, solve: nothing else is explained yet, and targets are drawn as they seemed to be built."""
     problem = replace(problem, sights=built.held(problem.sights))
     end = solve_robustly(problem, start.estimate, task.scales, task.progress, is_near=start.is_near)
-    seen = Explained(task, problem, start, end)
+    seen = TaskSolution(task, problem, start, end)
     if task.before is None:
         seen = _as_long_as_asked(seen)
         require_measured(seen.end.problem, seen.end.estimate)
     return seen
 
 
-def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
+def _explained(first: TaskSolution, drawn: Sights, built: Construction) -> TaskSolution:
     """Let explanations compete; solve for targets as built, where they are drawn otherwise, and for effects."""
     task = first.task
 
@@ -339,7 +339,7 @@ def _explained(first: Explained, drawn: Sights, built: Built) -> Explained:
     return replace(seen, problem=replace(seen.problem, smoothness={}))
 
 
-def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
+def _of_targets(seen: TaskSolution, solved: Solver, built: Construction) -> TaskSolution:
     """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
     is_asked, views = problem.options.as_built == "estimate", seen.unsteady.of_views if seen.unsteady else None
@@ -355,7 +355,7 @@ def _of_targets(seen: Explained, solved: Solver, built: Built) -> Explained:
     return now.at_least
 
 
-def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]:
+def _known(seen: TaskSolution, conflicts: Conflicts) -> tuple[TaskSolution, Posterior]:
     """What is known of every number, with what the lens hides and whatever else may be."""
     end, posterior = _assess(seen)
     is_new = seen.task.before is None
@@ -367,7 +367,7 @@ def _known(seen: Explained, conflicts: Conflicts) -> tuple[Explained, Posterior]
     return known, with_doubts(posterior, end, conflicts, seen.explanations, seen.others)
 
 
-def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
+def _assess(seen: TaskSolution) -> tuple[RobustSolution, Posterior]:
     """What is known of every number, by the observations that took part at the noise that they show.
 
     Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
@@ -375,7 +375,7 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
     end, before = seen.end, seen.task.before
     known = end.problem if before is None else replace(end.problem, layout=before)
     estimate = end.estimate
-    reduced = end.told if before is None else information(known, estimate)
+    reduced = end.information if before is None else information(known, estimate)
 
     def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
         at_end = there is estimate
@@ -387,7 +387,7 @@ def _assess(seen: Explained) -> tuple[RobustSolution, Posterior]:
     return (end if assessed is estimate else end.moved_to(assessed, seen.problem)), posterior
 
 
-def _start_of(others: Problem, some: Subproblem, first: Explained) -> Estimate:
+def _start_of(others: Problem, some: Subproblem, first: TaskSolution) -> Estimate:
     """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
     alike = set(others.sights.keys) == set(some.problem.sights.keys)
     if first.task.before is not None or not alike or all(key.placement is None for key in others.sights.keys):
@@ -395,7 +395,7 @@ def _start_of(others: Problem, some: Subproblem, first: Explained) -> Estimate:
     return initialise(others.sights, others.options).estimate
 
 
-def _as_long_as_asked(seen: Explained) -> Explained:
+def _as_long_as_asked(seen: TaskSolution) -> TaskSolution:
     """With the lenses that the residuals ask for where nothing is stated of their powers.
 
     A lens without a formula has all of its terms where residuals of different views agree from place to place. How
@@ -408,7 +408,7 @@ def _as_long_as_asked(seen: Explained) -> Explained:
 
     def grown(name: str, one: Options) -> Options:
         may_grow = not one.powers and one.is_rough and one.coefficients is None and not one.terms
-        if may_grow and LeftOver.of_end(end, end.problem.sights.of_camera(name)).in_cells > AGREES:
+        if may_grow and LensResiduals.of_end(end, end.problem.sights.of_camera(name)).in_cells > AGREES:
             return replace(one, terms=tuple(one.blank_lens.more_terms))
         return one
 

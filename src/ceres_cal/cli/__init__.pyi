@@ -9,6 +9,6 @@ from ceres_cal.cli.jobs import words_of as words_of
 from ceres_cal.cli.page.server import serve as serve
 from ceres_cal.cli.page.session import Session as Session
 from ceres_cal.cli.page.session import opened as opened
-from ceres_cal.cli.page.state import Sitting as Sitting
+from ceres_cal.cli.page.state import PageContext as PageContext
 from ceres_cal.cli.page.state import State as State
 from ceres_cal.cli.terminal import main as main

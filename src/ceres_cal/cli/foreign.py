@@ -84,7 +84,7 @@ def _typed(
     return options
 
 
-def _losses(exported: formats.Exported) -> Iterator[Section]:
+def _losses(exported: formats.Export) -> Iterator[Section]:
     """What is lost, in px and mm, and what else to know."""
     every = exported.losses
     errors = [

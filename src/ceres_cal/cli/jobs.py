@@ -189,7 +189,7 @@ _OBSERVATIONS = (".json", ".npz")
 _NAME = re.compile(r"[\w][\w .+-]*")
 
 
-class Planned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class JobSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One row: a job's name, its command, and arguments as they are typed; files are named from the plan's folder."""
 
     name: str
@@ -197,7 +197,7 @@ class Planned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arguments: tuple[str, ...] = ()
 
 
-def read_plan(path: Path) -> tuple[Planned, ...]:
+def read_plan(path: Path) -> tuple[JobSpec, ...]:
     """The rows of a plan.
 
     A table has `name`, `command` and `arguments` (one text as it is typed, or a list): a line of JSON each, a CSV with
@@ -216,15 +216,15 @@ def read_plan(path: Path) -> tuple[Planned, ...]:
     return tuple(rows)
 
 
-def _of_folder(folder: Path) -> Iterator[Planned]:
+def _of_folder(folder: Path) -> Iterator[JobSpec]:
     for place in sorted(folder.iterdir()):
         if place.is_dir():
             files = sorted(file for file in place.iterdir() if _holds_observations(file))
             if files:
                 names = tuple(str(file.relative_to(folder)) for file in files)
-                yield Planned(printable(place.name), "calibrate", names)
+                yield JobSpec(printable(place.name), "calibrate", names)
         elif _holds_observations(place):
-            yield Planned(printable(place.stem), "calibrate", (place.name,))
+            yield JobSpec(printable(place.stem), "calibrate", (place.name,))
 
 
 def _holds_observations(file: Path) -> bool:
@@ -236,7 +236,7 @@ def _holds_observations(file: Path) -> bool:
         return file.suffix == ".npz" or observations.FORMAT.encode() in stream.read(first)
 
 
-def _of_table(path: Path) -> Iterator[Planned]:
+def _of_table(path: Path) -> Iterator[JobSpec]:
     content = read_bytes(path)
     if path.suffix not in _ENDINGS:
         raise InputError(f"{path}: a plan is a folder, or a table in {', '.join(_ENDINGS[:-1])} or {_ENDINGS[-1]}")
@@ -248,7 +248,7 @@ def _of_table(path: Path) -> Iterator[Planned]:
     for where, data in read(text, str(path)):
         if isinstance(data, dict) and isinstance(data.get("arguments"), str):
             data["arguments"] = words_of(data["arguments"], f"{where}: arguments")
-        row = convert(data, Planned, where)
+        row = convert(data, JobSpec, where)
         if not _NAME.fullmatch(row.name):
             raise InputError(f"{where}: a job is called {row.name!r}: files have its name: letters, digits, - and _")
         yield row

@@ -66,7 +66,7 @@ def _serve(session: cli.Session, port: int, browser: bool) -> None:
             raise
 
 
-def _sitting(files: Sequence[str], folder: Path, target: str) -> cli.Sitting:
+def _sitting(files: Sequence[str], folder: Path, target: str) -> cli.PageContext:
     """What was named, each file once: nothing else is read later."""
     most_calibrations = 2
 
@@ -86,7 +86,7 @@ def _sitting(files: Sequence[str], folder: Path, target: str) -> cli.Sitting:
     if different := next((n for n, size in enumerate(sizes) if size != sizes[0]), None):
         (a, b), (c, d) = sizes[different], sizes[0]
         raise InputError(f"{photographs[different]}: {a} x {b} px, and the first has {c} x {d}: one camera at a time")
-    return cli.Sitting(photographs, sizes, folder, target, *calibrations)
+    return cli.PageContext(photographs, sizes, folder, target, *calibrations)
 
 
 def _sections(session: cli.Session) -> Iterator[Section]:

@@ -11,7 +11,7 @@ import numpy as np
 from ceres_cal.base import InputError, read_bytes, write_bytes, write_json
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS
-from ceres_cal.cli.page.state import Made, Region, Sitting, State, target_words
+from ceres_cal.cli.page.state import CommandResults, PageContext, Region, State, target_words
 from ceres_cal.detect.images import encoded
 from ceres_cal.detect.photographs.by_hand import FEWEST, FORMAT, VERSION
 from ceres_cal.formats import export_format
@@ -37,14 +37,14 @@ class PageStep(NamedTuple):
 
 
 def make(
-    sitting: Sitting,
+    sitting: PageContext,
     state: State,
     target: Target | None,
     folder: Path,
     *,
     auto: bool = False,
-    known: Made | None = None,
-) -> Made:
+    known: CommandResults | None = None,
+) -> CommandResults:
     """Detect and calibrate into a folder, by the commands.
 
     Args:
@@ -77,10 +77,10 @@ def make(
         step.answer()
         done.append(step)
     observed = {path.name: read_bytes(path) for path in outputs}
-    return Made(tuple(step.typed for step in done), observed, calibrated.output, boards)
+    return CommandResults(tuple(step.typed for step in done), observed, calibrated.output, boards)
 
 
-def board_step(state: State, sitting: Sitting, folder: Path) -> PageStep:
+def board_step(state: State, sitting: PageContext, folder: Path) -> PageStep:
     """Boards in all photographs."""
     output = folder / "board.json"
     words = [*arguments.board_words(state.board), "--camera", CAMERA, "-o", str(output)]
@@ -88,7 +88,7 @@ def board_step(state: State, sitting: Sitting, folder: Path) -> PageStep:
 
 
 def field_steps(
-    state: State, target: Target, sitting: Sitting, folder: Path, boards: Collection[Path], *, auto: bool
+    state: State, target: Target, sitting: PageContext, folder: Path, boards: Collection[Path], *, auto: bool
 ) -> Iterator[PageStep]:
     """The field in the photographs that show no board: those with a mask of their own one by one.
 
@@ -142,7 +142,7 @@ def export_steps(state: State, folder: Path) -> Iterator[PageStep]:
 # ---- what commands read ---------------------------------------------------------------------------------------------
 
 
-def write_inputs(state: State, sitting: Sitting, folder: Path, *, auto: bool) -> None:
+def write_inputs(state: State, sitting: PageContext, folder: Path, *, auto: bool) -> None:
     """Clicks and masks as files that the commands take."""
     if not auto and len(state.points) >= FEWEST:
         points = {name: (one.x, one.y) for name, one in state.points.items()}

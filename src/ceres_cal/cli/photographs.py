@@ -112,7 +112,7 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
     """
     import numpy as np
 
-    found: detect.Merged = detect.merged(_pictures(images, videos, bar))
+    found: detect.MedianPicture = detect.merged(_pictures(images, videos, bar))
     levels = np.round(found.picture * (65535 // found.white)).astype(np.uint16)
     save(path, detect.encoded(np.asarray(levels), ".png", 100))
     left_out = [{"image": name, "reason": reason} for name, reason in found.left_out]

@@ -122,11 +122,11 @@ TERMINATED = 143
 """What a shell reports of a program that SIGTERM ended."""
 
 
-class Terminated(KeyboardInterrupt):
+class Termination(KeyboardInterrupt):
     """SIGTERM came: everything is left as by Ctrl-C."""
 
 
-class _Kept(io.FileIO):
+class _SafeStream(io.FileIO):
     """A standard stream that never fails: what cannot be written is lost, and `lost` says why.
 
     So the exit code of a command is that of its work, wherever its words go.
@@ -173,13 +173,13 @@ def _open_what_is_closed() -> None:
 def _stream(number: int, before: TextIO | None) -> TextIO:
     """A descriptor as a stream like the one before, or like any where there was none."""
     encoding = "utf-8" if before is None else before.encoding
-    buffered = io.BufferedWriter(_Kept(number, "w", closefd=False))
+    buffered = io.BufferedWriter(_SafeStream(number, "w", closefd=False))
     by_lines = number != 1 or os.isatty(number)
     return io.TextIOWrapper(buffered, encoding, "backslashreplace", line_buffering=by_lines)
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise Terminated
+    raise Termination
 
 
 def _silence_libraries() -> None:
@@ -199,7 +199,7 @@ def ended(exit_code: int) -> int:
     if native is None or not native.is_busy():
         atexit._run_exitfuncs()
     sys.stdout.flush()
-    lost = cast(_Kept, cast(io.BufferedWriter, sys.stdout.buffer).raw).lost
+    lost = cast(_SafeStream, cast(io.BufferedWriter, sys.stdout.buffer).raw).lost
     if lost is not None and not isinstance(lost, BrokenPipeError):  # who closes a pipe wants no more
         print(f"ceres-cal: the answer is not on standard output: {lost.strerror}", file=sys.stderr)
     sys.stderr.flush()
@@ -265,7 +265,7 @@ def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
         case CalibrationError():
             return str(error), error.exit_code
         case KeyboardInterrupt():
-            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", interrupted)
+            how, code = ("terminated", TERMINATED) if isinstance(error, Termination) else ("interrupted", interrupted)
             return f"{how}: {f'written were {first_of(files)}' if files else 'nothing was written'}", code
         case MemoryError():
             return "out of memory: give fewer observations or images at a time", InputError.exit_code

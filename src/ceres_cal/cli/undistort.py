@@ -196,7 +196,7 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     )
 
 
-def _straight_line(straight: report.Straight, whole: bool) -> str:
+def _straight_line(straight: report.Straightening, whole: bool) -> str:
     (width, height), (across, down) = straight.camera.image_size, straight.view_deg
     ends = whole and straight.limit_deg is not None
     return (

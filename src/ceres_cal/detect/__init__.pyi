@@ -5,7 +5,7 @@ from ceres_cal.detect.images import encoded as encoded
 from ceres_cal.detect.images import read_colour as read_colour
 from ceres_cal.detect.images import read_grey as read_grey
 from ceres_cal.detect.median import MOST_PICTURES as MOST_PICTURES
-from ceres_cal.detect.median import Merged as Merged
+from ceres_cal.detect.median import MedianPicture as MedianPicture
 from ceres_cal.detect.median import merged as merged
 from ceres_cal.detect.photographs import Auto as Auto
 from ceres_cal.detect.photographs import Clicks as Clicks

@@ -28,7 +28,7 @@ _BAND, _EVERY = 64, 31  # rows worked on at once; pixels apart that tell the noi
 _NEAR = 3.0  # times the noise
 
 
-class Merged(Frozen):
+class MedianPicture(Frozen):
     """One picture of several.
 
     Attributes:
@@ -42,7 +42,7 @@ class Merged(Frozen):
     left_out: tuple[tuple[str, str], ...]
 
 
-def merged(pictures: Iterable[tuple[str, Image]]) -> Merged:
+def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
     """What the pictures show that stands still: each pixel's median, made finer by the mean of what is near it.
 
     They are read one by one and kept in grey; of a camera that was moved in between those count that most agree with.
@@ -68,7 +68,7 @@ def merged(pictures: Iterable[tuple[str, Image]]) -> Merged:
             "them one by one"
         )
     left_out |= {n: "the camera had moved" for n in sharp if n not in chosen}
-    return Merged(
+    return MedianPicture(
         _middle([greys[n] for n in chosen]),
         int(np.iinfo(greys[0].dtype).max),
         tuple(names[n] for n in chosen),

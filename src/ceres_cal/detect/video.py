@@ -92,7 +92,7 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
     Raises:
         InputError: see `open_video` and `Video.frames`.
     """
-    looked_at = 10  # frames of each stretch: a hand that holds a board comes to rest in between
+    sampled = 10  # frames of each stretch: a hand that holds a board comes to rest in between
     opened = open_video(video)
     stretches = min(count, opened.total)
     written: list[Path] = []
@@ -102,7 +102,7 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
         written.append(make_folder(folder) / f"{len(written) + 1:04d}.png")
         write_bytes(written[-1], encoded(frame, ".png", 100))
 
-    for number, frame in opened.frames(max(1, opened.total // (stretches * looked_at))):
+    for number, frame in opened.frames(max(1, opened.total // (stretches * sampled))):
         stretch, sharp = number * stretches // opened.total, _sharpness(frame)
         if best and best[0] != stretch:
             write(best[2])

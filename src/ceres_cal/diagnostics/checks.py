@@ -12,7 +12,7 @@ import numpy as np
 
 from ceres_cal.base import AnyArray, Array, Frozen, Indices, Mask, first_of, log_chi2_tail, log_f_tail, rms
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.labels import Mislabelled
+from ceres_cal.diagnostics.labels import WrongLabel
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.effects import Amount, AsBuilt, Case, EffectEstimate, Finding, Linearised, Selection, Words
 from ceres_cal.effects.table.targets import feature_of
@@ -142,7 +142,7 @@ class DiagnosisCase(Case):
 
     inliers: Inliers
     table: ResidualTable
-    labels: Sequence[Mislabelled]
+    labels: Sequence[WrongLabel]
     labels_tried: int
     calibration: Calibration | None
     as_built: tuple[AsBuilt, ...] = ()
@@ -160,7 +160,7 @@ class TestResults(Frozen):
 
 def wrong_labels(tested: TestResults) -> Iterator[Finding]:
     """Labels that stand for another feature, over all its frames."""
-    groups: dict[tuple[bool, str, int, int], list[Mislabelled]] = defaultdict(list)
+    groups: dict[tuple[bool, str, int, int], list[WrongLabel]] = defaultdict(list)
     for label in tested.case.labels:
         if label.log_p <= tested.selection.log_level:
             name = tested.case.problem.observations.views[label.view].target
@@ -169,7 +169,7 @@ def wrong_labels(tested: TestResults) -> Iterator[Finding]:
         yield _wrong_label(tested, target, labels)
 
 
-def _wrong_label(tested: TestResults, target: str, labels: list[Mislabelled]) -> Finding:
+def _wrong_label(tested: TestResults, target: str, labels: list[WrongLabel]) -> Finding:
     observations, table, one = tested.case.problem.observations, tested.case.table, labels[0]
     described = observations.targets[target]
     names = described.curve_names if one.is_curve else described.point_names

@@ -22,7 +22,7 @@ from ceres_cal.problem import EXACT, Estimate, camera_optics
 from ceres_cal.scene import Camera, Curve, Target, curve_points, nearest_to_rays, turned_on
 
 
-class Mislabelled(Frozen):
+class WrongLabel(Frozen):
     """Observations of one view under one label that fit another.
 
     Attributes:
@@ -46,14 +46,14 @@ def find_mislabelled(
     taking_part: tuple[Mask, Mask],
     scales: tuple[float, float],
     reject_sigma: float,
-) -> tuple[list[Mislabelled], int]:
+) -> tuple[list[WrongLabel], int]:
     """Every group of observations that another feature explains within the noise, and how many were looked at.
 
     Args:
         taking_part: of points (N,) and of curve observations (M,). scales: of the noise of either.
     """
     most = 20_000  # rejected observations looked at: of more, evenly spread ones
-    mislabelled: list[Mislabelled] = []
+    mislabelled: list[WrongLabel] = []
     tried = 0
 
     @cache  # all frames of one station show a field from the same place
@@ -63,8 +63,8 @@ def find_mislabelled(
     both: tuple[Columns, ...] = (observations.points, observations.curves)
     for column, original, used, scale in zip(both, observations.copies.originals, taking_part, scales, strict=True):
         rejected = original & ~used
-        looked_at = rejected | _may_lie_beyond(observations, column)
-        rows = np.flatnonzero(looked_at)
+        doubtful = rejected | _may_lie_beyond(observations, column)
+        rows = np.flatnonzero(doubtful)
         rows = rows[:: max(1, len(rows) // most)]
         for number in distinct(column.view[rows]):
             own, view = rows[column.view[rows] == number], observations.views[number]
@@ -103,7 +103,7 @@ class _Sight(Frozen):
         return min(1.0, 2.0 * distance_px * self.length_px / (width * height))
 
 
-def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Array) -> list[Mislabelled]:
+def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Array) -> list[WrongLabel]:
     """The groups of one view."""
     is_curve, named = isinstance(column, Curves), column.feature[rows]
     distance = sight.distances(column, rows)
@@ -123,7 +123,7 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
         near = sight.chance(is_curve, float(away[chosen].max()))
         log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
         groups.append(
-            Mislabelled(
+            WrongLabel(
                 is_curve, view, int(label), int(instead), rows[chosen], away[chosen], log_p
             )
         )  # fmt: skip
@@ -190,7 +190,7 @@ def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
 # ---- other names ----------------------------------------------------------------------------------------------------
 
 
-def renamings(observations: Observations, calibration: Calibration) -> Iterator[Mislabelled]:
+def renamings(observations: Observations, calibration: Calibration) -> Iterator[WrongLabel]:
     """Features of the world all of whose observations in a view, its rows, lie where another feature does: two and
     more of a curve, or two features that lie where each other's should.
     """
@@ -206,7 +206,7 @@ def renamings(observations: Observations, calibration: Calibration) -> Iterator[
             yield replace(one, rows=rows)
 
 
-def renaming_words(one: Mislabelled, observations: Observations) -> str:
+def renaming_words(one: WrongLabel, observations: Observations) -> str:
     """What was seen of a feature lies where another one does."""
     view = observations.views[one.view]
     target = observations.targets[view.target]
@@ -214,12 +214,12 @@ def renaming_words(one: Mislabelled, observations: Observations) -> str:
     return f"frame {view.frame!r}: {kind} {names[one.feature]!r} is seen where {names[one.instead]!r} lies"
 
 
-def _rows_of(one: Mislabelled, observations: Observations) -> Indices:
+def _rows_of(one: WrongLabel, observations: Observations) -> Indices:
     column = observations.curves if one.is_curve else observations.points
     return np.flatnonzero((column.view == one.view) & (column.feature == one.feature))
 
 
-def _is_whole(one: Mislabelled, observations: Observations, calibration: Calibration) -> bool:
+def _is_whole(one: WrongLabel, observations: Observations, calibration: Calibration) -> bool:
     """Whether all that was seen of the feature lies where the other does: crossing it, some of that may fit both."""
     view, rows = observations.views[one.view], _rows_of(one, observations)
     if view.placement is not None or 2 * len(one.rows) <= len(rows):
@@ -231,7 +231,7 @@ def _is_whole(one: Mislabelled, observations: Observations, calibration: Calibra
     return bool(np.all(off <= calibration.options.reject_sigma * scale * column.sigma_px[rows]))
 
 
-def mended(observations: Observations, wrong: Iterable[Mislabelled]) -> Observations:
+def mended(observations: Observations, wrong: Iterable[WrongLabel]) -> Observations:
     """The observations with the right names."""
     points, curves = observations.points.feature.copy(), observations.curves.feature.copy()
     for one in wrong:

@@ -1,4 +1,4 @@
-from ceres_cal.formats.format import Exported as Exported
+from ceres_cal.formats.format import Export as Export
 from ceres_cal.formats.format import ExportFormat as ExportFormat
 from ceres_cal.formats.format import ExportLoss as ExportLoss
 from ceres_cal.formats.format import ExportRequest as ExportRequest

@@ -14,7 +14,7 @@ import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, kept_signals, read_bytes
 from ceres_cal.base.words import plural
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign
 from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera, camera_matrix
 
@@ -36,7 +36,7 @@ def _library() -> Any:
     return pycolmap
 
 
-def _export(request: ExportRequest) -> Exported:
+def _export(request: ExportRequest) -> Export:
     pycolmap = _library()
     cameras, losses = as_foreign(request, lambda _: tuple(_MODELS))
     model, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
@@ -61,7 +61,7 @@ def _export(request: ExportRequest) -> Exported:
         model.write_text(folder)
         content = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
     models = " and ".join(_MODELS[one.model] for one in cameras)
-    return Exported(content, losses, f"{plural(len(cameras), 'camera')}, {models}, one rig, one frame")
+    return Export(content, losses, f"{plural(len(cameras), 'camera')}, {models}, one rig, one frame")
 
 
 def _camera(foreign: ForeignCamera, number: int) -> Any:

@@ -29,7 +29,7 @@ class ExportLoss(Struct, frozen=True):
     image_px: tuple[float, float] | None = None
 
 
-class Exported(Frozen):
+class Export(Frozen):
     """A calibration in a format.
 
     Attributes:
@@ -98,7 +98,7 @@ class ExportFormat(Struct, frozen=True):
     name: str
     description: str
     endings: tuple[str, ...]
-    export: Callable[..., Exported]
+    export: Callable[..., Export]
     most_stations: int | None = 1
     edits: bool = False
 

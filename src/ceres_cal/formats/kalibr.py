@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, require_rotation
 from ceres_cal.base.words import plural
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, camera_matrix
@@ -23,7 +23,7 @@ _PROJECTIONS = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # how many numbers
 _DISTORTIONS = {"none": 0, "radtan": 4, "equidistant": 4, "fov": 1}
 
 
-def _export(request: ExportRequest) -> Exported:
+def _export(request: ExportRequest) -> Export:
     cameras, losses = as_foreign(request, lambda _: tuple(_MODELS))
     chain, before = {}, Pose.identity()
     for number, (name, foreign) in enumerate(zip(request.stations, cameras, strict=True)):
@@ -40,9 +40,7 @@ def _export(request: ExportRequest) -> Exported:
     comments = [f"# {line}\n" for loss in losses for line in loss_words(loss)]
     comments.append("# T_cn_cnm1 of cam0 takes points of the field (m) to cam0, as mrcal-to-kalibr writes it\n")
     models = " and ".join(str(one["distortion_model"]) for one in chain.values())
-    return Exported(
-        ("".join(comments) + yaml_text(chain)).encode(), losses, f"{plural(len(chain), 'camera')}, {models}"
-    )
+    return Export(("".join(comments) + yaml_text(chain)).encode(), losses, f"{plural(len(chain), 'camera')}, {models}")
 
 
 def _read(request: ImportRequest) -> Any:

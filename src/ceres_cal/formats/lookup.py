@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ceres_cal import posterior, scene
 from ceres_cal.base import HEIGHTS_M, AnyArray, Array, Column, Frozen, InputError, grid_places, read_npz, replace
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.formats.format import Exported, ExportFormat, ExportLoss, ExportRequest
+from ceres_cal.formats.format import Export, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
 from ceres_cal.scene.camera import in_image
 
@@ -171,13 +171,13 @@ def _export(
     *,
     error_mm: Annotated[float, "largest interpolation error on the field; default: 0.1"] = 0.1,
     step_px: Annotated[int | None, "distance of the nodes; default: the widest that keeps to the error"] = None,
-) -> Exported:
+) -> Export:
     if not error_mm > 0.0:
         raise InputError(f"error_mm must be above 0, not {error_mm:g}")
     (station,), box = request.stations, posterior.field_grid(request.calibration.targets)
     table = make_lookup_table(request.calibration.station(station), station, *box, error_mm, step_px)
     nodes = (len(table.x_px), len(table.y_px))
-    return Exported(
+    return Export(
         table.to_bytes(),
         (ExportLoss(station, table.error_mm),),
         f"{nodes[0]} x {nodes[1]} nodes every {table.step_px} px",

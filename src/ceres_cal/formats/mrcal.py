@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base import InputError, Pose, require_room
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera, camera_matrix
@@ -22,7 +22,7 @@ _MODELS = {f"LENSMODEL_OPENCV{count}": model for model, count in OPENCV_MODELS.i
 _POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
 
 
-def _export(request: ExportRequest) -> Exported:
+def _export(request: ExportRequest) -> Export:
     (name,), ((foreign,), losses) = request.stations, as_foreign(request, lambda _: ("opencv5", "opencv8", "opencv12"))
     model = f"LENSMODEL_{foreign.model.upper()}"
     pose = foreign.pose.log().tolist()
@@ -34,7 +34,7 @@ def _export(request: ExportRequest) -> Exported:
     }
     lines = [f"# {line}\n" for line in (f"station {name}; reference: the field, metres", *loss_words(*losses))]
     body = "".join(f"    '{key}': {value!r},\n" for key, value in entries.items())
-    return Exported(("".join(lines) + "{\n" + body + "}\n").encode(), losses, f"{model}, pose")
+    return Export(("".join(lines) + "{\n" + body + "}\n").encode(), losses, f"{model}, pose")
 
 
 def literal_of(content: bytes) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, replace, two_digits
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.scene import FISHEYE, LARGEST, ForeignCamera, image_grid, opencv_models
 
@@ -28,7 +28,7 @@ _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height
 # ---- writing --------------------------------------------------------------------------------------------------------
 
 
-def _export(request: ExportRequest) -> Exported:
+def _export(request: ExportRequest) -> Export:
     import cv2
 
     cameras, losses = as_foreign(request, opencv_models)
@@ -42,7 +42,7 @@ def _export(request: ExportRequest) -> Exported:
     models_used = " and ".join(camera.model for camera in cameras)
     named = zip(request.stations, cameras, strict=True)
     warnings = [f"station {name!r}: {text}" for name, camera in named for text in _reader_traps(camera)]
-    return Exported(content.encode(), losses, f"K, {models_used}, pose", {}, tuple(warnings))
+    return Export(content.encode(), losses, f"K, {models_used}, pose", {}, tuple(warnings))
 
 
 def _reader_traps(camera: ForeignCamera) -> list[str]:

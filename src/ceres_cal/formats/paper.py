@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, euler_from_rotation
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene import Camera, Radial, nearest
 
 
-def _export(request: ExportRequest) -> Exported:
+def _export(request: ExportRequest) -> Export:
     (name,) = request.stations
     camera = request.calibration.station(name)
     ours = nearest(camera, Radial.blank((2, 3)))
@@ -40,7 +40,7 @@ def _export(request: ExportRequest) -> Exported:
         *loss_words(loss),
     ]
     text = "".join(f"# {line}\n" for line in comments) + "".join(f"{key} = {_text(v)}\n" for key, v in rows.items())
-    return Exported(text.encode(), (loss,), "a1, a2, a3, phi, K, R, t, angles and H")
+    return Export(text.encode(), (loss,), "a1, a2, a3, phi, K, R, t, angles and H")
 
 
 def _text(values: Array) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base import InputError, checked, naming, no_such, read_bytes
 from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -36,7 +36,7 @@ def export(
     stations: Sequence[str] | None = None,
     max_loss_mm: float | None = None,
     **options: Any,
-) -> Exported:
+) -> Export:
     """Write a calibration to a file of a format, or to a folder where the format takes one.
 
     Args:
@@ -60,7 +60,7 @@ def export(
 
 def prepare_export(
     calibration: Calibration, to: str, path: str | Path, stations: Sequence[str] | None, options: Mapping[str, Any]
-) -> Exported:
+) -> Export:
     """The same, not yet written."""
     form, path = export_format(to), Path(path)
     return form.export(

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from ceres_cal.base import Array, InputError, Pose, quaternion, rotation_of
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import as_foreign, loss_words
 from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
 from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
@@ -24,7 +24,7 @@ def _export(
     request: ExportRequest,
     *,
     world_frame: Annotated[str, "parent of the static transform; default: field"] = "field",
-) -> Exported:
+) -> Export:
     (name,), ((foreign,), losses) = request.stations, as_foreign(request, lambda _: tuple(_MODELS))
     projection = np.column_stack([foreign.matrix, np.zeros(3)])
     (width, height), pose = foreign.image_size, foreign.pose.inverse
@@ -46,7 +46,7 @@ def _export(
     words = f"{_MODELS[foreign.model]}, and the pose as static_transform, whose names are static_transform_publisher's"
     warnings = ["equidistant is unknown to installations before 2021"] if foreign.model == FISHEYE else []
     facts = {"static_transform": data["static_transform"]}
-    return Exported(yaml_text(data).encode(), losses, words, facts, (*warnings,))
+    return Export(yaml_text(data).encode(), losses, words, facts, (*warnings,))
 
 
 def _matrix(values: Array) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base import InputError, attempt, replace
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.opencv import ImageSize
 from ceres_cal.formats.ssl_cameras import CameraIds, as_before, to_cameras, to_entries
@@ -20,7 +20,7 @@ from ceres_cal.formats.yaml_files import read_yaml, yaml_text
 from ceres_cal.scene import still
 
 
-def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any]) -> tuple[dict[str, Any], Exported]:
+def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any]) -> tuple[dict[str, Any], Export]:
     """SSL_GeometryData as plain data, with the field and the other cameras of what was there before.
 
     Raises:
@@ -44,16 +44,16 @@ def geometry_of(request: ExportRequest, camera_id: str, before: Mapping[str, Any
         data["models"] = before["models"]
     words = f"camera {', '.join(map(str, entries))} of {len(cameras)} in ssl-vision's model"
     facts = {"camera_ids": dict(zip(request.stations, entries, strict=True))}
-    return data, Exported(b"", tuple(losses), words, facts, tuple(warnings))
+    return data, Export(b"", tuple(losses), words, facts, tuple(warnings))
 
 
-def _export_packet(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
+def _export_packet(request: ExportRequest, *, camera_id: CameraIds = "") -> Export:
     before = {} if request.existing is None else geometry_from_bytes(request.existing)
     data, exported = geometry_of(request, camera_id, before)
     return replace(exported, content=to_bytes("SSL_GeometryData", data))
 
 
-def _export_yaml(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
+def _export_yaml(request: ExportRequest, *, camera_id: CameraIds = "") -> Export:
     text = "" if request.existing is None else request.existing.decode("utf-8", errors="replace")
     before = _checked(read_yaml(text)) if text.strip() else {}
     data, exported = geometry_of(request, camera_id, before)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec import Struct
 
 from ceres_cal.base import InputError, first_of, naming, note, plural, read_bytes
-from ceres_cal.formats.format import Exported, ExportRequest
+from ceres_cal.formats.format import Export, ExportRequest
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import geometry_of, read_geometry
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
@@ -130,7 +130,7 @@ def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
 
 def ssl_packet(
     calibration: Calibration, stations: Sequence[str] | None = None, camera_id: str = "", before: Path | None = None
-) -> tuple[bytes, Exported]:
+) -> tuple[bytes, Export]:
     """The wrapper packet of a calibration, and what it gets wrong.
 
     Args:

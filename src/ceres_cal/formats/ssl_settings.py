@@ -14,7 +14,7 @@ from xml.sax.saxutils import escape
 from msgspec import Struct
 
 from ceres_cal.base import InputError, finite
-from ceres_cal.formats.format import Exported, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
+from ceres_cal.formats.format import Export, ExportFormat, ExportRequest, ImportFormat, ImportRequest, calibration_of
 from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.opencv import ImageSize
 from ceres_cal.formats.ssl_cameras import NAMES, CameraIds, to_cameras, to_entries
@@ -124,7 +124,7 @@ def _number(one: _Var) -> float:
 # ---- writing --------------------------------------------------------------------------------------------------------
 
 
-def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
+def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Export:
     if request.existing is None:
         raise InputError("ssl-vision's settings are edited in place: name its robocup-ssl.xml (or a copy), with "
                          "ssl-vision closed")  # fmt: skip
@@ -143,7 +143,7 @@ def _export(request: ExportRequest, *, camera_id: CameraIds = "") -> Exported:
     warnings.append("ssl-vision reads this file at its start and overwrites it at its end: it must be closed meanwhile")
     words = f"camera {', '.join(map(str, entries))} in ssl-vision's settings"
     facts = {"camera_ids": dict(zip(request.stations, entries, strict=True))}
-    return Exported(content, tuple(losses), words, facts, tuple(warnings))
+    return Export(content, tuple(losses), words, facts, tuple(warnings))
 
 
 def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -> Iterator[tuple[_Var, str]]:

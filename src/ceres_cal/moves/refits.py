@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from ceres_cal.base import DegenerateError, Pose, SolutionError, attempt, checked, numerical, replace
-from ceres_cal.calibration import Calibration, Refitted
+from ceres_cal.calibration import Calibration, RefitRecord
 from ceres_cal.calibration.solving import Task, solved_from
 from ceres_cal.moves.explanations import (
     WORDS,
@@ -139,7 +139,7 @@ def _refitted(
     seen = calibration.refitted.digests if calibration.refitted else ()
     if calibration.digest != observations.digest:
         seen = (*seen, calibration.digest)
-    refitted = Refitted(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
+    refitted = RefitRecord(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
     warnings = (*_warnings(plan, result), *([_TWICE] if observations.digest in seen else []))
     return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
 

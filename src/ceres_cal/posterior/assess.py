@@ -1,6 +1,6 @@
 """The last step of a calibration: what is known of its numbers, and what to do where phi ran away.
 
-The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima, and
+The posterior with what may be otherwise in it: statements in conflict, groups that may not belong, other minima, and
 other lenses.
 """
 

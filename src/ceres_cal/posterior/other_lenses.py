@@ -275,7 +275,7 @@ AGREES = 2.5
 _IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
 
 
-class LeftOver(Frozen):
+class LensResiduals(Frozen):
     """What a lens leaves of some sights.
 
     Attributes:
@@ -288,7 +288,7 @@ class LeftOver(Frozen):
     cameras: Mapping[str, Camera]
 
     @classmethod
-    def of(cls, sights: Sights, there: Residuals, scales: tuple[float, float], estimate: Estimate) -> LeftOver:
+    def of(cls, sights: Sights, there: Residuals, scales: tuple[float, float], estimate: Estimate) -> LensResiduals:
         """At an estimate; of very many equations those of some sights.
 
         Args:
@@ -302,7 +302,7 @@ class LeftOver(Frozen):
         return cls(some, points, curves, {name: estimate.cameras[name] for name in some.cameras})
 
     @classmethod
-    def of_end(cls, end: RobustSolution, sights: Sights | None = None) -> LeftOver:
+    def of_end(cls, end: RobustSolution, sights: Sights | None = None) -> LensResiduals:
         """At the end of all rounds, of some sights or of all that took part."""
         sights = end.problem.sights if sights is None else sights
         return cls.of(sights, end.residuals, end.problem.weighting.scales, end.estimate)
@@ -387,7 +387,7 @@ def shifts_by_roughness(end: RobustSolution, cameras: Iterable[str]) -> tuple[Se
     """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
     lenses of some cameras do to them.
     """
-    reduced = end.told
+    reduced = end.information
     model = _linearised(end, reduced)
     shifts = [_shifts_of(model, name, end.estimate.cameras[name]) for name in cameras]
     return reduced.shared.keys, [shift for own in shifts for shift in own]

@@ -23,7 +23,7 @@ from ceres_cal.problem import (
     sigma_limits,
 )
 from ceres_cal.problem.quantities import difference
-from ceres_cal.problem.reduced import Eliminated, ReducedInformation
+from ceres_cal.problem.reduced import PrivatePlacements, ReducedInformation
 
 LEAST_PROBABILITY = 0.02
 """From which on something else that may be true counts: all that has less makes no difference."""
@@ -380,7 +380,7 @@ class _Placements(Frozen, Mapping[str, Information]):
         shared: about what they follow. inflation: factor on the variance that their own observations leave.
     """
 
-    eliminated: tuple[Eliminated, ...]
+    eliminated: tuple[PrivatePlacements, ...]
     shared: Information
     inflation: float = 1.0
 
@@ -403,7 +403,7 @@ class _Placements(Frozen, Mapping[str, Information]):
         return len(self._informations)
 
 
-def _placement_information(part: Eliminated, shared: Information, inflation: float) -> Array:
+def _placement_information(part: PrivatePlacements, shared: Information, inflation: float) -> Array:
     """(S, 6, 6) information about each placement, everything shared integrated out.
 
     A placement follows the shared numbers by -G, and deviates from that by what its own observations leave open:

@@ -192,7 +192,7 @@ def _lost(last: str) -> SolutionError:
 
 
 class SharedObservations(Frozen):
-    """The observations of an engine's shares, judged at an estimate; see `problem.Elsewhere`."""
+    """The observations of an engine's shares, judged at an estimate; see `problem.RemoteObservations`."""
 
     engine: InProcess | OnWorkers
     keys: tuple[SightKey, ...]

@@ -44,7 +44,7 @@ class Weighting(Frozen, eq=True):
         return self.loss in _CONVEX
 
 
-class Elsewhere(Protocol):
+class RemoteObservations(Protocol):
     """Observations of the world that are not at hand: they answer with sums."""
 
     @property
@@ -78,7 +78,7 @@ class Problem(Frozen):
     options: Options = Options()
     feet: Array | None = None
     smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    elsewhere: Elsewhere | None = None
+    elsewhere: RemoteObservations | None = None
     taken_up: float = 0.0
 
     @property

@@ -23,7 +23,7 @@ from ceres_cal.problem.quantities import free_keys, from_placement, from_station
 from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
 
 
-class Eliminated(Frozen):
+class PrivatePlacements(Frozen):
     """Private placements of one station: their own information, and how they follow the shared numbers.
 
     Attributes:
@@ -63,7 +63,7 @@ class ReducedInformation(Frozen):
     stated: Information
     built: Information
     pull: Array
-    eliminated: tuple[Eliminated, ...]
+    eliminated: tuple[PrivatePlacements, ...]
     point_leverage: float
     curve_leverage: float
 
@@ -197,7 +197,7 @@ class _InformationSums:
             last = min(first + batch, len(sights))
             yield poses[first:last], {kind: one(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}
 
-    def _eliminate(self, sights: Sights) -> Eliminated:
+    def _eliminate(self, sights: Sights) -> PrivatePlacements:
         """The private placements of one station; what is left of their sights is added to the sums."""
         key = sights.keys[0]
         world = self._estimate.stations[key.station].cam_from_world
@@ -222,7 +222,7 @@ class _InformationSums:
                 whole[lead[:, None], lead] += own
         own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
         names = tuple(str(key.placement) for key in sights.keys)
-        return Eliminated(
+        return PrivatePlacements(
             key.station, names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station]))
         )
 

@@ -72,7 +72,7 @@ def _bin_of(lengths: Array) -> Indices32:
     return np.asarray(np.clip(place, 0.0, _BINS - 1.0), dtype=np.int32)
 
 
-class Looked(Frozen):
+class ResidualSummary(Frozen):
     """What residuals are like.
 
     Attributes:
@@ -88,9 +88,9 @@ class Looked(Frozen):
     squares: Array
     beyond: Indices
 
-    def __add__(self, other: Looked) -> Looked:
+    def __add__(self, other: ResidualSummary) -> ResidualSummary:
         each = zip(list(vars(self).values())[2:], list(vars(other).values())[2:], strict=True)
-        return Looked(self.points + other.points, self.curves + other.curves, *map(np.concatenate, each))
+        return ResidualSummary(self.points + other.points, self.curves + other.curves, *map(np.concatenate, each))
 
 
 class ByKey(Frozen):
@@ -106,7 +106,7 @@ class ByKey(Frozen):
         return replace(self, of={**self.of, **other.of, **shared})
 
 
-class Used(Frozen):
+class RowSelection(Frozen):
     """The rows that take part, and those that do not.
 
     Attributes:
@@ -118,12 +118,12 @@ class Used(Frozen):
     rows: tuple[Indices, Indices]
     sigmas: tuple[Array, Array]
 
-    def __add__(self, other: Used) -> Used:
+    def __add__(self, other: RowSelection) -> RowSelection:
         rows, sigmas = (
             tuple(np.concatenate(pair) for pair in zip(mine, theirs, strict=True))
             for mine, theirs in ((self.rows, other.rows), (self.sigmas, other.sigmas))
         )
-        return Used(self.sums + other.sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+        return RowSelection(self.sums + other.sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
 
 
 def compressed(*blocks: Array) -> Array:
@@ -163,7 +163,7 @@ class _RowBounds(Frozen):
 
     Attributes:
         name: of the place. bounds: that were asked for. far: rows of points and of curve observations beyond a share of
-            them, and their lengths in stated sigmas. sums: (2, 3) of the others, see `Used`.
+            them, and their lengths in stated sigmas. sums: (2, 3) of the others, see `RowSelection`.
     """
 
     name: str
@@ -269,7 +269,7 @@ class Share:
 
     # ---- answers ----------------------------------------------------------------------------------------------------
 
-    def looked(self, asked: ShareRequest) -> Looked:
+    def looked(self, asked: ShareRequest) -> ResidualSummary:
         """What the residuals are like where the rows are judged."""
         sights = self._counted(self._world())
         points, curves = self._lengths(sights, asked)
@@ -278,7 +278,7 @@ class Share:
         inside = np.concatenate([points <= p, curves <= c])
         relative = np.concatenate([points / asked.weighting.point_scale, curves / asked.weighting.curve_scale])[inside]
         count, size = np.where(np.arange(len(view)) < len(points), 2, 1), len(self.views)
-        return Looked(
+        return ResidualSummary(
             Histogram.of(points),
             Histogram.of(curves),
             self.first_view + np.arange(size),
@@ -303,7 +303,7 @@ class Share:
         every = ((sight, normals_of(sight, problem, asked.estimate)) for sight, problem in self._problems(asked))
         return ByKey({(sight.key, kind): own for sight, kinds in every for kind, own in kinds.items()}, add)
 
-    def used(self, asked: ShareRequest) -> Used:
+    def used(self, asked: ShareRequest) -> RowSelection:
         """Which rows take part, and how far off the others are."""
         world = self._world()
         content, judged = world.observations, self._judged_by(self._counted(world), asked)
@@ -316,7 +316,7 @@ class Share:
             out = ~inside & shown[kind][far]
             rows.append(self.first_rows[kind] + far[out])
             sigmas.append(lengths[out])
-        return Used(sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+        return RowSelection(sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
 
     def _problems(self, asked: ShareRequest) -> Iterator[tuple[Sights, Problem]]:
         """Each sight with the rows that take part, and its problem."""

@@ -16,7 +16,7 @@ from ceres_cal.report.pictures.overlay import Model as Model
 from ceres_cal.report.pictures.overlay import draw_overlay as draw_overlay
 from ceres_cal.report.pictures.overlay import draw_seen as draw_seen
 from ceres_cal.report.pictures.overlay import in_8_bit_colour as in_8_bit_colour
-from ceres_cal.report.pictures.straight import Straight as Straight
+from ceres_cal.report.pictures.straight import Straightening as Straightening
 from ceres_cal.report.pictures.straight import straighten as straighten
 from ceres_cal.report.pictures.warp import make_grid as make_grid
 from ceres_cal.report.pictures.warp import top_view as top_view

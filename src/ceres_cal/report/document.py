@@ -92,7 +92,7 @@ class Gallery(Frozen, eq=True):
     pictures: tuple[Figure, ...]
 
 
-class Folded(Frozen, eq=True):
+class Details(Frozen, eq=True):
     """Pieces that are there when somebody asks for them."""
 
     title: str
@@ -123,7 +123,7 @@ class Card(Frozen, eq=True):
         return wrapped(self.sentence, *([f"-> {self.advice}"] if self.advice else []), f"   {'; '.join(self.facts)}")
 
 
-Piece = Text | BulletList | Table | Gallery | Folded | tuple[Tile, ...] | Card
+Piece = Text | BulletList | Table | Gallery | Details | tuple[Tile, ...] | Card
 
 
 class Chapter(Frozen, eq=True):

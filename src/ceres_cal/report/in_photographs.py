@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base import counted, first_of, fixed, rms
 from ceres_cal.calibration import Calibration
-from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Text
+from ceres_cal.report.document import Chapter, Details, Figure, Gallery, Text
 from ceres_cal.report.pictures.frames import Frame, frames_of, jpeg_of_at_most, marks_of, model_of, read_photograph
 from ceres_cal.report.pictures.overlay import Layer, Model, draw_overlay
 from ceres_cal.report.quality import FramePhotographs, Material
@@ -39,7 +39,7 @@ def in_photographs(material: Material, photographs: FramePhotographs) -> Chapter
         shown = f"{len(chosen)} of {len(frames)} photographs: {which}"
         notes.append(Text(f"{shown}; `ceres-cal undistort --overlay` draws any other.", "note"))
     pictures = tuple(_picture(material, photographs, frame, number) for number, frame in enumerate(chosen))
-    more = (Folded("More photographs", (Gallery(pictures[1:]),)),) if len(pictures) > 1 else ()
+    more = (Details("More photographs", (Gallery(pictures[1:]),)),) if len(pictures) > 1 else ()
     return Chapter("photographs", "In the photograph", (Gallery(pictures[:1]), *notes, *more))
 
 

@@ -79,9 +79,9 @@ def _fit(calibration: Calibration) -> Section:
 def outliers(calibration: Calibration) -> Section:
     """What was taken out, by feature."""
     fit, total = calibration.fit, len(calibration.outliers)
-    wholes = (entry.reason.partition(":")[0] for entry in calibration.outliers if entry.is_of_whole)
+    groups = (entry.reason.partition(":")[0] for entry in calibration.outliers if entry.is_of_whole)
     single = (f"{entry.kind} {entry.feature}" for entry in calibration.outliers if not entry.is_of_whole)
-    features = Counter(wholes) + Counter(single)
+    features = Counter(groups) + Counter(single)
     most = features.most_common(_MOST_FEATURES)
     rule = f"taken out ({calibration.options.reject_sigma:g} sigma and more, or a whole line)" if total else ""
     lines = [f"{total or 'none'} of {fit.points + fit.curves + total} {rule}".rstrip()]

@@ -91,7 +91,7 @@ def _(piece: document.Gallery) -> str:
 
 
 @html.register
-def _(piece: document.Folded) -> str:
+def _(piece: document.Details) -> str:
     body = "".join(map(html, piece.pieces))
     return f'<details class="folded"><summary>{escape(piece.title)}</summary>{body}</details>'
 

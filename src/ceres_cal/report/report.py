@@ -11,7 +11,7 @@ from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Options
 from ceres_cal.report import findings
-from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Piece, Text
+from ceres_cal.report.document import Chapter, Details, Figure, Gallery, Piece, Text
 from ceres_cal.report.grounds import promises
 from ceres_cal.report.maps import image_figure, lens_image_figure, map_figure
 from ceres_cal.report.page import page
@@ -138,7 +138,7 @@ def _solve(material: Material) -> Chapter:
         figures.insert(1, against_closed_form(material, *closed))
     texts = (Text(f"No closed form to compare with: {closed}.", "note"),) if isinstance(closed, str) else ()
     gallery = Gallery(tuple(figure for figure in figures if figure is not None))
-    folded = Folded("Convergence, closed form, and correlations", (gallery, *texts))
+    folded = Details("Convergence, closed form, and correlations", (gallery, *texts))
     return Chapter("solve", "The solve", (folded,))
 
 

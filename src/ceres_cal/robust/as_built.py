@@ -43,7 +43,7 @@ from ceres_cal.scene.targets import Target
 _MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
 
 
-class OfViews(Frozen):
+class ViewEffects(Frozen):
     """What displaces single views, each in its own way, and is taken off the observations.
 
     Attributes:
@@ -54,7 +54,7 @@ class OfViews(Frozen):
     columns: Callable[[Linearised], tuple[SparseColumns, Others]]
 
 
-class Built(Frozen):
+class Construction(Frozen):
     """How targets are likely built.
 
     Attributes:
@@ -75,7 +75,7 @@ class Built(Frozen):
         return own.carrying(self.whole).built_into(sights)
 
 
-AS_DRAWN = Built()
+AS_DRAWN = Construction()
 
 
 def solve_as_built(
@@ -83,8 +83,8 @@ def solve_as_built(
     end: RobustSolution,
     explanations: tuple[Explanation, ...],
     solver: Solver,
-    built: Built,
-    views: OfViews | None = None,
+    built: Construction,
+    views: ViewEffects | None = None,
     left_out: frozenset[tuple[str, Kind]] = frozenset(),
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
     """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
@@ -96,11 +96,11 @@ def solve_as_built(
     """
     observations, options, stated, first = problem.observations, problem.options, end.estimate.structure, end
 
-    def solved(there: Built) -> RobustSolution:
+    def solved(there: Construction) -> RobustSolution:
         held = taking_part(_held(problem, there), explanations)
         return solve_robustly(held, replace(end.estimate, structure=stated), is_near=True)
 
-    def freed(there: Built) -> Structure:
+    def freed(there: Construction) -> Structure:
         tolerances = {**options.tolerances, **tolerances_of(there.every)}
         structure = make_structure(observations.targets, tolerances, options.dimensions)
         return structure.carrying(there.whole, end.estimate.structure)
@@ -146,7 +146,7 @@ def solve_held(solver: SolvedFrom, problem: Problem, estimate: Estimate, every: 
         return solver(problem, estimate)
     built, stated = estimate.structure, problem.options.structure_of(problem.observations.targets)
     start = replace(estimate, structure=stated.carrying(built))
-    end = solver(_held(problem, Built(tuple(every), built)), start)
+    end = solver(_held(problem, Construction(tuple(every), built)), start)
     return _as_measured(problem, end, built.carrying(built, end.estimate.structure))
 
 
@@ -164,7 +164,7 @@ def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) ->
 
 
 def _beside_views(
-    every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: OfViews
+    every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: ViewEffects
 ) -> Iterator[AsBuilt]:
     """The same as probable as they are where single views may be displaced otherwise, too.
 
@@ -196,7 +196,7 @@ def shifts_as_drawn(every: Sequence[AsBuilt], end: RobustSolution) -> tuple[Sequ
     doubtful = [one for one in every if 1.0 - one.probability > negligible]
     if not doubtful:
         return (), []
-    known, structure = end.told.shared, end.estimate.structure
+    known, structure = end.information.shared, end.estimate.structure
     numbers = numbers_by_kind(structure, end.problem.observations.targets)
     shifts = []
     for one in doubtful:
@@ -222,7 +222,7 @@ def words_of(every: Sequence[AsBuilt]) -> tuple[str, ...]:
     return tuple(f"{target!r} is not as drawn: {words}; solved for" for target, words in said.items())
 
 
-def _held(problem: Problem, built: Built) -> Problem:
+def _held(problem: Problem, built: Construction) -> Problem:
     """The problem of targets that are drawn as they are built."""
     return replace(problem, sights=built.held(problem.sights))
 
@@ -245,7 +245,7 @@ def taking_part(problem: Problem, explanations: Sequence[Explanation]) -> Proble
     return replace(part, layout=part.layout.of(part.sights.keys))
 
 
-def _change(now: Built, before: Built) -> float:
+def _change(now: Construction, before: Construction) -> float:
     """By how much a sigma, or the offsets, are others at most, over what is no other one; infinite where they are not
     of the same kinds.
     """
@@ -343,7 +343,7 @@ _REPEATS = 2.0
 
 def estimate_as_built(
     problem: Problem, end: RobustSolution, left_out: frozenset[tuple[str, Kind]] = frozenset()
-) -> Built:
+) -> Construction:
     """The kinds of features that are likely not where they are drawn, of targets without a stated tolerance; and the
     whole structure with their likeliest offsets, and those of stated tolerances as they are.
 
@@ -357,14 +357,14 @@ def estimate_as_built(
     numbered = numbers_by_kind(structure, targets).items()
     kinds = {of: n for of, n in numbered if of[0] not in tolerances and of not in left_out}
     if len(end.problem.sights) < 2 or not kinds:
-        return Built((), structure.carrying(stated))
+        return Construction((), structure.carrying(stated))
     sights = some_sights(end.problem.sights, most_screened)
     equations, weights = _equations(stated, end, sights)
     residuals = weights.robust * weights.inverse_sigma * weights.used * equations.residual
     scores = _columns(structure, equations, weights).gathered(residuals, equations.sight, len(sights))
     repeat = {of for of, numbers in kinds.items() if agreement(scores[:, numbers]) > _REPEATS}
     if not repeat:
-        return Built((), structure.carrying(stated))
+        return Construction((), structure.carrying(stated))
     # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved. But
     # heights, as many as points, took up what a wrong floor left of eight views of a board: they repeat by themselves.
     structure = whole_structure(targets, {target for target, kind in repeat if kind == "heights"})
@@ -379,7 +379,7 @@ def estimate_as_built(
     sigmas = np.repeat([one.sigma_m for one in every], [len(own) for own in numbers])
     values = as_stated.values.copy()
     values[moved], covariance = repeats.amounts(moved, sigmas)
-    return Built(every, structure.with_values(values), moved, covariance)
+    return Construction(every, structure.with_values(values), moved, covariance)
 
 
 def some_sights(sights: Sights, most: int) -> Sights:
@@ -396,7 +396,7 @@ def some_sights(sights: Sights, most: int) -> Sights:
 
 
 def _equations(
-    stated: Structure, end: RobustSolution, sights: Sights, views: OfViews | None = None
+    stated: Structure, end: RobustSolution, sights: Sights, views: ViewEffects | None = None
 ) -> tuple[Equations, Weights]:
     """Of some sights, with the residuals to the drawing: offsets that were found before, and what displaces views, are
     not taken off.

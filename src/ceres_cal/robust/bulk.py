@@ -20,7 +20,7 @@ from ceres_cal.problem import Estimate, Layout, Problem, Solution, SolveProgress
 from ceres_cal.problem.engines import InProcess, OnWorkers, SharedObservations, of_world
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Residuals, relative_lengths, residuals
-from ceres_cal.problem.shares import Histogram, Looked, Share, ShareRequest, Used, cut
+from ceres_cal.problem.shares import Histogram, ResidualSummary, RowSelection, Share, ShareRequest, cut
 from ceres_cal.robust.noise import SAME, Inliers, NoiseScales, Redundancy, by_count, by_leverage, noise_of
 from ceres_cal.robust.robust import RobustSolution, Rounds
 
@@ -41,7 +41,7 @@ class Subset(Frozen):
     gone: Mask | None = None
 
 
-class Settled(Frozen):
+class BulkSolution(Frozen):
     """Where all observations were solved for.
 
     Attributes:
@@ -50,7 +50,7 @@ class Settled(Frozen):
 
     observations: Observations
     end: RobustSolution
-    used: Used
+    used: RowSelection
     explanations: tuple[Explanation, ...]
 
 
@@ -118,7 +118,7 @@ class Bulk:
         end: RobustSolution,
         explanations: Sequence[Explanation],
         progress: SolveProgress | None,
-    ) -> Settled:
+    ) -> BulkSolution:
         """All observations judged and solved for, from the end of a part.
 
         Args:
@@ -131,7 +131,7 @@ class Bulk:
             gone = np.any([mine for mine, _ in taken], axis=0)
             engine = self._engine_without(self._also(np.any([rows for _, rows in taken], axis=0)))
         rounds = _SumRounds(self, engine, replace(part, gone=gone), problem, end, progress)
-        return Settled(self.observations, rounds.end(), rounds.used(), every)
+        return BulkSolution(self.observations, rounds.end(), rounds.used(), every)
 
     def _rows_of(self, explanation: Explanation, part: Subset) -> Mask:
         """(N + M,) all observations of a whole of which the part has some."""
@@ -157,7 +157,7 @@ class Bulk:
     def look(
         self, engine: InProcess | OnWorkers, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
         along: tuple[tuple[str, Estimate], ...] = (),
-    ) -> tuple[str, Looked]:  # fmt: skip
+    ) -> tuple[str, ResidualSummary]:  # fmt: skip
         """What residuals are like at an estimate, which is given a name. along: where feet were sought before."""
         here = uuid4().hex, of_world(estimate)
         blank = Layout({}, frozenset(), frozenset())
@@ -171,7 +171,7 @@ class _BulkResiduals(Frozen):
 
     name: str
     estimate: Estimate
-    looked: Looked
+    looked: ResidualSummary
     here: Residuals
     lengths: tuple[Array, Array]
     placed: tuple[Mask, Mask]
@@ -295,16 +295,16 @@ class _SumRounds(Rounds[_SumRound]):
         rounds = before.rounds + state.rounds
         return RobustSolution(problem, state.solution, inliers, state.residuals, rounds, state.reduced)
 
-    def used(self) -> Used:
+    def used(self) -> RowSelection:
         """What takes part at the end, of the world."""
         judged = self._judged(self._seen, self._noise)
         assert isinstance(judged.elsewhere, SharedObservations)
         used = self._engine.ask(Share.used, judged.elsewhere.asked(judged, self._seen.estimate)) + self._used_here()
         (p, c), (far_p, far_c) = used.rows, used.sigmas
         first, then = np.argsort(p), np.argsort(c)
-        return Used(used.sums, (p[first], c[then]), (far_p[first], far_c[then]))
+        return RowSelection(used.sums, (p[first], c[then]), (far_p[first], far_c[then]))
 
-    def _used_here(self) -> Used:
+    def _used_here(self) -> RowSelection:
         """The same of what is not of the world."""
         sums, rows, sigmas = [], [], []
         columns = self._few.points, self._few.curves
@@ -322,7 +322,7 @@ class _SumRounds(Rounds[_SumRound]):
             sums.append((np.count_nonzero(inside), np.sum(px[inside] ** 2), np.sum(column.sigma_px[inside] ** 2)))
             rows.append(row[placed & ~inside])
             sigmas.append(lengths[placed & ~inside])
-        return Used(np.array(sums, dtype=float), (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+        return RowSelection(np.array(sums, dtype=float), (rows[0], rows[1]), (sigmas[0], sigmas[1]))
 
 
 def _bounds(end: RobustSolution) -> tuple[float, float]:

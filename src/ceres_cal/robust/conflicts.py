@@ -73,7 +73,7 @@ def linear_rest(statement: Statement, end: RobustSolution, near: RobustSolution 
     """
     estimate, freedom = end.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
-        reduced = end.told
+        reduced = end.information
         stated = Information.nothing(statement.keys).beside_all(prior.information for prior in statement.priors)
         at = reduced.shared.columns(stated.keys)
         slope = np.zeros(len(stated.keys))
@@ -126,7 +126,7 @@ def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 def rest_at(statement: Statement, end: RobustSolution, known: Information | None = None) -> Rest:
     """Where a problem without the statement was solved, by what is known of its numbers there; else by the model."""
-    reduced = end.told
+    reduced = end.information
     freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     known = (known or reduced.shared).marginal(statement.keys)
     return Rest(end.estimate, np.zeros(len(statement.keys)), known, freedom)
@@ -240,7 +240,7 @@ def find_conflicts(
     every = tuple(statements(problem, end.estimate))
     if not every:
         return Conflicts()
-    reduced = end.told
+    reduced = end.information
     search = _ForwardSelection(problem, end, solver, every, shifts_at, near)
     while search.solves < most and search.leave_out_the_worst():
         pass
@@ -310,11 +310,11 @@ class _ForwardSelection:
     def __post_init__(self) -> None:
         self.left, self.solves = list(self.every), 0
         if self.near is not None:
-            self.near = replace(self.near, reduced=self.near.told)
+            self.near = replace(self.near, reduced=self.near.information)
         self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
         self.doubts: list[Doubt] = []
         self._level = float(np.log(LEVEL / len(self.every)))
-        self._first = self.end.told
+        self._first = self.end.information
         self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.estimate
 
     def leave_out_the_worst(self) -> bool:
@@ -367,7 +367,7 @@ class _ForwardSelection:
         """
         near = self.near
         test = worst_test(one, linear_rest(one, self.end, near))
-        if near is None or one.kind not in ("prior", "fixed") or not {*one.keys} <= {*near.told.shared.keys}:
+        if near is None or one.kind not in ("prior", "fixed") or not {*one.keys} <= {*near.information.shared.keys}:
             return test
         said = near.problem.priors_at(near.estimate)
         loose = replace(one, priors=tuple(prior for prior in said if {*one.keys} & {*prior.keys}))
@@ -420,7 +420,7 @@ class _ForwardSelection:
     def _known(self, end: RobustSolution) -> Information:
         """About the shared numbers at an end, as the observations scatter."""
         estimate = end.estimate
-        reduced = end.told
+        reduced = end.information
         known = scattered(reduced, measure_scatter(end.problem, end.residuals, estimate, reduced))
         if self.shifts_at is None:
             return known

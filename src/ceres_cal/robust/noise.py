@@ -340,7 +340,7 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
 # them, at the standard deviation of that (Cook and Weisberg 1982, Residuals and Influence in Regression, 2.2).
 
 
-class Fitted(Frozen):
+class InlierFit(Frozen):
     """An estimate of some observations, and what these say there.
 
     Attributes:
@@ -355,7 +355,7 @@ class Fitted(Frozen):
     reduced: ReducedInformation
 
 
-def by_deleted_residuals(inliers: Inliers, fitted: Fitted) -> Inliers:
+def by_deleted_residuals(inliers: Inliers, fitted: InlierFit) -> Inliers:
     """The inliers by deleted residuals, where the residuals alone, by which these are, leave it in doubt."""
     # Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it says more of
     # its place than all others, and then nobody knows which of the two is wrong.
@@ -369,7 +369,7 @@ def by_deleted_residuals(inliers: Inliers, fitted: Fitted) -> Inliers:
     return inliers.with_rows(rows)
 
 
-def deleted_lengths(rows: Mask, weighting: Weighting, fitted: Fitted) -> tuple[Indices, Array]:
+def deleted_lengths(rows: Mask, weighting: Weighting, fitted: InlierFit) -> tuple[Indices, Array]:
     """Of some of the observations (N + M,), whose residuals are finite: which one each is, and the length of its
     deleted residual in that one's standard deviations.
     """

@@ -18,7 +18,7 @@ from ceres_cal.problem import Estimate, Problem, Solution, SolveProgress, Weight
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, residuals_alone
 from ceres_cal.robust.noise import (
-    Fitted,
+    InlierFit,
     Inliers,
     Redundancy,
     by_count,
@@ -59,7 +59,7 @@ class RobustSolution(Frozen):
         return self.solution.estimate
 
     @cached_property
-    def told(self) -> ReducedInformation:
+    def information(self) -> ReducedInformation:
         """What observations and priors say there."""
         return self.reduced or information(self.problem, self.estimate)
 
@@ -314,7 +314,7 @@ class _RowRounds(Rounds[RobustSolution]):
         self._redundancy = by_leverage((2 * len(sights.point_rows), len(sights.curve_rows)), taken)
         inliers, rows = self._judge(state.solution, state.residuals), state.inliers.rows
         estimate, there = state.estimate, state.residuals
-        fitted = Fitted(self._problem, estimate, there, rows, reduced)
+        fitted = InlierFit(self._problem, estimate, there, rows, reduced)
         return by_deleted_residuals(inliers, fitted), reduced
 
     def _judged(

@@ -52,7 +52,7 @@ from ceres_cal.effects.table.lens import lens_changes
 from ceres_cal.observations import Observations
 from ceres_cal.problem import Estimate, Key, Problem, free_keys
 from ceres_cal.problem.residuals import Equations, Residuals, residuals, write_equations
-from ceres_cal.robust.as_built import OfViews
+from ceres_cal.robust.as_built import ViewEffects
 from ceres_cal.robust.robust import RobustSolution
 
 MOVES, ROLLING = "principal point moves", "rolling shutter"
@@ -87,7 +87,7 @@ Sizes = Mapping[str, float]
 """Sigma, px, of each likely kind of a camera's coefficients."""
 
 
-class Unsteady(Frozen):
+class ViewDisplacement(Frozen):
     """By how much views are displaced, of cameras whose principal point moves or whose shutter rolls.
 
     Attributes:
@@ -109,9 +109,9 @@ class Unsteady(Frozen):
         return replace(problem, sights=sights, taken_up=self.taken_up)
 
     @property
-    def of_views(self) -> OfViews:
+    def of_views(self) -> ViewEffects:
         """The same where something else is asked."""
-        return OfViews(self.displacement, self._columns)
+        return ViewEffects(self.displacement, self._columns)
 
     def _columns(self, model: Linearised) -> tuple[SparseColumns, Others]:
         columns, keys = _of_views(model), model.equations.sights.keys
@@ -147,7 +147,7 @@ def _centre_moves(sizes: Sizes) -> bool:
     return sizes.get(_CENTRE_OF_VIEW, 0.0) > _LEAST_PX
 
 
-def find_unsteady(problem: Problem, end: RobustSolution, before: Unsteady | None) -> Unsteady | None:
+def find_unsteady(problem: Problem, end: RobustSolution, before: ViewDisplacement | None) -> ViewDisplacement | None:
     """What is found of cameras whose views are likely to be displaced; None where none is.
 
     Args:
@@ -204,7 +204,7 @@ def _equations(
     estimate: Estimate,
     there: Residuals,
     weights_of: Callable[[Equations], Weights],
-    before: Unsteady | None,
+    before: ViewDisplacement | None,
     problem: Problem,
     seen_once: Collection[str | None],
 ) -> tuple[Equations, Weights]:
@@ -296,7 +296,7 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
     return (found if rolling or _centre_moves(found) else {}), repeated.noise
 
 
-class _Told(Frozen):
+class _ViewSums(Frozen):
     """What the equations of each of S views say of its C coefficients beyond its pose, and of P shared directions.
 
     Attributes:
@@ -345,7 +345,7 @@ class _Told(Frozen):
         return squares(alone - across.transpose(0, 2, 1) @ self.left_open @ across) / squares(alone)
 
 
-def _told(own: Linearised, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float) -> _Told:
+def _told(own: Linearised, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float) -> _ViewSums:
     """At these sizes and a mean square of the noise."""
     equations, image_px = own.equations, max(one.get(_IMAGE, _NONE_PX) for one in sizes.values())
     model = own.with_columns(smooth_image(equations, estimate), image_px / np.sqrt(noise))
@@ -357,16 +357,16 @@ def _told(own: Linearised, estimate: Estimate, sizes: Mapping[str, Sizes], noise
     sigma = np.array([_of_sight(sizes.get(key.camera, {}) if key.placement else {}) for key in equations.sights.keys])
     width = modes.shape[1]
     left_open = inverse_of(products[:, :width, :width] + np.eye(width) * sigma[:, None] ** -2.0)
-    return _Told(model, modes, products, left_open)
+    return _ViewSums(model, modes, products, left_open)
 
 
 def _predicted(
     own: Linearised, problem: Problem, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float
-) -> Unsteady:
+) -> ViewDisplacement:
     """The best linear unbiased predictions at these sizes and a mean square of the noise, everything that is free at
     its best beside them.
 
-    Of the shared directions 1 - sum of G^T C G is known (see `_Told`), and what follows of these goes back into the
+    Of the shared directions 1 - sum of G^T C G is known (see `_ViewSums`), and what follows of these goes back into the
     coefficients.
     """
     equations, all_told = own.equations, _told(own, estimate, sizes, noise)
@@ -377,7 +377,7 @@ def _predicted(
     coefficients = through @ (covariance @ step) - (all_told.left_open @ slope)[:, :, 0]
     moved = np.sum(modes * coefficients[equations.sight], axis=1)
     moved = model.beyond_private((moved * model.weight)[:, None])[:, 0] / model.weight  # what poses do not follow
-    return Unsteady(
+    return ViewDisplacement(
         sizes,
         equations.displacement(moved, problem.observations.rows),
         float(np.einsum("sij,sji->", all_told.told, all_told.left_open)),

@@ -135,12 +135,12 @@ def all_shown(camera: Camera, sights: Sights) -> bool:
 
 
 def require_usable(
-    end: RobustSolution, problem: Problem, wholes: Sequence[Mask], *, is_refit: bool = False
+    end: RobustSolution, problem: Problem, groups: Sequence[Mask], *, is_refit: bool = False
 ) -> tuple[str, ...]:
     """Warnings about the solution; SolutionError where it must not be used.
 
     Args:
-        wholes: (N + M,) of each the observations that were taken out as one. is_refit: whether the lens was chosen
+        groups: (N + M,) of each the observations that were taken out as one. is_refit: whether the lens was chosen
             before.
     """
     instead = "choose fewer or other coefficients, or observe nearer to the corners"
@@ -174,7 +174,7 @@ def require_usable(
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
             f"observations reach {observed.reach_px:.0f} px"
         )
-    return (*warnings, *_lost(end.inliers, problem, wholes))
+    return (*warnings, *_lost(end.inliers, problem, groups))
 
 
 def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
@@ -189,10 +189,10 @@ def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
     return bool(off_px > _UNUSUAL * np.hypot(*size) and other_px < _NEARER * off_px)
 
 
-def _lost(inliers: Inliers, problem: Problem, wholes: Sequence[Mask]) -> Iterator[str]:
+def _lost(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterator[str]:
     """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
     used = inliers.rows
-    for rows in wholes:
+    for rows in groups:
         used |= rows
     sights = problem.sights
     shares = sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])

@@ -26,7 +26,7 @@ from ceres_cal.start.closed_forms import (
     poses_from_homographies,
 )
 from ceres_cal.start.planes import Homographies, profile_and_homographies
-from ceres_cal.start.world import CameraPlace, Placed, beforehand, chained_poses, left_of, placed
+from ceres_cal.start.world import CameraPlace, CameraPlaces, beforehand, chained_poses, left_of, placed
 
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
@@ -195,7 +195,7 @@ def _start_camera(
     of_world = sorted((n for n, key in enumerate(sights.keys) if key.placement is None), key=lambda n: -sizes[n])
     # Boards tell phi and lens better than what no homography explains.
     told = phi_from == "fixed" or (phi_from != "guess" and len(homographies.sights) > 1)
-    found: dict[int, Placed] = {}
+    found: dict[int, CameraPlaces] = {}
     for number in of_world:
         known = beforehand(priors, sights.keys[number].station, _known_phi(phi, told, unit, priors))
         may_bend = given is None and not told

@@ -19,7 +19,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Indices, Mask, rotation_exp, skews
 from ceres_cal.observations import joined
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
-from ceres_cal.start.sightlines import LEAST_PX, Beforehand, Candidates, Sightlines
+from ceres_cal.start.sightlines import LEAST_PX, CameraPrior, Candidates, Sightlines
 
 _PHI_GRID = (0.45, 0.8, 1.4, 2.4, 4.2, 7.0)  # in half image diagonals
 _TILTS = tuple(np.deg2rad((0.0, 18.0, 36.0, 54.0, 70.0, 82.0)))
@@ -211,7 +211,7 @@ def apart(poses: Candidates, costs: Array, least: float) -> Indices:
     return np.array(kept, dtype=np.int64)
 
 
-def _logs(known: Beforehand, grid: Array) -> Array:
+def _logs(known: CameraPrior, grid: Array) -> Array:
     """Logarithms of phi to try, of a grid in half image diagonals; one where phi is told."""
     middle, sd = known.log_phi
     return middle + np.log(grid) - np.log(1.1) if sd > 0.2 else np.array([middle])

@@ -49,7 +49,7 @@ class Candidates(Rows):
         )
 
 
-class Beforehand(Frozen):
+class CameraPrior(Frozen):
     """What is known of a camera beforehand: means and standard deviations, infinite where nothing is, 0 where a number
     is held; and the least scale that residuals can have.
     """
@@ -91,7 +91,7 @@ class Sightlines(Frozen):
         counts: of points, lines and arcs. curve: (N,) which feature each row belongs to.
     """
 
-    known: Beforehand
+    known: CameraPrior
     pixels: Array
     w: Array
     slope: Array
@@ -128,7 +128,7 @@ class Sightlines(Frozen):
         return 2 * self.counts[0] + 2 * len(straight) + 5 * len(distinct(self.curve[self._arcs]))
 
     @classmethod
-    def of_points(cls, known: Beforehand, pixels: Array, places: Array, unit_px: float, bend: float) -> Sightlines:
+    def of_points(cls, known: CameraPrior, pixels: Array, places: Array, unit_px: float, bend: float) -> Sightlines:
         """Of places (N, 3) m alone, seen at offsets (N, 2) px by a lens of which w is 1 + bend (r / unit_px)^2."""
         twice, count, bent = np.vstack([pixels, pixels]), len(pixels), bend / unit_px**2
         w, slope = 1.0 + bent * np.sum(twice**2, axis=1), np.full(2 * count, 2.0 * bent)

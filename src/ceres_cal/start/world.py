@@ -16,7 +16,7 @@ from ceres_cal.observations import Prior, Sights
 from ceres_cal.problem.parameters import Station, anchored_stations
 from ceres_cal.start.closed_forms import RadialProfile
 from ceres_cal.start.search import BestCameras, apart, best_of, information, searched
-from ceres_cal.start.sightlines import Beforehand, Candidates, Sightlines
+from ceres_cal.start.sightlines import CameraPrior, Candidates, Sightlines
 
 _MOST = (20, 12)  # points, and places of each curve, by which a camera is searched for
 _HOLDS = 0.7  # share of a proposal's rows that lie near: a fifth and more may be gross errors, of all features alike
@@ -42,7 +42,7 @@ class CameraPlace(Frozen):
     profile: RadialProfile
 
 
-class Placed(Frozen):
+class CameraPlaces(Frozen):
     """The places that a sight may be seen from, the likeliest first.
 
     Attributes:
@@ -54,7 +54,7 @@ class Placed(Frozen):
     tells_phi: bool
 
 
-def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float]) -> Beforehand:
+def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, float]) -> CameraPrior:
     """What is stated of a station's place, and this of phi."""
     least_sd = 1e-3  # of a stated number, as a share: a start is no better
     position, sd = np.zeros(3), np.full(3, np.inf)
@@ -63,19 +63,19 @@ def beforehand(priors: Iterable[Prior], station: str, log_phi: tuple[float, floa
             numbers = slice(3 - len(prior.value), 3)
             position[numbers] = prior.value
             sd[numbers] = np.maximum(prior.sigma, least_sd * max(abs(prior.value[-1]), least_sd))
-    return Beforehand(position, sd, log_phi, 0.0)
+    return CameraPrior(position, sd, log_phi, 0.0)
 
 
 def placed(
     sight: Sights,
     profile: RadialProfile,
-    known: Beforehand,
+    known: CameraPrior,
     proposed: Array | None,
     log_phi: float,
     *,
     may_bend: bool,
     may_search: bool = True,
-) -> Placed:
+) -> CameraPlaces:
     """The places of a camera by one sight about it.
 
     Args:
@@ -131,7 +131,7 @@ def _at_rest(
 
 
 def _searched(
-    sight: Sights, profile: RadialProfile, known: Beforehand, given: Candidates, axes: tuple[float, float]
+    sight: Sights, profile: RadialProfile, known: CameraPrior, given: Candidates, axes: tuple[float, float]
 ) -> tuple[Sightlines, RadialProfile, BestCameras]:
     """`axes`: which way the picture's x and y point."""
     few = 8, 4  # points, and places of each curve, for the first rounds of a search
@@ -140,13 +140,13 @@ def _searched(
     return lines, profile, searched(lines, some, given)
 
 
-def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> Placed:
+def _answered(lines: Sightlines, profile: RadialProfile, found: BestCameras) -> CameraPlaces:
     """With what the best place leaves open, and the others that fit alike."""
     finest_px = 1e-2  # of a scale: exact data are told no better
     best, scale = found.poses.take(np.array([0])), max(found.scale_px, finest_px)
     matrix = information(lines, best, scale)
     places = tuple(_place(found.poses, number, profile) for number in apart(found.poses, found.costs, _APART))
-    return Placed(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
+    return CameraPlaces(places, open_numbers(matrix), _sd_of(matrix, 6) < _TOLD)
 
 
 def holds(lines: Sightlines, found: BestCameras) -> bool:
@@ -191,7 +191,7 @@ def left_of(sight: Sights, place: CameraPlace) -> Array:
     """
     points, some = chosen = _rows_of(sight, (len(sight.points), len(sight.on_arc)))
     log_phi = float(np.log(place.phi))
-    held = Beforehand(np.zeros(3), np.full(3, np.inf), (log_phi, 0.0), 0.0)
+    held = CameraPrior(np.zeros(3), np.full(3, np.inf), (log_phi, 0.0), 0.0)
     lines, there = _lines_of(sight, place.profile, held, chosen), _candidate(place.pose, log_phi)
     sigma_px = np.concatenate([sight.sigma_px[points], sight.sigma_px[points], sight.curve_sigma_px[some]])
     return np.asarray(np.where(lines.seen(there), np.abs(lines.distances(there)), np.inf)[0] / sigma_px)
@@ -217,7 +217,7 @@ def _rows_of(sight: Sights, most: tuple[int, int] = _MOST) -> tuple[Indices, Ind
     return points, some[np.argsort(sight.on_arc[some], kind="stable")]
 
 
-def _lines_of(sight: Sights, profile: RadialProfile, known: Beforehand, chosen: tuple[Indices, Indices]) -> Sightlines:
+def _lines_of(sight: Sights, profile: RadialProfile, known: CameraPrior, chosen: tuple[Indices, Indices]) -> Sightlines:
     """Of the chosen rows, see `_rows_of`."""
     (points, some), tracks = chosen, sight.track_index
     arcs = int(np.count_nonzero(sight.on_arc[some]))

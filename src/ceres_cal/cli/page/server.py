@@ -17,7 +17,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from ceres_cal.base.errors import InputError, answer_or_reason
 from ceres_cal.cli.page.session import Session
-from ceres_cal.cli.page.state import Change, Do, Drag, Message, read_message
+from ceres_cal.cli.page.state import ButtonPress, Change, Drag, Message, read_message
 from ceres_cal.detect.images import read_colour
 from ceres_cal.report.pictures.frames import jpeg_of_at_most
 
@@ -38,7 +38,7 @@ _HEADERS = {
 }
 _WIDEST_PX, _MOST_JPEG = 6000, 12_000_000
 _T = TypeVar("_T")
-_AT_LENGTH: Mapping[str, tuple[str, Callable[[Session, Do], None]]] = {
+_AT_LENGTH: Mapping[str, tuple[str, Callable[[Session, ButtonPress], None]]] = {
     "find": ("the lines are being found", lambda session, _: session.find(auto=False)),
     "auto": ("the field is being looked for", lambda session, _: session.find(auto=True)),
     "check": ("the photograph is being compared", lambda session, asked: session.check(asked.photograph)),
@@ -132,9 +132,9 @@ class Server:
     async def _answer(self, window: web.WebSocketResponse, content: str | bytes) -> None:
         """What a message asks for; a refusal is a sentence to the window that sent it."""
         message, why = answer_or_reason(lambda: self._message(content))
-        if message == Do("end"):
+        if message == ButtonPress("end"):
             self.ended.set()
-        elif isinstance(message, Do) and message.what in _AT_LENGTH:
+        elif isinstance(message, ButtonPress) and message.what in _AT_LENGTH:
             await self._at_length(message)
         elif message is not None:
             answer, why = await self._quickly(partial(self._change, message))
@@ -149,7 +149,7 @@ class Server:
 
     def _message(self, content: str | bytes) -> Message:
         message = read_message(content)
-        if self._busy and message != Do("end"):
+        if self._busy and message != ButtonPress("end"):
             raise InputError(f"wait: {self._busy}")
         return message
 
@@ -162,9 +162,9 @@ class Server:
                 return None if message.last else {"is": "model", **session.model(message)}
             case Change():
                 session.change(message)
-            case Do(what="undo" | "redo" as what):
+            case ButtonPress(what="undo" | "redo" as what):
                 session.step(back=what == "undo")
-            case Do(what=what):
+            case ButtonPress(what=what):
                 raise InputError(f"the page has no button {what!r}")
         return None
 
@@ -187,7 +187,7 @@ class Server:
         if not self._busy:
             self._thinking = asyncio.create_task(wait())
 
-    async def _at_length(self, asked: Do) -> None:
+    async def _at_length(self, asked: ButtonPress) -> None:
         """Work in the other thread; meanwhile every window says what it is."""
         self._busy, work = _AT_LENGTH[asked.what]
 

@@ -17,7 +17,16 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.files import read_target
 from ceres_cal.cli.open_steps import make
-from ceres_cal.cli.page.state import Change, Drag, Made, Sitting, State, load_state, save_state, target_words
+from ceres_cal.cli.page.state import (
+    Change,
+    CommandResults,
+    Drag,
+    PageContext,
+    State,
+    load_state,
+    save_state,
+    target_words,
+)
 from ceres_cal.detect.photographs.by_hand import FEWEST
 from ceres_cal.observations import Observations, combine
 from ceres_cal.problem.parameters import Options
@@ -34,16 +43,16 @@ class _Moment(Frozen, eq=True):
 
     state: State
     base: scene.Camera | None = None
-    found: Found | None = None
-    made: Made | None = None
+    found: PageResult | None = None
+    made: CommandResults | None = None
     auto: bool = False
 
 
 class Session:
     """What the page works on. One thread at a time changes it: `lock` is held meanwhile."""
 
-    def __init__(self, sitting: Sitting, state: State) -> None:
-        self.sitting: Sitting = sitting
+    def __init__(self, sitting: PageContext, state: State) -> None:
+        self.sitting: PageContext = sitting
         self.lock: Any = threading.RLock()
         self.revision: int = 0
         self.message: str = ""
@@ -167,7 +176,7 @@ class Session:
             made = make(self.sitting, moment.state, target, Path(folder), auto=auto)
             observations = combine([Observations.load(Path(folder) / name) for name in made.observed])
             calibration = Calibration.load(made.calibration)
-            found = Found(calibration, observations, report.known_of(report.quality_of(calibration, observations)))
+            found = PageResult(calibration, observations, report.known_of(report.quality_of(calibration, observations)))
         with self.lock:
             if self._now is not moment:
                 raise InputError("it was changed meanwhile: find the lines again")
@@ -313,7 +322,7 @@ class Session:
         return {one.name: _lines(report.model_of(found.calibration, one)) for one in frames if one.shown}
 
 
-class Found(Struct, frozen=True, eq=False):
+class PageResult(Struct, frozen=True, eq=False):
     """What came of "find the lines"; `known`: what is said of it."""
 
     calibration: Calibration
@@ -351,7 +360,7 @@ def _about(target: scene.Target, words: str) -> dict[str, Any]:
     }
 
 
-def opened(sitting: Sitting, first: State) -> Session:
+def opened(sitting: PageContext, first: State) -> Session:
     """The session of a folder: what was kept there goes on, unless the command line says another field."""
     kept = sitting.folder / KEPT
     state = load_state(kept) if kept.exists() else first

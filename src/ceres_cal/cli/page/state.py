@@ -73,7 +73,7 @@ class State(Struct, frozen=True, forbid_unknown_fields=True):
     exports: Annotated[tuple[Name, ...], FEW] = ()
 
 
-class Sitting(Struct, frozen=True):
+class PageContext(Struct, frozen=True):
     """What does not change while the page is open.
 
     Attributes:
@@ -90,7 +90,7 @@ class Sitting(Struct, frozen=True):
     other: Path | None = None
 
 
-class Made(Struct, frozen=True):
+class CommandResults(Struct, frozen=True):
     """What the commands made of a state.
 
     Attributes:
@@ -141,14 +141,14 @@ class Drag(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag=
         return msgspec.structs.replace(state, places=tuple(places))
 
 
-class Do(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="now"):
+class ButtonPress(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do", tag="now"):
     """A button: what is to be done with the state as it is."""
 
     what: str
     photograph: Annotated[int, Meta(ge=0, le=10_000)] = 0
 
 
-Message = Change | Drag | Do
+Message = Change | Drag | ButtonPress
 _MESSAGES = msgspec.json.Decoder(Message)
 
 

@@ -21,7 +21,7 @@ from ceres_cal.scene import Camera, Radial, Target, curve_points, require_featur
 from ceres_cal.start.closed_forms import RADII, LensProfile
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.start.search import searched
-from ceres_cal.start.sightlines import Beforehand, Sightlines
+from ceres_cal.start.sightlines import CameraPrior, Sightlines
 
 FORMAT, VERSION = "ceres-cal/corners", 1
 # How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
@@ -122,7 +122,7 @@ def _with_stretch(stretch: float, pixels: Array, plane: Array, image_size: tuple
     middle, half = 0.5 * (np.array(image_size) - 1.0), 0.5 * float(np.hypot(*image_size))
     offsets, bend = pixels - middle, 1.0 / stretch - 1.0
     usual = float(np.log(USUAL_PHI * half)), float(np.log(USUAL_PHI_FACTOR))
-    known = Beforehand(np.zeros(3), np.full(3, np.inf), usual, 0.0, least_px=0.5 * SIGMA_PX)
+    known = CameraPrior(np.zeros(3), np.full(3, np.inf), usual, 0.0, least_px=0.5 * SIGMA_PX)
     lines = Sightlines.of_points(known, offsets, plane, half, bend)
     best = searched(lines, lines).poses
     rotation, phi = best.rotations[0].T, float(np.exp(best.log_phi[0]))

@@ -9,7 +9,7 @@ from time import thread_time
 import numpy as np
 
 from ceres_cal.base import Array, Array32, Frozen, Mask, Pose, chained, field, inverted, replace
-from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.photographs.grid import Facing, LineGrid, grid_of, offsets_of
 from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, StrokeMap, lines_seen, match
 from ceres_cal.detect.photographs.painted import likelihoods_of_places
@@ -59,7 +59,7 @@ class FieldSearch(Frozen):
     Attributes:
         asked: what is known of it. others: the target drawn with other lengths, where some are not known.
         until_s: of this thread's processor time, after which no further camera is looked at.
-        looked_at: cameras of candidates so far. reached: what was followed. refused: those of it that are surely not
+        cameras: cameras of candidates so far. reached: what was followed. refused: those of it that are surely not
             the field.
     """
 
@@ -69,9 +69,9 @@ class FieldSearch(Frozen):
     asked: Auto
     others: tuple[LineGrid, ...] = ()
     until_s: float = np.inf
-    looked_at: list[Camera] = field(default_factory=list)
-    reached: list[Followed] = field(default_factory=list)
-    refused: list[Followed] = field(default_factory=list)
+    cameras: list[Camera] = field(default_factory=list)
+    reached: list[FieldLines] = field(default_factory=list)
+    refused: list[FieldLines] = field(default_factory=list)
 
     @property
     def is_out_of_time(self) -> bool:
@@ -155,9 +155,9 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
             break
     distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.grid.turns, _COMPARABLE)
     likely = _likely(search, [(camera, drawn[id(camera)]) for camera in distinct])
-    before = _poses(search.looked_at)
+    before = _poses(search.cameras)
     new = [one for one in likely if not np.any(_same_place(one[0].cam_from_world.matrix, before, search.grid.turns))]
-    search.looked_at.extend(camera for camera, _ in new)
+    search.cameras.extend(camera for camera, _ in new)
     return new
 
 

@@ -25,8 +25,8 @@ from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.median import MOST_PICTURES, merged
 from ceres_cal.detect.photographs.by_hand import STRETCH, Clicks, starts_from_clicks
 from ceres_cal.detect.photographs.candidates import Auto, prepare_search
+from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.photographs.follow import follow
-from ceres_cal.detect.photographs.followed import Followed
 from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import OTHER, SearchResult, SeveralWaysError, search
@@ -58,7 +58,7 @@ class FieldDetections(Frozen):
     """
 
     observations: Observations
-    found: dict[str, Followed]
+    found: dict[str, FieldLines]
     missed: tuple[tuple[str, str], ...]
     searched: dict[str, SearchResult]
 
@@ -235,7 +235,7 @@ def _signs(grey: Array32, *, is_near: bool) -> Iterator[tuple[bool, Strokes | No
         yield is_near or dark <= light, strokes[is_near or dark <= light]
 
 
-def _found(prior: Prior, followed: Followed) -> Prior:
+def _found(prior: Prior, followed: FieldLines) -> Prior:
     """What is known of a length; where nothing is, a calibration starts from what was found."""
     return replace(prior, value=(followed.target.dimensions[prior.quantity],)) if prior.is_open else prior
 
@@ -309,7 +309,7 @@ def _looked_from(
     grey: Array32,
     target: Target,
     painted: tuple[str, ...],
-    start: Start | Followed | None,
+    start: Start | FieldLines | None,
     options: FieldOptions,
     strokes: Strokes | None,
 ) -> SearchResult:
@@ -318,7 +318,7 @@ def _looked_from(
     if isinstance(start, Auto):
         return search(grey, target, painted, replace(start, lengths=lengths), strokes)
     assert start is not None  # an image that showed it
-    target = start.target if isinstance(start, Followed) else target
+    target = start.target if isinstance(start, FieldLines) else target
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), lengths)
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
     if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
@@ -339,13 +339,13 @@ def _looked_from(
 
 
 @or_none  # reads: "its lines were not found ..."
-def _is_worn(grey: Array32, followed: Followed) -> bool:
+def _is_worn(grey: Array32, followed: FieldLines) -> bool:
     """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
     return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves, Auto()), followed)
 
 
 def _starts(
-    start: Camera | Clicks | Followed, target: Target, size: tuple[int, int], lengths: tuple[Prior, ...]
+    start: Camera | Clicks | FieldLines, target: Target, size: tuple[int, int], lengths: tuple[Prior, ...]
 ) -> tuple[list[Camera], FreeIntrinsics]:
     """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to.
 
@@ -354,17 +354,17 @@ def _starts(
     """
     if isinstance(start, Clicks):
         return starts_from_clicks(start, target, size, lengths)
-    camera = start.camera if isinstance(start, Followed) else start
+    camera = start.camera if isinstance(start, FieldLines) else start
     if camera.image_size != size:
         width, height = camera.image_size
         other = f"but the camera has {width} x {height}: start from a calibration of this camera"
-        if isinstance(start, Followed):
+        if isinstance(start, FieldLines):
             other = "unlike the images before: give it on its own"
         raise InputError(f"{size[0]} x {size[1]} px, {other}")
     return [camera], FreeIntrinsics(priors=lengths)
 
 
-def _observations(frame: str, followed: Followed, target: Target, options: FieldOptions) -> Observations:
+def _observations(frame: str, followed: FieldLines, target: Target, options: FieldOptions) -> Observations:
     """One image's view: what its lines and crossings are, each pixel counted once.
 
     Curves that lie beside their drawing are straight and round nevertheless: they tell the lens, under an offset.

@@ -15,7 +15,7 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_built
 from ceres_cal.detect.photographs.beside import among_others
-from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.photographs.painted import painted_curves, visible_curves
 from ceres_cal.detect.photographs.refit import (
     TARGET,
@@ -53,12 +53,12 @@ _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX = 0.1  # lines that are predicted so little elsewhere are not measured again: they are found up to 5 px off
 _SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
 
-Made = TypeVar("Made")
+_T = TypeVar("_T")
 
 
 def follow(
     grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], free: FreeIntrinsics | None = None
-) -> Followed:
+) -> FieldLines:
     """Follow a target's painted curves in a photograph, from the best of several starts.
 
     A start that is near is taken at once; else shifts, turns and scales of it are tried, by 130 px and 7.5 degrees.
@@ -67,7 +67,7 @@ def follow(
         starts: posed cameras, any of which may be right. curves: names of those that are painted.
 
     Returns:
-        The best that was reached; whether it is the field, `Followed.holds` tells.
+        The best that was reached; whether it is the field, `FieldLines.holds` tells.
     """
     tracker = Tracker(grey, target, curves, free or FreeIntrinsics())
     tried = tracker.tried(starts)
@@ -99,17 +99,17 @@ class Tracker:
     curves: Collection[str]
     free: FreeIntrinsics
     missing: tuple[str, ...] = ()
-    reached: list[Followed] = field(default_factory=list)
+    reached: list[FieldLines] = field(default_factory=list)
     known: list[tuple[Camera, tuple[object, ...], Any]] = field(default_factory=list)
     is_even: bool = False
 
-    def approached(self, camera: Camera) -> Followed:
+    def approached(self, camera: Camera) -> FieldLines:
         """`follow` from one start, up to where the lens remains that it started from. What others led to, and leads to
         again, is not followed to its end.
         """
         return next(self.tried([camera]))
 
-    def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> Followed:
+    def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> FieldLines:
         """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside, as
         drawn next to where lines were followed that look like another field's, or in a picture that was stretched.
 
@@ -121,10 +121,10 @@ class Tracker:
         tracker = replace(tracker, is_even=lines.is_even)  # the picture has coma, or none, wherever its lines are now
         return tracker.told(tracker.followed(camera, lines))
 
-    def followed(self, camera: Camera, lines: Lines) -> Followed:
+    def followed(self, camera: Camera, lines: Lines) -> FieldLines:
         """What was measured from a camera."""
         visible = visible_curves(self.grey, self.target, camera, self.curves)
-        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, visible)
+        return FieldLines(camera, self.target, tuple(self.curves), self.missing, lines, visible)
 
     def of_painted(self, camera: Camera) -> Tracker:
         """The same without what the target may lack and this camera does not see."""
@@ -137,9 +137,9 @@ class Tracker:
         names = [name for part in parts for name in part]
         return replace(self, curves=[one for one in self.curves if one not in names], missing=tuple(names))
 
-    def tried(self, starts: Sequence[Camera]) -> Iterator[Followed]:
+    def tried(self, starts: Sequence[Camera]) -> Iterator[FieldLines]:
         """What is reached from the starts: what is surely the field at once, then the others, the best first."""
-        is_sure: dict[Followed, bool] = {}
+        is_sure: dict[FieldLines, bool] = {}
         for one in self._reached(starts):
             if one not in is_sure:
                 is_sure[one] = one.is_sure
@@ -148,7 +148,7 @@ class Tracker:
         left = [one for one in is_sure if not is_sure[one]]
         yield from sorted(left, key=lambda one: (one.holds, one.share), reverse=True)
 
-    def _reached(self, starts: Sequence[Camera]) -> Iterator[Followed]:
+    def _reached(self, starts: Sequence[Camera]) -> Iterator[FieldLines]:
         if self.free.hints is None:
             yield self.close_in(starts[0], _NEAR_REACHES_PX)
             if self.free.keep:
@@ -180,7 +180,7 @@ class Tracker:
             refitted.append(camera if there is None else there[0])
         return refitted
 
-    def close_in(self, camera: Camera, reaches_px: Sequence[float]) -> Followed:
+    def close_in(self, camera: Camera, reaches_px: Sequence[float]) -> FieldLines:
         """Search ever nearer, freeing one intrinsic after the other; then measure and refit until at rest."""
         tracker = self
         for number, reach in enumerate(reaches_px):
@@ -197,13 +197,13 @@ class Tracker:
         self.reached.append(there)
         return there
 
-    def _reached_before(self, camera: Camera) -> Followed | None:
+    def _reached_before(self, camera: Camera) -> FieldLines | None:
         """What was at rest before, of the same lines, so near that it is where this camera would come to rest."""
         own = self.target.spec, tuple(self.curves)
         alike = [one for one in self.reached if (one.target.spec, one.curves) == own]
         return next((one for one in alike if moved_px(one.camera, camera, one.lines.course.pixels) < _SAME_PX), None)
 
-    def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
+    def at_rest(self, camera: Camera, names: tuple[str, ...]) -> FieldLines:
         """Measured and refitted, with these intrinsics free, until nothing moves any more, or no less than before."""
         return self._once(camera, (names,), lambda: self._at_rest(camera, names))
 
@@ -211,19 +211,19 @@ class Tracker:
         self,
         camera: Camera,
         what: tuple[object, ...],
-        made: Callable[[], Made],
-        is_same: Callable[[Camera, Made], bool] = lambda start, came: False,
-    ) -> Made:
+        made: Callable[[], _T],
+        is_same: Callable[[Camera, _T], bool] = lambda start, came: False,
+    ) -> _T:
         """What is made from a camera, or one that is the same, of these lines: they are asked for time and again."""
         asked = *what, tuple(self.curves), self.target.spec
         for start, before, came in self.known:
             if before == asked and (start is camera or is_same(start, came)):
-                return cast(Made, came)
+                return cast(_T, came)
         came = made()
         self.known.append((camera, asked, came))
         return came
 
-    def _at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
+    def _at_rest(self, camera: Camera, names: tuple[str, ...]) -> FieldLines:
         no_nearer = 0.8  # of the last step: lines that are taken in turns, or none that fit, come to no rest
         tracker, lines, moved, there = self, self.measured(camera), np.inf, camera
         for _ in range(_ROUNDS):
@@ -239,7 +239,7 @@ class Tracker:
                 break
         return tracker.followed(there, lines)
 
-    def refined(self, followed: Followed) -> Followed:
+    def refined(self, followed: FieldLines) -> FieldLines:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
         whole = self._with(followed)
         followed = whole.without_aside(followed)
@@ -257,7 +257,7 @@ class Tracker:
         stretched = whole.without_aside(left.with_best_lens(followed, is_stretched=True))
         return stretched if stretched.is_field else there
 
-    def farther(self, followed: Followed) -> Followed:
+    def farther(self, followed: FieldLines) -> FieldLines:
         """The same searched again from farther off, with its kind of lens: one that was too simple for a wide lens had
         the ends of lines elsewhere, and what is found next to there holds another one back.
         """
@@ -267,7 +267,7 @@ class Tracker:
         there = tracker.at_rest(camera, _free(camera))
         return there if there.may_be_worn and there.share > followed.share else followed
 
-    def as_drawn(self, other: Followed) -> Followed:
+    def as_drawn(self, other: FieldLines) -> FieldLines:
         """What looks like another field, or the one that is drawn, where all of its lines are there as well.
 
         A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
@@ -282,7 +282,7 @@ class Tracker:
         drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
-    def told(self, followed: Followed) -> Followed:
+    def told(self, followed: FieldLines) -> FieldLines:
         """The same refined, with square pixels; unless it is the field in a picture that was stretched one way, and
         square pixels suit clearly worse, by other dimensions as well, or show no field and no other dimensions either.
         """
@@ -295,27 +295,27 @@ class Tracker:
         stretched = self.refined(followed)
         return even if not stretched.is_field or (is_told and not self._suits_worse(nearest, stretched)) else stretched
 
-    def _suits_worse(self, one: Followed, other: Followed) -> bool:
+    def _suits_worse(self, one: FieldLines, other: FieldLines) -> bool:
         """Whether less paint is found where one has the lines than where another has them, or it lies off that."""
         return one.share < _KEPT * other.share or self._misfit(one) > _WORSE * self._misfit(other)
 
-    def _misfit(self, followed: Followed) -> float:
+    def _misfit(self, followed: FieldLines) -> float:
         return misfit(followed.camera, self._with(followed)._observed(followed.lines, followed.camera))
 
-    def _misfit_as_built(self, followed: Followed) -> float:
+    def _misfit_as_built(self, followed: FieldLines) -> float:
         """The same where its lines are followed to with the dimensions that they say."""
         return self._misfit(self.as_built(followed)[1])
 
-    def _with(self, followed: Followed) -> Tracker:
+    def _with(self, followed: FieldLines) -> Tracker:
         """The same for curves, and a target as drawn, as they were followed."""
         return replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
 
-    def squared(self, followed: Followed) -> Followed:
+    def squared(self, followed: FieldLines) -> FieldLines:
         """The same lines through a camera with square pixels."""
         camera = squared_pixels(followed.camera)
         return self._with(followed).at_rest(camera, _free(camera))
 
-    def without_aside(self, followed: Followed) -> Followed:
+    def without_aside(self, followed: FieldLines) -> FieldLines:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
         free = _free(followed.camera)
         whole, built = replace(self, target=followed.target), AS_DRAWN
@@ -334,7 +334,7 @@ class Tracker:
             beside = every.take(np.isin(every.course.curve, aside))
         return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
-    def as_built(self, followed: Followed) -> tuple[FieldAsBuilt, Followed]:
+    def as_built(self, followed: FieldLines) -> tuple[FieldAsBuilt, FieldLines]:
         """How all curves lie, and where they are followed to with those dimensions.
 
         Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
@@ -342,7 +342,7 @@ class Tracker:
         """
         return self._once(followed.camera, ("as built",), lambda: self._as_built(followed))
 
-    def _as_built(self, followed: Followed) -> tuple[FieldAsBuilt, Followed]:
+    def _as_built(self, followed: FieldLines) -> tuple[FieldAsBuilt, FieldLines]:
         free, target = _free(followed.camera), self.target
         nearest = replace(followed, lines=self.measured(followed.camera))
         built = as_built(nearest.lines, nearest.camera, target, self.free.priors)
@@ -359,7 +359,7 @@ class Tracker:
             built = as_built(nearest.lines, nearest.camera, target, self.free.priors)
         return built, nearest
 
-    def with_best_lens(self, followed: Followed, *, is_stretched: bool = False) -> Followed:
+    def with_best_lens(self, followed: FieldLines, *, is_stretched: bool = False) -> FieldLines:
         """What is found when the lines are predicted with the kind of lens that suits them best.
 
         A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture

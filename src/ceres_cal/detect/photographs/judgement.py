@@ -7,7 +7,7 @@ import numpy as np
 from ceres_cal.base import Array, Frozen, Mask, median, replace
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.photographs.candidates import FieldSearch
-from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
+from ceres_cal.detect.photographs.field_lines import LEAST_SHARE, FieldLines
 from ceres_cal.detect.photographs.matching import divergence
 from ceres_cal.detect.photographs.painted import BY_CHANCE
 from ceres_cal.problem.quantities import is_lens
@@ -40,7 +40,7 @@ _LEAST_UPRIGHT = 0.42
 _SAME_FLOOR = 0.1
 
 
-def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
+def why_missed(followed: FieldLines, target: Target, *, started: bool) -> str:
     """Why lines that were followed are not the target's; for those that do not hold.
 
     Args:
@@ -58,7 +58,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
     return f"its lines were not found{share}: check the target's dimensions and which lines are painted, or {elsewhere}"
 
 
-def objection(search: FieldSearch, followed: Followed) -> str:
+def objection(search: FieldSearch, followed: FieldLines) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
     if not is_shown(search, followed) or followed.built.is_other:
         return why_missed(followed, search.grid.target, started=False)
@@ -80,7 +80,7 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     return ""
 
 
-def is_shown(search: FieldSearch, followed: Followed) -> bool:
+def is_shown(search: FieldSearch, followed: FieldLines) -> bool:
     """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own, and on
     more than half of its curves: a few cables lie on some of any field's.
     """
@@ -94,7 +94,7 @@ def is_shown(search: FieldSearch, followed: Followed) -> bool:
     return everywhere > _EXPLAINED and inside > explained_if_worn
 
 
-def likelihood(followed: Followed) -> float:
+def likelihood(followed: FieldLines) -> float:
     """How much likelier the paint that was found is of the target there than of lines laid anywhere.
 
     The log-likelihood ratio of so many places with paint: a grid that is moved by a line has fewer of them.
@@ -102,7 +102,7 @@ def likelihood(followed: Followed) -> float:
     return float(followed.places * divergence(max(followed.share, BY_CHANCE), BY_CHANCE))
 
 
-def explained(search: FieldSearch, followed: Followed) -> tuple[float, float]:
+def explained(search: FieldSearch, followed: FieldLines) -> tuple[float, float]:
     """Of the strokes inside the target's outline, and of those everywhere, that could be its lines, the share that lies
     on them.
 
@@ -142,7 +142,7 @@ class _Parallel(Frozen):
     outline: Array
 
 
-def _parallel(search: FieldSearch, followed: Followed) -> _Parallel:
+def _parallel(search: FieldSearch, followed: FieldLines) -> _Parallel:
     rim = 0.02  # of its size
     strokes = search.stroke_map.strokes
     ends = np.stack([followed.camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
@@ -155,7 +155,7 @@ def _parallel(search: FieldSearch, followed: Followed) -> _Parallel:
         return _Parallel(ends.mean(axis=0), pixel_m, y < _PARALLEL * x, x < _PARALLEL * y, outline)
 
 
-def coincidence(search: FieldSearch, followed: Followed) -> float:
+def coincidence(search: FieldSearch, followed: FieldLines) -> float:
     """How unlikely it is that lines of something else lie where all of the target's do: the negative log of it.
 
     Of each straight line: in how many of the places beside it, all over the field, there are as many strokes as on it.
@@ -181,7 +181,7 @@ def coincidence(search: FieldSearch, followed: Followed) -> float:
     return -float(np.sum(np.log(np.sort(chances)[_LAID:])))
 
 
-def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
+def same_labels(search: FieldSearch, one: FieldLines, other: FieldLines) -> bool:
     """Whether two put what is seen onto the same places of the target, whatever its turn."""
     pixels = one.lines.pixels[one.lines.found]
     here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
@@ -190,7 +190,7 @@ def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
     return min(median(np.nan_to_num(one, nan=np.inf)) for one in away) < _SAME_FLOOR * extent
 
 
-def detected_curves(search: FieldSearch, followed: Followed) -> list[str]:
+def detected_curves(search: FieldSearch, followed: FieldLines) -> list[str]:
     """Names of the curves that were found."""
     numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
     return [search.grid.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]

@@ -19,8 +19,8 @@ from ceres_cal.detect.photographs.candidates import (
     off_centre,
     prepare_search,
 )
+from ceres_cal.detect.photographs.field_lines import SURE_SHARE, FieldLines
 from ceres_cal.detect.photographs.follow import Tracker
-from ceres_cal.detect.photographs.followed import SURE_SHARE, Followed
 from ceres_cal.detect.photographs.grid import (
     Facing,
     agreeing_with_facing,
@@ -54,7 +54,7 @@ _NO_LINES = (
 class SeveralWaysError(InputError):
     """The field is found, but what is known does not say which way round, or contradicts all ways; `seen` is one."""
 
-    def __init__(self, message: str, seen: Followed) -> None:
+    def __init__(self, message: str, seen: FieldLines) -> None:
         super().__init__(message)
         self.seen = seen
 
@@ -71,11 +71,11 @@ class SearchResult(Frozen):
         shows: the name of another target of the same kind that is found in its place.
     """
 
-    followed: Followed | None
+    followed: FieldLines | None
     reason: str = ""
     ways: int = 0
     chosen_by: str = ""
-    seen: Followed | None = None
+    seen: FieldLines | None = None
     darker: bool = False
     shows: str = ""
 
@@ -142,7 +142,7 @@ def _shows(problem: FieldSearch, target: Target) -> bool:
     grid = attempt(partial(grid_of, target, target.painted), InputError)  # quiet: it has no lines to be found by
     if isinstance(grid, CalibrationError):
         return False
-    own = replace(problem, grid=grid, asked=Auto(), others=(), looked_at=[], reached=[])
+    own = replace(problem, grid=grid, asked=Auto(), others=(), cameras=[], reached=[])
     for camera, grid in candidates(own)[:1]:
         own = replace(own, grid=grid)
         one = _followed(own, camera)
@@ -152,10 +152,10 @@ def _shows(problem: FieldSearch, target: Target) -> bool:
     return False
 
 
-def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[Followed], Followed | None, str]:
+def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[FieldLines], FieldLines | None, str]:
     """What may be the field, by candidates from some strokes; else the best there is, and what speaks against it."""
-    good: list[Followed] = []
-    seen: Followed | None = None
+    good: list[FieldLines] = []
+    seen: FieldLines | None = None
     reason, refined = _NO_LINES, 0
     for camera, grid in candidates(among):
         if problem.is_out_of_time:
@@ -181,7 +181,7 @@ def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[Followed], F
     return good, seen, reason
 
 
-def _given_up(seen: Followed | None) -> SearchResult:
+def _given_up(seen: FieldLines | None) -> SearchResult:
     why = f"the field was not found within {BUDGET_S:g} s of processor time"
     return SearchResult(None, f"{why}: check the target's dimensions, or start from corners", seen=seen)
 
@@ -193,7 +193,7 @@ def _turned(problem: FieldSearch, camera: Camera) -> Camera:
     return ways[agreeing[0]] if agreeing else camera
 
 
-def _followed(problem: FieldSearch, camera: Camera) -> Followed:
+def _followed(problem: FieldSearch, camera: Camera) -> FieldLines:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
     return _tracker(problem, problem.grid.target, camera).approached(camera)
 
@@ -210,7 +210,7 @@ def _tracker(problem: FieldSearch, target: Target, camera: Camera) -> Tracker:
 # ---- which way round ------------------------------------------------------------------------------------------------
 
 
-def _one_way(problem: FieldSearch, distinct: Sequence[Followed]) -> SearchResult:
+def _one_way(problem: FieldSearch, distinct: Sequence[FieldLines]) -> SearchResult:
     """The one way that agrees with what is known; SeveralWaysError where none does, or several."""
     target, curves = problem.grid.target, problem.grid.curves
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.grid.turns]

@@ -11,10 +11,10 @@ namespace ceres_cal {
 
 // Polynomials side by side, each over the next stretch of a width and by its place there from 0 on, the last one
 // without an end; over another polynomial, where there is one.
-class Growing {
+class MonotonicMap {
   public:
-    Growing(int pieces, int terms, const double* above, double width, int terms_below, const double* below,
-            double limit)
+    MonotonicMap(int pieces, int terms, const double* above, double width, int terms_below, const double* below,
+                 double limit)
         : pieces_(pieces),
           terms_(terms),
           terms_below_(terms_below),
@@ -85,7 +85,7 @@ class Growing {
 };
 
 // Rays of a lens on square pixels whose images are some offsets, each sought in the plane that touches its start.
-class Seeking {
+class RaySearch {
   public:
     // Steps of the n rays (x, y, z), unit vectors at first, towards the offsets (x, y), no longer than so many radians;
     // NaN where they do not get there.

@@ -54,7 +54,7 @@ void lens_rays(Tuple optics, const Read<N, 2>& offsets, double longest, const Fi
     const OpticsGiven given(optics);
     const std::unique_ptr<Lens> made = given.make();
     unlocked([&] {
-        Seeking sought;
+        RaySearch sought;
         for (int64_t first = 0; first < count; first += CHUNK)
             sought.find(*made, static_cast<int>(std::min<int64_t>(CHUNK, count - first)), row(offsets, first), longest,
                         row(rays, first));
@@ -67,7 +67,8 @@ void inverse_of_growing(const Read<N, N>& above, double width, const Read<N>& be
     require(pieces > 0 && terms > 0 && width > 0.0, "above: polynomials of a width are needed");
     require(places.size() == targets.size(), "targets and places are (N,)");
     unlocked([&] {
-        const Growing map(whole(pieces), whole(terms), above.data(), width, whole(below.size()), below.data(), limit);
+        const MonotonicMap map(whole(pieces), whole(terms), above.data(), width, whole(below.size()), below.data(),
+                               limit);
         double last = 1.0, before = 1.0;  // shares of the targets: most lie on lines
         for (size_t i = 0; i < targets.size(); ++i) {
             const double target = targets.data()[i], place = map.inverse(target, (2.0 * last - before) * target);
@@ -321,10 +322,10 @@ void lines_near(const Array<const float, N, N>& plane, int reduced, const Array<
     require(sums.shape(0) == feet.shape(0), "feet and sums are (K, 3)");
     const float* const o = optics.data();
     unlocked([&] {
-        const Nearby near{plane.data(), static_cast<int64_t>(plane.shape(0)), static_cast<int64_t>(plane.shape(1)),
-                          static_cast<float>(reduced)};
-        Shown shown(near, {o[0], o[1], o[2], o[3], o[4], o[5], o[6]}, whole(joined.size()), along.data(),
-                    joined.data());
+        const NearnessMap near{plane.data(), static_cast<int64_t>(plane.shape(0)), static_cast<int64_t>(plane.shape(1)),
+                               static_cast<float>(reduced)};
+        VisibleLines shown(near, {o[0], o[1], o[2], o[3], o[4], o[5], o[6]}, whole(joined.size()), along.data(),
+                           joined.data());
         for (int64_t k = 0; k < static_cast<int64_t>(feet.shape(0)); ++k) shown.add_up(row(feet, k), row(sums, k));
     });
 }

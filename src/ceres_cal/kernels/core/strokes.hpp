@@ -40,23 +40,23 @@ inline float share_along(int count, const float* planes, const float* weights, c
 }
 
 // How near each of `reduced` by `reduced` pixels of a picture is to strokes, 0 to 1.
-struct Nearby {
+struct NearnessMap {
     const float* plane;
     int64_t height, width;
     float reduced;
 };
 
 // A picture of a lens with ray = (p / phi, 1 + bend |p|^2), p in `unit` px from its centre.
-struct Bent {
+struct BentLens {
     float bend, phi, unit, x, y, width, height;
 };
 
 // How much a camera shows of lines, and how much of that is near strokes.
-class Shown {
+class VisibleLines {
   public:
     // along: x, y and z of places on the lines as seen from their origin; joined: which belong to the line of the one
     // before.
-    Shown(const Nearby& near, const Bent& camera, int count, const float* along, const bool* joined)
+    VisibleLines(const NearnessMap& near, const BentLens& camera, int count, const float* along, const bool* joined)
         : near_(near), camera_(camera), count_(count), along_(along), joined_(joined), x_(count), y_(count) {}
 
     // near strokes, shown, px, and the share of the places in view, of a camera that is so far from the origin.
@@ -101,8 +101,8 @@ class Shown {
         return inside ? near_.plane[row * near_.width + column] : 0.0f;
     }
 
-    const Nearby near_;
-    const Bent camera_;
+    const NearnessMap near_;
+    const BentLens camera_;
     const int count_;
     const float* along_;
     const bool* joined_;

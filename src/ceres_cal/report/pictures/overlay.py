@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Struct
 
 from ceres_cal.base import Array, Image, Image8, Indices32, Mask, Pose, first_of
-from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.field_lines import FieldLines
 from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.diagnostics.advice import Measurement
 from ceres_cal.problem import Estimate
@@ -137,7 +137,7 @@ def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: f
     return canvas
 
 
-def draw_seen(photograph: Image, seen: Followed | None, target: Target) -> Image8:
+def draw_seen(photograph: Image, seen: FieldLines | None, target: Target) -> Image8:
     """A photograph with the lines found in it, and, of the best candidate, where paint was found and where not."""
     grey = in_8_bit_colour(photograph).mean(axis=2).astype(np.float32)
     layers = [Layer(find_strokes(grey).ends.reshape(-1, 2), "lines seen", "before")]

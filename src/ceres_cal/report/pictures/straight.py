@@ -20,7 +20,7 @@ _GRID, _ROUNDS, _SHRINK = 9, 24, 0.6
 _ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms
 
 
-class Straight(Struct, frozen=True, eq=False):
+class Straightening(Struct, frozen=True, eq=False):
     """How photographs of one camera are straightened.
 
     Attributes:
@@ -52,7 +52,7 @@ def straighten(
     size: tuple[int, int] | None = None,
     phi: float | None = None,
     angle_deg: float | None = None,
-) -> Straight:
+) -> Straightening:
     """How to straighten a camera's photographs.
 
     Args:
@@ -92,7 +92,7 @@ def straighten(
         return there
 
     warp = make_warp(new_size, camera.image_size, places)
-    return Straight(straight, warp, _share_shown(camera, straight, region.slope), region.limit_deg)
+    return Straightening(straight, warp, _share_shown(camera, straight, region.slope), region.limit_deg)
 
 
 def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bool) -> tuple[float, tuple[int, int]]:

@@ -11,13 +11,13 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.scene.lens.base import LinearEquations, ahead
-from ceres_cal.scene.lens.planar import Decentred
+from ceres_cal.scene.lens.planar import DecentredLens
 
 _ORDERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 7, "s1": 2, "s2": 4, "s3": 2, "s4": 4}
 
 
 @dataclass(frozen=True)
-class Brown(Decentred):
+class Brown(DecentredLens):
     """Brown's model as in OpenCV: k1 k2 p1 p2 k3 act on the ideal point (x/z, y/z), and so do, where they are asked
     for, k4 to k6 under the line (its rational model) and s1 to s4 (its thin prism).
     """
@@ -69,7 +69,7 @@ class Brown(Decentred):
 
 
 @dataclass(frozen=True)
-class KannalaBrandt(Decentred):
+class KannalaBrandt(DecentredLens):
     """Kannala and Brandt's model as in OpenCV's fisheye: k1..k4 act on the angle from the axis, up to 180 degrees; p1
     and p2, where they are asked for, displace tangentially, as in COLMAP's THIN_PRISM_FISHEYE.
     """

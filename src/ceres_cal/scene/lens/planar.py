@@ -250,7 +250,7 @@ class Planar(Lens):
         return self._unit(phi) * self._rim
 
 
-class Decentred(Planar):
+class DecentredLens(Planar):
     """A ratio of polynomials along the radius, Brown's decentring (p1, p2) and OpenCV's thin prism (s1 to s4) across.
 
     Coefficients that a lens does not have are 0.

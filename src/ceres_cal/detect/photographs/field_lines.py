@@ -21,7 +21,7 @@ _LEAST_IF_WORN = 0.3
 _ABSENT, _MOST_ABSENT = 0.2, 0.08
 
 
-class Followed(Frozen):
+class FieldLines(Frozen):
     """A field's lines as they were followed.
 
     Attributes:

@@ -20,7 +20,7 @@ _WARPED = 0.002
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class PeerFit:
     """A calibrated camera.
 
     Attributes:
@@ -104,7 +104,7 @@ def _of_turns(turn: Array) -> Array:
     return np.column_stack([turn * np.sinc(angle / np.pi)[:, None], np.cos(angle)])
 
 
-def turn_basis(fitted: Fitted, rays: Array) -> Array:
+def turn_basis(fitted: PeerFit, rays: Array) -> Array:
     """(2 N, 3) orthonormal basis of how the places at which rays are seen move when the camera turns."""
     columns = [(fitted.seen(rays + _STEP * np.cross(a, rays)) - fitted.seen(rays)).ravel() for a in np.eye(3)]
     return np.asarray(np.linalg.qr(np.column_stack(columns))[0])
@@ -123,7 +123,7 @@ def grid_of(corners: Corners, step: int = 12) -> Array:
 # ---- two calibrations of one camera ---------------------------------------------------------------------------------
 
 
-def agreement(first: Fitted, second: Fitted, pixels: Array) -> dict[str, float]:
+def agreement(first: PeerFit, second: PeerFit, pixels: Array) -> dict[str, float]:
     """Mean squares of what two calibrations from different pictures differ by, over what both state: of each number by
     itself, and of projections, the rotation between the two that fits best taken out. What is not stated is not there.
     """
@@ -151,7 +151,7 @@ def agreement(first: Fitted, second: Fitted, pixels: Array) -> dict[str, float]:
 # ---- views that a calibration has not seen --------------------------------------------------------------------------
 
 
-def held_out(fitted: Fitted, corners: Corners) -> tuple[Array, Array]:
+def held_out(fitted: PeerFit, corners: Corners) -> tuple[Array, Array]:
     """(N,) px that a camera leaves of new views, of which it solves for the poses alone; and (N,) px^2 of the squares
     that it predicts of itself, NaN where it states no noise.
     """
@@ -173,7 +173,7 @@ def _moved(pose: Array, board: Array) -> Array:
     return np.asarray(board @ cv2.Rodrigues(pose[:3])[0].T + pose[3:])
 
 
-def _posed(fitted: Fitted, board: Array, pixels: Array) -> tuple[Array, Array, Array]:
+def _posed(fitted: PeerFit, board: Array, pixels: Array) -> tuple[Array, Array, Array]:
     """Least squares over one pose, corners far beyond the others left out of it: pose (6,), what is left (2 N,) and
     its slopes (2 N, 6). Of the two poses that a plane's picture allows it is the better one.
     """
@@ -210,7 +210,7 @@ def _refined(pose: Array, left_at: Callable[[Array], Array]) -> Array:
     return pose
 
 
-def _first_poses(fitted: Fitted, board: Array, pixels: Array) -> list[Array]:
+def _first_poses(fitted: PeerFit, board: Array, pixels: Array) -> list[Array]:
     rays = fitted.rays(pixels)
     ahead = np.isfinite(rays[:, 2]) & (rays[:, 2] > _AHEAD)
     if np.count_nonzero(ahead) < 4:
