@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -67,16 +67,19 @@ class Kind(Frozen):
         """The least squares of its longest lens."""
         return np.inf if self.normals is None else self.normals.least
 
-    def candidates(self, *, first: bool) -> Iterator[Candidate]:
+    def candidates(self, *, first: bool) -> list[Candidate]:
         """The longest lens of the kind and the paper's, or all others, with their errors of prediction."""
-        forms = [form for form in self.forms if first == (form is self.forms[0] or form.label == PAPER)]
-        if self.normals is None or not forms:
-            yield from (Candidate(form, self, failed=self.failed) for form in forms)
-            return
-        counts, held_out = self.normals.counts, self.normals.held_out([self.to_nothing(form) for form in forms])
-        for form, squares, step in zip(forms, *held_out, strict=True):
-            rms_px = self.sigma_px * float(np.sqrt(max(squares.sum(), 0.0) / counts.sum()))
-            yield Candidate(form, self, surprise(squares, counts), rms_px, step, self.normals.squares_at(step))
+        return [one for one in self._every if first == (one.form is self.forms[0] or one.form.label == PAPER)]
+
+    @cached_property
+    def _every(self) -> list[Candidate]:
+        """All of its lenses, which together take hardly longer than one."""
+        if self.normals is None:
+            return [Candidate(form, self, failed=self.failed) for form in self.forms]
+        counts, (squares, steps) = self.normals.counts, self.normals.held_out([*map(self.to_nothing, self.forms)])
+        rms_px = self.sigma_px * np.sqrt(np.maximum(squares.sum(axis=1), 0.0) / counts.sum())
+        each = zip(self.forms, surprise(squares, counts), rms_px.tolist(), steps, strict=True)
+        return [Candidate(form, self, own, rms, at, self.normals.squares_at(at)) for form, own, rms, at in each]
 
     def slopes(self, lenses: OtherLenses) -> Sequence[Array]:
         """How what pixels show moves with its numbers, see `shown_slopes`."""
@@ -84,16 +87,13 @@ class Kind(Frozen):
 
     def to_nothing(self, form: Form) -> dict[Key, float]:
         """How far from where they stand the coefficients that one of its lenses does not have are 0."""
-        lens = set(self.forms[0].names) - set(form.names)
-        return {key: step for key, step in self._to_nothing.items() if key[2] in lens}
+        return {key: step for key, step in self._to_nothing.items() if key.quantity not in form.names}
 
     @cached_property
     def _to_nothing(self) -> dict[Key, float]:
         """The same of all coefficients of its longest lens."""
-        names = set(self.forms[0].names)
-        keys = (
-            [key for key in self.normals.keys if key.kind == "camera" and key.quantity in names] if self.normals else []
-        )
+        names, every = set(self.forms[0].names), self.normals.keys if self.normals else ()
+        keys = [key for key in every if key.kind == "camera" and key.quantity in names]
         return dict(zip(keys, (-values_of(self.estimate, keys)).tolist(), strict=True))
 
     @cached_property
@@ -114,8 +114,7 @@ class Kind(Frozen):
         """
         if self.normals is None:
             return 1.0
-        names = set(self.forms[0].names)
-        own = [i for i, key in enumerate(self.normals.keys) if key.kind == "camera" and key.quantity in names]
+        own = [i for i, key in enumerate(self.normals.keys) if key in self._to_nothing]
         groups = len(self.normals.counts)
         more = self.normals.scatter_of(np.array(own)) - self.noise
         return self.noise + max(0.0, more) * groups / (groups + _UNSEEN_GROUPS)

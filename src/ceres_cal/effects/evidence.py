@@ -23,7 +23,7 @@ scatter of the others explains (`Offsets`).
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -341,14 +341,9 @@ class RepeatedAmounts(Frozen):
         """Sigma and probability of amounts that each view has by itself, by name, beside those of the others that are
         likely.
         """
-        sweeps = 2
-        found: dict[_Name, tuple[float, float]] = {}
-        for name in [*numbers] * sweeps:
-            others = [
-                (numbers[other], size) for other, (size, likely) in found.items() if likely > LIKELY and other != name
-            ]
-            found[name] = self.scatter(numbers[name], others, priors[name], tells)
-        return found
+        return _beside_each_other(
+            numbers, [*numbers], lambda name, others: self.scatter(numbers[name], others, priors[name], tells)
+        )
 
     def _size(self, numbers: Indices, others: Others, prior: SizePrior) -> tuple[float, float]:
         """The same where what goes together within a sight counts as noise; as it was beforehand where too few sights
@@ -371,24 +366,35 @@ class RepeatedAmounts(Frozen):
         Args:
             stated: others, beside which all of them are; their numbers come last.
         """
-        sweeps, no_change = 2, 0.1  # over the effects, each beside the others; of the logarithm of one of their sigmas
-        found: dict[_Name, tuple[float, float]] = {}
-        asked: dict[_Name, dict[_Name, float]] = {}
         own_last = min((of_other[0] for of_other, _ in stated), default=len(self.score))
         score, information = self._beside(np.arange(own_last), stated)
         where = replace(self, score=score, information=information)
-        each = sorted(numbers.items(), key=lambda one: len(one[1]))  # what takes longest is asked when others are known
-        for name, own in each * sweeps if self.spare >= _FEWEST else ():
-            before = found.pop(name, None)  # the last one looked at stands last
-            beside = {one: sigma for one, (sigma, probability) in found.items() if probability > LIKELY}
-            known = asked.get(name, {})
-            if (
-                before
-                and known.keys() == beside.keys()
-                and all(abs(np.log(known[one] / beside[one])) < no_change for one in beside)
-            ):
-                found[name] = before
-                continue
-            others = [(numbers[one], sigma) for one, sigma in beside.items()]
-            found[name], asked[name] = where._size(own, others, priors[name]), beside
-        return found
+        # what takes longest is asked when others are known
+        each = sorted(numbers, key=lambda name: len(numbers[name])) if self.spare >= _FEWEST else []
+        return _beside_each_other(numbers, each, lambda name, others: where._size(numbers[name], others, priors[name]))
+
+
+def _beside_each_other(
+    numbers: Mapping[_Name, Indices], each: Sequence[_Name], size_of: Callable[[_Name, Others], tuple[float, float]]
+) -> dict[_Name, tuple[float, float]]:
+    """Sigma and probability of effects, one after the other and then again, each beside those of the others that are
+    likely; not again where these are as they were.
+
+    Args:
+        size_of: both of an effect, beside others.
+    """
+    sweeps, no_change = 2, 0.1  # of the logarithm of one of the others' sigmas
+    found: dict[_Name, tuple[float, float]] = {}
+    asked: dict[_Name, dict[_Name, float]] = {}
+    for name in [*each] * sweeps:
+        before = found.pop(name, None)  # the last one looked at stands last
+        beside = {one: sigma for one, (sigma, probability) in found.items() if probability > LIKELY}
+        known = asked.get(name, {})
+        same = known.keys() == beside.keys() and all(
+            abs(np.log(known[one] / beside[one])) < no_change for one in beside
+        )
+        if before and same:
+            found[name] = before
+            continue
+        found[name], asked[name] = size_of(name, [(numbers[one], sigma) for one, sigma in beside.items()]), beside
+    return found

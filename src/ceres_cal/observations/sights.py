@@ -193,6 +193,8 @@ class Sights(Frozen, Sequence["Sights"]):
         """Each sight as one of every feature that it shows, or of every half of a curve in the image; those (S,) that
         are to stay whole as they are.
         """
+        if whole.all():
+            return self
         numbers = np.arange(len(self))
         sight = np.concatenate([np.repeat(numbers, np.diff(b)) for b in (self.point_bounds, self.curve_bounds)])
         half = self._halves(sight[len(self.point_rows) :]) if halved else 0

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -297,7 +299,7 @@ class EliminatedCost(_SightsCost):
             )
             return sweep.reduced
 
-        reduced = np.sum(run_parts(part, self._parts), axis=0)
+        reduced = reduce(add, run_parts(part, self._parts))
         return kernels.Sweep(poses, gains, costs, reduced if chain is None else chain.T @ reduced @ chain)
 
     def posed(self, tolerance: float, poses: Array | None = None) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ceres_cal.base import Array, Frozen, InputError, field, replace, rotation_log
+from ceres_cal.base import Array, Frozen, Indices, InputError, cached_property, field, replace, rotation_log
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.problem.information import Information, Key, pose_keys
 from ceres_cal.problem.parameters import AUTO, OF_PIXELS, Estimate, Options, intrinsic_names
@@ -139,11 +139,15 @@ class GaussianPrior(Frozen):
         least_ratio = 1e-6  # of a number to its mean: a step of the solver may pass 0
         slope = np.ones(len(off))
         if self.logs:
-            at = self.information.columns(self.information.among(self.logs))
+            at = self._of_logs
             ratio = np.maximum(1.0 + off[at] / self.mean[at], least_ratio)
             off = off.copy()
             off[at], slope[at] = self.mean[at] * np.log(ratio), 1.0 / ratio
         return off, slope
+
+    @cached_property
+    def _of_logs(self) -> Indices:
+        return self.information.columns(self.information.among(self.logs))
 
     def residuals(self, estimate: Estimate) -> Array:
         """(R,) root (x - mean), in standard deviations."""
