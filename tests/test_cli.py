@@ -805,8 +805,9 @@ def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatc
     [
         ((), "nothing was given"),
         (("640",), "argument '640': give 2 numbers"),
-        (("1,2,3",), "give 2 numbers with commas between, not 3"),
-        (("1:2",), "'1:2' is not a finite number, such as -0.15"),
+        (("1,2,3",), "give 2 numbers with commas between, such as 640,480"),
+        (("640x480",), "argument '640x480': give 2 numbers with commas between, such as 640,480"),
+        (("1:2,3",), "'1:2' is not a finite number, such as -0.15"),
         (("1,5;\u22122",), "'\u22122' is not a finite number"),
         (("1,nan",), "'nan' is not a finite number"),
         (("1,2", "--file", "rows.csv"), "not both"),

@@ -126,7 +126,7 @@ ON_THE_COMMAND_LINE = [
     ("calibrate CAL", "it holds a calibration, where observations must be given: were two arguments exchanged?"),
     ("check OBS CAL", "it holds observations, where a calibration must be given: were two arguments exchanged?"),
     ("locate OBS 1,2", "it holds observations, where a calibration must be given"),
-    ("locate CAL 640", "give 2 numbers with commas between, not 1"),
+    ("locate CAL 640", "give 2 numbers with commas between, such as 640,480"),
     ("locate CAL 640,480 --station overhaed", "there is no station 'overhaed': did you mean 'overhead'?"),
     ("locate CAL 640,480 --height-mm 15x", "'15x' is no length: write a number of mm, or 5m, 150mm"),
     ("calibrate OBS --prior heigth_m=4:0.01", "there is no quantity 'heigth_m': did you mean 'height_m'?"),

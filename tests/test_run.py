@@ -120,6 +120,13 @@ def test_what_is_no_video(tmp_path: Path) -> None:
             sharpest_frames(tmp_path / name, tmp_path / "frames", 3)
 
 
+@pytest.mark.usefixtures("words_alone")
+def test_photographs_whose_endings_are_in_capitals_are_in_the_report(photographs: Path, tmp_path: Path) -> None:
+    given = [str(shutil.copy(path, tmp_path / path.with_suffix(".JPG").name)) for path in photographs.iterdir()]
+    assert main(["run", *given, "--lens", "radial", "--board", "9x6x100mm", "-o", str(tmp_path / "out")]) == 0
+    assert "data:image/jpeg" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_a_plan_names_the_first_of_many_photographs() -> None:
     many = " ".join(f"{number}.jpg" for number in range(9))
     assert _short(f"ceres-cal detect board {many} --rows 6") == "ceres-cal detect board 0.jpg ... --rows 6"

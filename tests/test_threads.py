@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ceres_cal.base.threads import at_most, in_turn, meanwhile, parts_of, run_parts
+from ceres_cal.base.errors import InputError, noting
+from ceres_cal.base.files import write_bytes
+from ceres_cal.base.threads import at_most, in_turn, interruptibly, meanwhile, parts_of, run_parts
 
 
 @given(
@@ -66,3 +70,21 @@ def test_two_items_are_at_work_at_once_and_the_rest_ends_with_an_error() -> None
     with at_most(2), pytest.raises(ValueError, match="the second"):
         list(in_turn(work, range(1000)))
     assert len(seen) < 10
+
+
+def test_work_that_is_left_writes_no_more_files_and_ends_the_one_that_it_writes(tmp_path: Path) -> None:
+    """And what it had written is known to whoever waited for it."""
+    begun, ended = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with suppress(InputError):
+            for number in range(1000):
+                write_bytes(tmp_path / str(number), bytes(1_000_000))
+                begun.set()
+        ended.set()
+
+    with noting() as files, pytest.raises(TimeoutError):
+        interruptibly(work, 0.2)
+    assert begun.is_set() and ended.wait(10.0)
+    written = sorted(path.name for path in tmp_path.iterdir())
+    assert written == sorted(Path(file).name for file in files) and 0 < len(written) < 1000

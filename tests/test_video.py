@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.cli import main
 from ceres_cal.detect import video as video_module
 from ceres_cal.detect.median import MOST_PICTURES, merged
-from ceres_cal.detect.video import sharpest_frames, spread_frames
+from ceres_cal.detect.video import frames_of_videos, sharpest_frames, spread_frames, turned_words
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "ssl_field"
 SIZE = (320, 240)
@@ -46,9 +47,9 @@ def shot(seed: int, shift_px: float = 0.0, blur_px: float = 0.0, gain: float = 1
     return np.asarray(np.clip(gain * seen + rng.normal(0.0, 2.0, grey.shape), 0.0, 255.0).astype(np.uint8))
 
 
-def write_video(path: Path, frames: Sequence[Image]) -> Path:
+def write_video(path: Path, frames: Sequence[Image], code: str = "MJPG") -> Path:
     size = (frames[0].shape[1], frames[0].shape[0]) if frames else SIZE
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10.0, size)
     for frame in frames:
         writer.write(frame if frame.ndim == 3 else cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
     writer.release()
@@ -153,6 +154,75 @@ def test_a_board_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     board = ("--columns", "9", "--rows", "6", "--square", "100mm", "-o", str(tmp_path / "board.json"))
     assert main(["detect", "board", str(path), *board, "--frames", "2", "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("2 of 2 images show the board, 108 corners in all")
-    assert sorted(one.name for one in (tmp_path / "boards").iterdir()) == ["0001.png", "0002.png"]
+    assert sorted(one.name for one in (tmp_path / "boards_frames").iterdir()) == ["0001.png", "0002.png"]
     assert main(["detect", "board", str(path), *board, "--frames", "0"]) == 2
     assert "'0' is not a whole number of 1 or more" in capsys.readouterr().err
+
+
+def turned(path: Path, source: Path) -> Path:
+    """A video whose header tells viewers to turn it by half a turn, as of a telephone that was held upside down."""
+    content = bytearray(source.read_bytes())
+    matrix = content.find(b"tkhd") + 4 + 40  # nine numbers of 32 bits, of 16 or 30 bits behind the point
+    struct.pack_into(">9i", content, matrix, -(1 << 16), 0, 0, 0, -(1 << 16), 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    return path
+
+
+def test_frames_are_as_the_sensor_stored_them_and_a_turn_for_viewers_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = write_video(tmp_path / "plain.mp4", [shot(n) for n in range(3)], "mp4v")
+    upside_down = turned(tmp_path / "turned.mp4", plain)
+    capture = cv2.VideoCapture(str(upside_down))
+    assert np.array_equal(np.asarray(capture.read()[1]), np.rot90(next(spread_frames(plain, 3))[1], 2))  # as viewers do
+    for (_, stored), (_, seen) in zip(spread_frames(plain, 3), spread_frames(upside_down, 3), strict=True):
+        assert np.array_equal(seen, stored)
+    assert turned_words(plain) == "" and turned_words(upside_down).startswith(
+        "its file tells viewers to turn it by 180 "
+    )
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x03\0\0\0\0\0\0"  # orientation 3
+    content = (SAMPLE / "photographs" / "0001.jpg").read_bytes()
+    (tmp_path / "0001.jpg").write_bytes(
+        content[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + content[2:]
+    )
+    asked = [
+        "detect",
+        "field",
+        str(tmp_path / "0001.jpg"),
+        "--target",
+        "ssl-b",
+        "--auto",
+        "-o",
+        str(tmp_path / "o.json"),
+    ]
+    assert main([*asked, "--facing", "LeftGoalLine=top"]) == 0
+    assert "0001.jpg: its file tells viewers to turn it by 180 degrees, but" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert main([*asked, "--facing", "LeftGoalLine=left"]) == 2
+    assert "give an old calibration of the station (--start); its file tells viewers" in capsys.readouterr().err
+
+
+def test_frames_of_two_videos_go_into_two_folders(tmp_path: Path) -> None:
+    """And into none that may hold photographs."""
+    one = write_video(tmp_path / "board.avi", [shot(1)])
+    other = one.with_suffix(".mpg")
+    with pytest.raises(InputError, match=r"board\.mpg: another video is called 'board', too: rename one"):
+        frames_of_videos([one, other], 1, tmp_path)
+    assert frames_of_videos([one], 1, tmp_path) == [tmp_path / "board_frames" / "0001.png"]
+
+
+def test_a_video_where_photographs_are_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video, text = write_video(tmp_path / "now.avi", [shot(1)]), tmp_path / "notes.md"
+    text.write_text("# Notes\n")
+    for path, words in ((video, "a video: give frames of it, as PNG"), (text, "text: give photographs (files of obs")):
+        assert main(["detect", "rings", str(path), "--radii", "10mm:90mm:10mm", "-o", str(tmp_path / "o.json")]) == 2
+        assert f"{path}: not an image but {words}" in capsys.readouterr().err
+
+
+def test_run_names_the_frames_that_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    still = np.asarray(cv2.imread(str(SAMPLE / "photographs" / "0001.jpg")))
+    path = write_video(tmp_path / "game.avi", [still, still, still, np.roll(still, 3, axis=1)])
+    asked = ["--target", "ssl-b", "--facing", "LeftGoalLine=top", "--prior", "height_m=4.02:0.01", "--lens", "radial"]
+    assert main(["run", str(path), *asked, "-o", str(tmp_path / "out")]) == 0
+    assert "the median of 3 pictures of 4; 1 left out, the camera had moved (" in capsys.readouterr().out

@@ -12,6 +12,8 @@ from contextvars import ContextVar
 from functools import partial, wraps
 from typing import ParamSpec, TypeVar
 
+from ceres_cal.base.words import first_of
+
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
@@ -122,3 +124,9 @@ def note(path: object) -> None:
     files = _noted.get()
     if files is not None:
         files.append(str(path))
+
+
+def noted_words() -> str:
+    """Which files are in their place, as the end of a message."""
+    files = _noted.get()
+    return f"written were {first_of(files)}" if files else "nothing was written"

@@ -21,6 +21,7 @@ from typing import IO, Any, Literal, TypeVar, cast
 import msgspec
 
 from ceres_cal.base.errors import InputError, note
+from ceres_cal.base.threads import writing
 from ceres_cal.base.words import did_you_mean, printable
 
 T = TypeVar("T")
@@ -358,7 +359,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             raise InputError(f"{path}: cannot be written: it is a folder or a device")
         if target.exists() and not os.access(target, os.W_OK):
             raise InputError(f"{path}: cannot be written: Permission denied")
-        with _beside(target) as (handle, beside), os.fdopen(handle, "wb") as stream:
+        with writing(), _beside(target) as (handle, beside), os.fdopen(handle, "wb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(handle)

@@ -11,9 +11,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
+
+from ceres_cal.base.errors import InputError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ThreadPoolExecutor
@@ -159,10 +161,37 @@ def _keep_freed_memory() -> None:
         library.mallopt(*mapped)
 
 
+class _Left(threading.Thread):
+    """Work that may be left to itself.
+
+    Attributes:
+        is_left: nobody waits for it any more, so that it writes no file. is_writing: a file, which will be whole.
+    """
+
+    is_left = is_writing = False
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """While a file is written; InputError where the thread was left to itself."""
+    thread = threading.current_thread()
+    if not isinstance(thread, _Left):
+        yield
+        return
+    thread.is_writing = True  # before it looks, as whoever leaves it says so before waiting
+    try:
+        if thread.is_left:
+            raise InputError("interrupted: not written")
+        yield
+    finally:
+        thread.is_writing = False
+
+
 def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) -> _T:
     """What a function returns whose native work would hold back Ctrl-C until it is done.
 
-    It works in a thread of its own, which is left to itself when this one is interrupted or has waited long enough.
+    It works in a thread of its own, which is left to itself when this one is interrupted or has waited long enough; but
+    for a file that it writes just then, and it writes no other.
 
     Raises:
         TimeoutError: it takes longer than `timeout_s`.
@@ -176,14 +205,20 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
         except BaseException as error:  # quiet: raised again in the thread that waits
             results.append((None, error))
 
-    thread = threading.Thread(target=work, daemon=True)
+    thread = _Left(target=copy_context().run, args=(work,), daemon=True)  # and what it writes is noted here
     _unfinished.append(thread)
     thread.start()
     end = None if timeout_s is None else time.monotonic() + timeout_s
-    while thread.is_alive():
-        if end is not None and time.monotonic() > end:
-            raise TimeoutError
-        thread.join(look_s)
+    try:
+        while thread.is_alive():
+            if end is not None and time.monotonic() > end:
+                raise TimeoutError
+            thread.join(look_s)
+    except BaseException:  # quiet: raised again, once no file is half written
+        thread.is_left = True
+        while thread.is_writing:
+            time.sleep(0.01)
+        raise
     _unfinished.remove(thread)
     result, error = results[0]
     if error is not None:

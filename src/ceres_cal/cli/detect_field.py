@@ -11,7 +11,7 @@ from ceres_cal import calibration, detect, report, scene
 from ceres_cal.base import InputError, images_and_videos, plural
 from ceres_cal.cli import arguments, files
 from ceres_cal.cli.command import QuietArguments, argument, command, option, switch
-from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
+from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, turned_section, write_median
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
@@ -121,7 +121,7 @@ def _run(args: FieldArguments) -> Document:
     with bar:
         detections = detected(args.timeout, look)
     files.save(args.output, detections.observations)
-    return Document(tuple(_sections(detections, merged, args.output)))
+    return Document(tuple(_sections(detections, merged, args.output, [*images, *videos] if merged else [])))
 
 
 def _drawing(picture: Path | None, target: scene.Target) -> Callable[[Path, detect.SearchResult], None] | None:
@@ -177,7 +177,10 @@ def _corners(specs: Sequence[str]) -> detect.Clicks:
 # ---- the answer -----------------------------------------------------------------------------------------------------
 
 
-def _sections(detections: detect.FieldDetections, merged: dict[str, Any], output: Path) -> Iterator[Section]:
+def _sections(
+    detections: detect.FieldDetections, merged: dict[str, Any], output: Path, given: Sequence[Path] = ()
+) -> Iterator[Section]:
+    """The answer; `given`: what the one picture was made of."""
     observations, images = detections.observations, [_image_data(path, detections) for path in detections.found]
     points, curves = len(observations.points), len(observations.curves)
     every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
@@ -192,6 +195,7 @@ def _sections(detections: detect.FieldDetections, merged: dict[str, Any], output
     if merged:
         yield Section("", [median_text(merged)], {"median": merged})
     yield Section("", tuple(_image_lines(images)))
+    yield turned_section(path for path in (*given, *map(Path, detections.found)) if path.is_file())
     yield missed
     yield Section("", [f"written to {output}"], {"output": str(output)})
 

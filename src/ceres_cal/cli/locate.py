@@ -114,10 +114,11 @@ def _lines(lines: Iterable[str], where: str) -> Iterator[tuple[str, str]]:
 def _numbers(text: str, sizes: tuple[int, ...], where: str) -> list[float]:
     if ";" in text:  # as spreadsheets write where decimals have a comma
         text = text.replace(",", ".").replace(";", ",")
-    row = [parse_number(part, where) for part in (text.split(",") if "," in text else text.split())]
-    if len(row) not in sizes:
-        raise InputError(f"{where}: give {' or '.join(map(str, sizes))} numbers with commas between, not {len(row)}")
-    return row
+    parts = text.split(",") if "," in text else text.split()
+    if len(parts) not in sizes:
+        example = "640,480" if sizes == (2,) else "-2.5,1.0"
+        raise InputError(f"{where}: give {' or '.join(map(str, sizes))} numbers with commas between, such as {example}")
+    return [parse_number(part, where) for part in parts]
 
 
 # ---- answering ------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -78,6 +78,13 @@ def missed_section(missed: tuple[tuple[str, str], ...]) -> Section:
     return Section("", [f"{path}: {reason}" for path, reason in missed], data)
 
 
+def turned_section(paths: Iterable[Path]) -> Section:
+    """Photographs and videos that viewers show turned, a line each."""
+    words = ((path, detect.turned_words(path)) for path in dict.fromkeys(paths))
+    said = [f"{path}: {one}: --facing and pixels refer to the picture as stored" for path, one in words if one]
+    return Section("warning", said)
+
+
 # ---- detection ------------------------------------------------------------------------------------------------------
 
 
@@ -90,7 +97,7 @@ def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
         return base.interruptibly(detect, timeout)
     except TimeoutError:
         raise InputError(
-            f"--timeout: not done after {timeout:g} s, nothing was written: give fewer images, or more time"
+            f"--timeout: not done after {timeout:g} s, {base.noted_words()}: give fewer images, or more time"
         ) from None
 
 

@@ -14,6 +14,7 @@ from ceres_cal.base.words import first_of, plural
 from ceres_cal.cli import arguments
 from ceres_cal.cli.command import COMMANDS, QuietArguments, argument, command, option
 from ceres_cal.cli.files import attempted, folder_of_results, is_board, read_board, require_shown
+from ceres_cal.cli.photographs import median_text, turned_section
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Document, Section
 
@@ -177,7 +178,10 @@ def _step(
         bar.say(f"now       {_short(typed)}")
     answer = COMMANDS[name].answer(arguments, quiet=args.quiet or args.json)
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
-    lines = [*answer.text(titles).splitlines()[:most], *missed]
+    merged = answer.data.get("median", {})
+    left_out = [median_text(merged)] if merged.get("left_out") else []
+    warned = [] if most is None else answer.text({"warning"}).splitlines()
+    lines = [*answer.text(titles).splitlines()[:most], *left_out, *missed, *warned]
     return _Step(typed, lines, answer.data, answer.exit_code)
 
 
@@ -242,9 +246,9 @@ def _calibrated(
     priors = arguments.repeated("--prior", args.prior)
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
     seen = [(one, *images_and_videos(one.images)) for one in cameras]
-    folders = [str(one.output / video.stem) for one, _, videos in seen for video in videos]
+    folders = [str(detect.folder_of_frames(video, one.output)) for one, _, videos in seen for video in videos]
     given = [name for one, images, _ in seen if images for name in one.images]
-    shown = [name for name in (*given, *folders) if Path(name).is_dir() or Path(name).suffix in IMAGE_ENDINGS]
+    shown = [name for name in (*given, *folders) if Path(name).is_dir() or Path(name).suffix.lower() in IMAGE_ENDINGS]
     medians = [data["median"]["picture"] for data in detected if "median" in data]
     images = arguments.repeated("--images", [*shown, *medians])
     asked = [*observations, "--lens", args.lens, *priors, *goal, *images]
@@ -268,6 +272,7 @@ def _exported(args: RunArguments, cameras: Sequence[RunArguments], form: formats
 
 def _sections(args: RunArguments, images: int, steps: Sequence[_Step], level: str) -> Iterator[Section]:
     yield Section("read", [f"{plural(images, 'photograph')} in {first_of(args.images, _MOST_NAMES)}"])
+    yield turned_section(images_and_videos(args.images)[1])
     for number, step in enumerate(steps, start=1):
         yield _BLANK
         yield Section(f"step {number}", [_short(step.command)])

@@ -22,7 +22,7 @@ from types import FrameType, TracebackType
 from typing import Any, NoReturn, TextIO, cast
 
 from ceres_cal import base, calibration
-from ceres_cal.base import CalibrationError, InputError, SolutionError, did_you_mean, first_of, noting
+from ceres_cal.base import CalibrationError, InputError, SolutionError, did_you_mean, noted_words, noting
 from ceres_cal.cli.command import COMMANDS, Command
 from ceres_cal.report.document import Document
 
@@ -244,7 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _answer(arguments: list[str]) -> int:
     """Run one command; the exit code, whatever happens."""
-    with noting() as files:
+    with noting():
         try:
             return _run(arguments)
         except SystemExit as done:  # quiet: argparse has printed its help
@@ -252,10 +252,10 @@ def _answer(arguments: list[str]) -> int:
         except (Exception, KeyboardInterrupt) as error:  # reads: "ceres-cal: ..." on standard error
             if os.environ.get("CERES_CAL_DEBUG") and not isinstance(error, _FORESEEN):
                 raise
-            return _fail(*_words(error, files), "--json" in arguments)
+            return _fail(*_words(error), "--json" in arguments)
 
 
-def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
+def _words(error: BaseException) -> tuple[str, int]:
     """What is said of an error, and the exit code."""
     interrupted = 130  # what a shell reports of a program that SIGINT ended
     most_letters = 200  # of an error that nobody wrote for people
@@ -266,7 +266,7 @@ def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
             return str(error), error.exit_code
         case KeyboardInterrupt():
             how, code = ("terminated", TERMINATED) if isinstance(error, Termination) else ("interrupted", interrupted)
-            return f"{how}: {f'written were {first_of(files)}' if files else 'nothing was written'}", code
+            return f"{how}: {noted_words()}", code
         case MemoryError():
             return "out of memory: give fewer observations or images at a time", InputError.exit_code
         case OSError():

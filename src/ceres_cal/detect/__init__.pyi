@@ -26,5 +26,7 @@ from ceres_cal.detect.photographs.known import is_painted as is_painted
 from ceres_cal.detect.photographs.refit import PointHints as PointHints
 from ceres_cal.detect.rings import RingsDetection as RingsDetection
 from ceres_cal.detect.rings import detect_rings as detect_rings
+from ceres_cal.detect.video import folder_of_frames as folder_of_frames
 from ceres_cal.detect.video import frames_of_videos as frames_of_videos
 from ceres_cal.detect.video import spread_frames as spread_frames
+from ceres_cal.detect.video import turned_words as turned_words

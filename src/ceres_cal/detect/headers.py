@@ -8,6 +8,9 @@ import struct
 _COMMENT = rb"(?:\s+|#[^\n]*\n)+"
 _PNM = re.compile(rb"P[1-6]" + _COMMENT + rb"(\d{1,9})" + _COMMENT + rb"(\d{1,9})")
 _JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others are tables
+_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}  # of the bytes in a TIFF, by how it begins
+_ORIENTATION, _TURNED_DEG = 274, {3: 180, 6: 90, 8: 270}  # the tag, and by how much viewers turn clockwise
+_EXIF = b"Exif\0\0"  # before the TIFF with a JPEG's notes
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:
@@ -23,8 +26,8 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
         return width, abs(height)  # negative from the top down
     if content.startswith(b"\xff\xd8\xff"):
         return _jpeg(content)
-    if content.startswith((b"II*\0", b"MM\0*")):
-        return _tiff(content, "<" if content.startswith(b"II") else ">")
+    if order := _ORDERS.get(content[:4]):
+        return _tiff(content, order)
     if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
         return _webp(content)
     if content.startswith(b"\xff\x4f\xff\x51"):
@@ -33,6 +36,16 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
         return _jpeg_2000(content, start + 8)
     match = _PNM.match(content[:10_000])
     return (int(match[1]), int(match[2])) if match else None
+
+
+def viewers_turn_deg(content: bytes) -> int:
+    """By how much viewers turn a JPEG or TIFF clockwise, as it notes for them; 0, 90, 180 or 270."""
+    notes = content.partition(_EXIF)[2] if content.startswith(b"\xff\xd8\xff") else content
+    try:
+        order = _ORDERS.get(notes[:4])
+        return _TURNED_DEG.get(_tags(notes, order, _ORIENTATION)[0], 0) if order else 0
+    except struct.error:  # quiet: notes that are cut short turn nothing
+        return 0
 
 
 def _unpack(form: str, content: bytes, at: int) -> tuple[int, int]:
@@ -64,15 +77,21 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
 
 
 def _tiff(content: bytes, order: str) -> tuple[int, int]:
-    sizes = {256: 0, 257: 0}
+    width, height = _tags(content, order, 256, 257)
+    return width, height
+
+
+def _tags(content: bytes, order: str, *wanted: int) -> list[int]:
+    """The values of some tags of a TIFF, the largest where one is there again; 0 where it is not."""
+    values = dict.fromkeys(wanted, 0)
     (start,) = struct.unpack_from(order + "I", content, 4)
     (count,) = struct.unpack_from(order + "H", content, start)
     for number in range(count):
         tag, kind = struct.unpack_from(order + "HH", content, start + 2 + 12 * number)
-        if tag in sizes:
+        if tag in values:
             (value,) = struct.unpack_from(order + ("H" if kind == 3 else "I"), content, start + 10 + 12 * number)
-            sizes[tag] = max(sizes[tag], value)
-    return sizes[256], sizes[257]
+            values[tag] = max(values[tag], value)
+    return list(values.values())
 
 
 def _webp(content: bytes) -> tuple[int, int] | None:

@@ -9,7 +9,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base import AnyArray, Array32, Image, InputError, Mask, median, quantile, read_bytes, require_room
+from ceres_cal.base import (
+    VIDEO_ENDINGS,
+    AnyArray,
+    Array32,
+    Image,
+    InputError,
+    Mask,
+    median,
+    quantile,
+    read_bytes,
+    require_room,
+)
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
@@ -71,10 +82,12 @@ def read_colour(path: str | Path) -> Image:
 
 
 def _decoded(path: str | Path, channels: int) -> Image:
+    if Path(path).suffix.lower() in VIDEO_ENDINGS:
+        raise InputError(f"{path}: not an image but a video: give frames of it, as PNG")
     content = read_bytes(path)
     flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = None
-    with suppress(cv2.error, struct.error):  # reads: "not an image that OpenCV can read (cut short?)"
+    with suppress(cv2.error, struct.error):  # reads: "not an image that OpenCV can read (cut short?) ..."
         if size := claimed_size(content):
             _require_believable(size, len(content), str(path))
             packed = np.frombuffer(content, np.uint8)
@@ -82,8 +95,18 @@ def _decoded(path: str | Path, channels: int) -> Image:
             if image is None or image.dtype.itemsize > 2:  # of which OpenCV makes no grey
                 image = _in_levels(cv2.imdecode(packed, flags | cv2.IMREAD_ANYCOLOR), channels, str(path))
     if image is None:
-        raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
+        raise InputError(f"{path}: {_not_an_image(content)}")
     return image
+
+
+def _not_an_image(content: bytes) -> str:
+    """What is wrong with a file that is no image, and what to do."""
+    if not content:
+        return "not an image but an empty file: leave it out"
+    with suppress(UnicodeDecodeError):  # reads: "not an image that OpenCV can read ..."
+        if "\0" not in content.decode():
+            return "not an image but text: give photographs (files of observations end in .json or .npz)"
+    return "not an image that OpenCV can read (cut short?): convert it to PNG or leave it out"
 
 
 def _in_levels(image: AnyArray | None, channels: int, path: str) -> Image | None:

@@ -8,7 +8,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base import Frozen, Image, ImageProgress, InputError, make_folder, require_room, write_bytes
+from ceres_cal.base import (
+    VIDEO_ENDINGS,
+    Frozen,
+    Image,
+    ImageProgress,
+    InputError,
+    make_folder,
+    read_bytes,
+    require_room,
+    write_bytes,
+)
+from ceres_cal.detect.headers import viewers_turn_deg
 from ceres_cal.detect.images import encoded
 
 MOST_FRAMES = 200_000
@@ -66,6 +77,7 @@ def _opened(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path)) if path.is_file() else None
     if capture is None or not capture.isOpened():
         raise _not_a_video(path)
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)  # pixels as the sensor stored them, as of photographs
     return capture
 
 
@@ -126,11 +138,31 @@ def _sharpness(frame: Image) -> float:
 def frames_of_videos(
     videos: Sequence[Path], count: int, folder: Path, progress: ImageProgress | None = None
 ) -> list[Path]:
-    """The sharpest frames of each video, written into a folder of its name.
+    """The sharpest frames of each video, written into a folder of its own: see `folder_of_frames`.
 
     Raises:
-        InputError: a video cannot be read, or count is below 1.
+        InputError: a video cannot be read, two would have one folder, or count is below 1.
     """
     if count < 1:
         raise InputError(f"--frames must be at least 1, not {count}")
-    return [path for one in videos for path in sharpest_frames(one, folder / one.stem, count, progress)]
+    folders = [folder_of_frames(one, folder) for one in videos]
+    for number, one in enumerate(videos):
+        if folders[number] in folders[:number]:
+            raise InputError(f"{one}: another video is called {one.stem!r}, too: rename one")
+    each = zip(videos, folders, strict=True)
+    return [path for one, own in each for path in sharpest_frames(one, own, count, progress)]
+
+
+def turned_words(path: Path) -> str:
+    """What is to be known of a photograph or video whose file tells viewers to turn it; "" of any other.
+
+    Pixels are those that the sensor stored, however the camera was held: intrinsics belong to them.
+    """
+    is_video = path.suffix.lower() in VIDEO_ENDINGS
+    degrees = _opened(path).get(cv2.CAP_PROP_ORIENTATION_META) if is_video else viewers_turn_deg(read_bytes(path))
+    return f"its file tells viewers to turn it by {degrees:.0f} degrees, but it is used as stored" if degrees else ""
+
+
+def folder_of_frames(video: Path, folder: Path) -> Path:
+    """Where the frames taken out of a video are written: beside its name, where a folder of photographs may be."""
+    return folder / f"{video.stem}_frames"

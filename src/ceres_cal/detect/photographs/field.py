@@ -31,6 +31,7 @@ from ceres_cal.detect.photographs.judgement import is_shown, why_missed
 from ceres_cal.detect.photographs.refit import FreeIntrinsics
 from ceres_cal.detect.photographs.search import OTHER, SearchResult, SeveralWaysError, search
 from ceres_cal.detect.strokes import Strokes, strokes_of_signs
+from ceres_cal.detect.video import turned_words
 from ceres_cal.observations import COMA, NO_POINTS, Curves, Observations, Prior, View, combine, joined
 from ceres_cal.problem.structure import features_of
 from ceres_cal.robust.as_built import drawn_as_stated
@@ -130,6 +131,8 @@ def detect_field(
                 return _looked_for(_without(grey, options.left_out), drawn, painted, starts, options)
             except SeveralWaysError as error:
                 refused(path, SearchResult(None, str(error), seen=error.seen))
+                if path.is_file() and (turned := turned_words(path)):
+                    raise InputError(f"{error}; {turned}") from None
                 raise
 
     for number, path in enumerate(paths, start=1):
