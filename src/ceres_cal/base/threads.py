@@ -161,7 +161,7 @@ def _keep_freed_memory() -> None:
         library.mallopt(*mapped)
 
 
-class _Left(threading.Thread):
+class _DetachedThread(threading.Thread):
     """Work that may be left to itself.
 
     Attributes:
@@ -175,7 +175,7 @@ class _Left(threading.Thread):
 def writing() -> Iterator[None]:
     """While a file is written; InputError where the thread was left to itself."""
     thread = threading.current_thread()
-    if not isinstance(thread, _Left):
+    if not isinstance(thread, _DetachedThread):
         yield
         return
     thread.is_writing = True  # before it looks, as whoever leaves it says so before waiting
@@ -205,7 +205,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
         except BaseException as error:  # quiet: raised again in the thread that waits
             results.append((None, error))
 
-    thread = _Left(target=copy_context().run, args=(work,), daemon=True)  # and what it writes is noted here
+    thread = _DetachedThread(target=copy_context().run, args=(work,), daemon=True)  # and what it writes is noted here
     _unfinished.append(thread)
     thread.start()
     end = None if timeout_s is None else time.monotonic() + timeout_s
