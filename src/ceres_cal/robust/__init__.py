@@ -1,4 +1,4 @@
-"""What belongs: rounds of the solve, noise and outliers, features aside, other minima, targets as built."""
+"""The robust solve: rounds, noise, outliers, misplaced features, other minima, targets as built, tests of priors."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -1,15 +1,15 @@
-"""Targets that are not where they are drawn, solved for; and dimensions of targets that are not known.
+"""Solve for targets that differ from their drawing, and for dimensions of targets that are not known.
 
-How large the noise is, what is an outlier and what explanations say of whole lines and frames change with the offsets,
-and these with all that. So in turns the offsets are read off the residuals and everything else is solved for with the
-targets drawn as they were found to be, which costs no more than a calibration, until the sigmas stay.
+The noise, the outliers and the explanations of whole lines and frames depend on the offsets of the features, and these
+depend on them. So two steps alternate until the sigmas converge: the offsets are estimated from the residuals, and
+everything else is solved for with the targets drawn as built, which costs no more than a calibration.
 
-A board's corners and bows, a field's lines: a few numbers move each of them, the same in all views. Their sizes are
-those of `effects.evidence`, under the prior AS_BUILT. Whether there is anything to look for is asked first of some
-views, by products of different views alone. What smooth displacements of the image explain has no say in them, for a
-lens that is too simple would bend a board (a module that is cut off; Liu, Bayarri and Berger, Bayesian Analysis 4,
-2009); so a board's offsets are not solved for with all the rest. The few of a field, which nothing but its cameras
-together tell, are. The posterior has them under their sigmas like any tolerance.
+A few numbers move each of a board's corners and bows and of a field's lines, the same in all views. Their sizes are
+estimated by `effects.evidence` under the prior AS_BUILT. Products of different views, of some views only, first show
+whether there is anything to estimate. What smooth displacements of the image explain is projected out, since a lens
+that is too simple would bend a board (a module that is cut off; Liu, Bayarri and Berger, Bayesian Analysis 4, 2009); so
+a board's offsets are not solved for with the rest. The few offsets of a field, which only its cameras together
+determine, are. In the posterior they have their sigmas as tolerances.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from ceres_cal.robust.competing import Solver, compete
 from ceres_cal.robust.robust import RobustSolution, SolvedFrom, judge_at, solve_robustly
 from ceres_cal.scene.targets import Target
 
-_MOST_ROUNDS, _AT_REST = 3, 0.2  # of the logarithm of a sigma: by less it is no other one
+_MOST_ROUNDS, _AT_REST = 3, 0.2  # change of the logarithm of a sigma below which it has converged
 
 
 class ViewEffects(Frozen):
-    """What displaces single views, each in its own way, and is taken off the observations.
+    """Displacements of single views, different in each, that are subtracted from the observations.
 
     Attributes:
-        displacement: (N + M, 2) px. columns: of a model, those of its amounts, and these with their sigmas.
+        displacement: (N + M, 2) px. columns: of a linear model, those of the amounts, and their numbers with sigmas.
     """
 
     displacement: Array
@@ -55,11 +55,11 @@ class ViewEffects(Frozen):
 
 
 class Construction(Frozen):
-    """How targets are likely built.
+    """The likely construction of targets.
 
     Attributes:
-        every: the kinds of features that are not where they are drawn. whole: their likeliest offsets. moved: (Q,)
-            numbers of those that were found. covariance: (Q, Q) of these.
+        every: the kinds of features that differ from the drawing. whole: the structure with their likeliest offsets.
+        moved: (Q,) numbers of the offsets that were found. covariance: (Q, Q) of these.
     """
 
     every: tuple[AsBuilt, ...] = ()
@@ -87,11 +87,11 @@ def solve_as_built(
     views: ViewEffects | None = None,
     left_out: frozenset[tuple[str, Kind]] = frozenset(),
 ) -> tuple[RobustSolution, Problem, tuple[Explanation, ...], tuple[AsBuilt, ...]]:
-    """The end, problem and explanations with everything solved for that is likely not where it is drawn; and what is.
+    """Solve for everything that likely differs from its drawing. Returns the end, problem, explanations, and what does.
 
     Args:
-        problem: of all the observations. end: of its rounds, without what the explanations took out, with targets
-            drawn as `built`. solver: of some of the observations, see `compete`. views: what was taken off.
+        problem: of all the observations. end: of its rounds, without what the explanations left out, with targets drawn
+            as `built`. solver: of a subset, see `compete`. views: what was subtracted from views.
         left_out: targets and kinds that are as drawn.
     """
     observations, options, stated, first = problem.observations, problem.options, end.estimate.structure, end
@@ -112,7 +112,7 @@ def solve_as_built(
         return end, problem, explanations, ()
     before, rounds, change = now, 1, _change(now, built)
     end = solved(before)
-    while change > 2.0 and rounds < _MOST_ROUNDS:  # the next one is less than half of it
+    while change > 2.0 and rounds < _MOST_ROUNDS:  # the next change is less than half of this one
         now = estimate_as_built(problem, _freed(end, problem, freed(before)), left_out)
         change = _change(now, before) if now.every else 0.0
         if change > 1.0:
@@ -141,7 +141,7 @@ def solve_as_built(
 
 
 def solve_held(solver: SolvedFrom, problem: Problem, estimate: Estimate, every: Sequence[AsBuilt]) -> RobustSolution:
-    """The problem solved from an estimate that has targets as they are built: what was found of boards is held."""
+    """Solve a problem from an estimate that has targets as they are built; offsets found of boards are held."""
     if not _is_held(every, problem):
         return solver(problem, estimate)
     built, stated = estimate.structure, problem.options.structure_of(problem.observations.targets)
@@ -151,13 +151,13 @@ def solve_held(solver: SolvedFrom, problem: Problem, estimate: Estimate, every: 
 
 
 def _is_held(every: Sequence[AsBuilt], problem: Problem) -> bool:
-    """Whether what is not as drawn is held while everything else is solved for: not where the world is among it."""
+    """Whether offsets from the drawing are held while everything else is solved for: not if some are of the world."""
     world = {view.target for view in problem.observations.views if view.placement is None}
     return bool(every) and not world & {one.target for one in every}
 
 
 def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) -> RobustSolution:
-    """The end of the problem with targets held as they are built, judged where these are free."""
+    """The end of a solve with targets held as they are built, judged with their offsets free."""
     settled = replace(end.solution, estimate=replace(end.estimate, structure=structure))
     as_smooth = replace(problem, smoothness=end.problem.smoothness)
     return replace(judge_at(as_smooth, settled.estimate), solution=settled, rounds=end.rounds)
@@ -166,12 +166,12 @@ def _as_measured(problem: Problem, end: RobustSolution, structure: Structure) ->
 def _beside_views(
     every: Sequence[AsBuilt], end: RobustSolution, stated: Structure, views: ViewEffects
 ) -> Iterator[AsBuilt]:
-    """The same as probable as they are where single views may be displaced otherwise, too.
+    """The same with the probabilities that remain where single views may be displaced in their own ways, too.
 
-    What was taken off of these followed what was solved for with it, and would say it again: halves of a set found
-    a board of which pictures have a rolling shutter .4 % longer and .9 % shorter, each at a probability of 1.
+    What was subtracted from the views depends on the offsets that were found and would confirm them: halves of a set of
+    pictures with a rolling shutter found the board .4 % longer and .9 % shorter, each with probability 1.
     """
-    most_sights = 40  # of a camera: each has numbers of its own
+    most_sights = 40  # of a camera, since each sight has its own unknowns
     targets = end.problem.observations.targets
     structure = whole_structure(targets, {one.target for one in every if one.kind == "heights"})
     equations, weights = _equations(stated, end, some_sights(end.problem.sights, most_sights), views)
@@ -181,18 +181,18 @@ def _beside_views(
     kinds = {(one.target, one.kind): numbers[one.target, one.kind] for one in every}
     known = [(own.size + at, sigma) for at, sigma in sizes]
     found = repeats.sizes(kinds, _priors(kinds, targets), known)
-    for one in every:  # as it was where the views' own numbers leave too few equations to tell
+    for one in every:  # unchanged where the views' own numbers leave too few degrees of freedom
         yield replace(one, probability=found.get((one.target, one.kind), (0.0, one.probability))[1])
 
 
 def shifts_as_drawn(every: Sequence[AsBuilt], end: RobustSolution) -> tuple[Sequence[Key], list[Array]]:
-    """Numbers, and by how much they scatter for kinds of features that may be where they are drawn, as far as that is
-    probable.
+    """Keys (K), and the vectors (K,) by which they move if a doubtful kind of features is where it is drawn, as far as
+    that is probable.
 
     Args:
-        end: with everything solved for that is likely not where it is drawn.
+        end: with everything solved for that likely differs from its drawing.
     """
-    negligible = 0.01  # probability: nothing is visibly wider
+    negligible = 0.01  # probability below which nothing is visibly wider
     doubtful = [one for one in every if 1.0 - one.probability > negligible]
     if not doubtful:
         return (), []
@@ -208,7 +208,7 @@ def shifts_as_drawn(every: Sequence[AsBuilt], end: RobustSolution) -> tuple[Sequ
 
 
 def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:
-    """The sigmas as tolerances."""
+    """The estimated sigmas as tolerances."""
     sigmas: dict[str, dict[str, Any]] = {}
     for one in every:
         sigmas.setdefault(one.target, {})[f"{one.kind}_m"] = one.sigma_m
@@ -216,19 +216,19 @@ def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:
 
 
 def words_of(every: Sequence[AsBuilt]) -> tuple[str, ...]:
-    """One line for each target that is not as drawn."""
+    """One line for each target that differs from its drawing."""
     targets = dict.fromkeys(one.target for one in every)
     said = {target: " and ".join(one.words for one in every if one.target == target) for target in targets}
     return tuple(f"{target!r} is not as drawn: {words}; solved for" for target, words in said.items())
 
 
 def _held(problem: Problem, built: Construction) -> Problem:
-    """The problem of targets that are drawn as they are built."""
+    """The problem with targets that are drawn as they are built."""
     return replace(problem, sights=built.held(problem.sights))
 
 
 def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> RobustSolution:
-    """The end of a problem that was held, as one of targets that are built like that."""
+    """The end of a solve with targets held as they are built, as the end of a problem in which that is free."""
     sights = problem.used(end.inliers.points, end.inliers.curves).sights
     estimate = replace(end.estimate, structure=structure)
     solution = replace(end.solution, estimate=estimate)
@@ -236,7 +236,7 @@ def _freed(end: RobustSolution, problem: Problem, structure: Structure) -> Robus
 
 
 def taking_part(problem: Problem, explanations: Sequence[Explanation]) -> Problem:
-    """The problem without what they took out."""
+    """The problem without the observations that the explanations leave out."""
     rows = [one.rows for one in explanations if one.is_taken]
     if not rows:
         return problem
@@ -246,14 +246,14 @@ def taking_part(problem: Problem, explanations: Sequence[Explanation]) -> Proble
 
 
 def _change(now: Construction, before: Construction) -> float:
-    """By how much a sigma, or the offsets, are others at most, over what is no other one; infinite where they are not
-    of the same kinds.
+    """The largest change of a sigma or of the offsets, relative to the change that counts as converged; infinite where
+    the kinds differ.
     """
     sigmas = {(one.target, one.kind): one.sigma_m for one in before.every}
     if {(one.target, one.kind) for one in now.every} != set(sigmas):
         return np.inf
-    # Standard deviations by which offsets may still move, root mean square of those directions that are known apart: of
-    # a board's two sides the difference is known to a hundredth of what each is.
+    # Standard deviations by which offsets may still move, as root mean square over the directions that are determined:
+    # of a board's two sides, the difference is known to a hundredth of each.
     still = 0.5
     logs = [abs(float(np.log(one.sigma_m / sigmas[one.target, one.kind]))) for one in now.every]
     steps = (now.whole.values - now.whole.carrying(before.whole).values)[now.moved]
@@ -262,11 +262,11 @@ def _change(now: Construction, before: Construction) -> float:
 
 
 def _measured(every: Sequence[AsBuilt], structure: Structure, targets: Mapping[str, Target]) -> Iterator[AsBuilt]:
-    """The same with the offsets that came out."""
+    """The same with the offsets that resulted from the last solve."""
     numbers = numbers_by_kind(structure, targets)
     for one in every:
         values, size_m = structure.values[numbers[one.target, one.kind]], _longer_side_m(targets[one.target])
-        # No view tells both sides' stretch alike, which has the scatter of their mean.
+        # No view determines what both sides stretch alike, so the stretch has the scatter of their mean.
         stretch = (float(values[0] - values[1]) / size_m, one.sigma_m / size_m / 2.0**0.5)
         yield replace(one, rms_m=rms(values), stretch=stretch if one.kind == "stretch" else None)
 
@@ -275,14 +275,14 @@ def _longer_side_m(target: Target) -> float:
     return float(np.max(np.ptp(target.box, axis=0)))
 
 
-# Of a dimension, its standard deviation from which on it is not measured. What nothing measures has an infinite one,
-# but for rounding.
+# Relative standard deviation of a dimension above which it counts as not measured. It is infinite, except for rounding,
+# where nothing measures the dimension.
 _UNMEASURED = 0.3
 
 
 def free_dimensions(observations: Observations, options: Options) -> tuple[Observations, Options]:
-    """The observations of targets drawn with the lengths that are stated of them, and options that name those, and the
-    tolerances of curves that lie beside their drawing.
+    """The observations of targets drawn with their stated dimensions, and options that name these dimensions and the
+    tolerances of curves that are stated to be off their drawing.
     """
     priors = (*observations.priors, *options.priors)
     names = dict.fromkeys((*options.dimensions, *(prior.dimension for prior in priors if prior.dimension)))
@@ -299,17 +299,17 @@ def free_dimensions(observations: Observations, options: Options) -> tuple[Obser
 def drawn_as_stated(targets: Mapping[str, Target], priors: Sequence[Prior]) -> dict[str, Target]:
     """The targets with the dimensions that priors state."""
     stated: dict[str, dict[str, float]] = {}
-    for prior in sorted(priors, key=lambda prior: not prior.is_open):  # what is known better comes last
+    for prior in sorted(priors, key=lambda prior: not prior.is_open):  # better-known values come last and win
         if prior.dimension and prior.name in targets and prior.quantity in targets[prior.name].dimensions:
             stated.setdefault(prior.name, {})[prior.quantity] = prior.value[0]
     return {name: redrawn(target, stated.get(name, {})) for name, target in targets.items()}
 
 
 def require_measured(problem: Problem, estimate: Estimate) -> None:
-    """Raise DegenerateError where nothing says how long something is that is solved for.
+    """Raise DegenerateError where nothing determines a dimension that is solved for.
 
     Raises:
-        DegenerateError: which measurement is missing.
+        DegenerateError: it names the missing measurement.
     """
     lengths = estimate.structure.dimensions
     if not lengths:
@@ -337,20 +337,20 @@ def require_measured(problem: Problem, estimate: Estimate) -> None:
         )
 
 
-# Standard deviations of products of different views from which on the likelihood is asked, which costs as much again.
+# Standard deviations of products of different views above which the likelihood is computed, which costs as much again.
 _REPEATS = 2.0
 
 
 def estimate_as_built(
     problem: Problem, end: RobustSolution, left_out: frozenset[tuple[str, Kind]] = frozenset()
 ) -> Construction:
-    """The kinds of features that are likely not where they are drawn, of targets without a stated tolerance; and the
-    whole structure with their likeliest offsets, and those of stated tolerances as they are.
+    """The kinds of features that likely differ from the drawing, of targets without a stated tolerance; with the whole
+    structure: their likeliest offsets, and those of stated tolerances unchanged.
 
     Args:
-        problem: of all the observations. end: of its rounds. left_out: targets and kinds that are not asked.
+        problem: of all the observations. end: of its rounds. left_out: targets and kinds that count as drawn.
     """
-    most_screened, most_sights = 12, 200  # of a camera: that are asked first, and that tell the sigma
+    most_screened, most_sights = 12, 200  # sights of a camera: for the first test, and for the sigmas
     targets, tolerances = problem.observations.targets, problem.options.tolerances
     structure, dimensions = whole_structure(targets), problem.options.dimensions
     stated = make_structure(targets, tolerances, dimensions).carrying(end.estimate.structure)
@@ -365,8 +365,8 @@ def estimate_as_built(
     repeat = {of for of, numbers in kinds.items() if agreement(scores[:, numbers]) > _REPEATS}
     if not repeat:
         return Construction((), structure.carrying(stated))
-    # What one kind leaves hides another: a board bowed by 0.1 mm was seen only once its points had been moved. But
-    # heights, as many as points, took up what a wrong floor left of eight views of a board: they repeat by themselves.
+    # What one kind leaves hides another: a board bowed by 0.1 mm was found only once its points had been moved. But
+    # heights, as many as points, took up the errors of a wrong floor in eight views of a board: they must repeat.
     structure = whole_structure(targets, {target for target, kind in repeat if kind == "heights"})
     asked = numbers_by_kind(structure, targets)
     kinds, as_stated = {of: asked[of] for of in kinds if of in asked}, structure.carrying(stated)
@@ -383,7 +383,7 @@ def estimate_as_built(
 
 
 def some_sights(sights: Sights, most: int) -> Sights:
-    """All of the world, and of each camera's others at most so many, evenly."""
+    """All sights of the world, and at most `most` of the other sights of each camera, evenly."""
     chosen = [sights.numbers(placements=(None,))]
     world = set(chosen[0].tolist())
     for camera in sights.cameras:
@@ -398,8 +398,8 @@ def some_sights(sights: Sights, most: int) -> Sights:
 def _equations(
     stated: Structure, end: RobustSolution, sights: Sights, views: ViewEffects | None = None
 ) -> tuple[Equations, Weights]:
-    """Of some sights, with the residuals to the drawing: offsets that were found before, and what displaces views, are
-    not taken off.
+    """Equations and weights of some sights with residuals to the drawing: neither offsets found before nor the views'
+    displacements are subtracted.
     """
     estimate = end.estimate
     equations = equations_of(sights, estimate, end.residuals)
@@ -412,14 +412,14 @@ def _equations(
 
 
 def _columns(structure: Structure, equations: Equations, weights: Weights) -> SparseColumns:
-    """Of the structure's numbers."""
+    """The columns of the structure's numbers."""
     slots, scale = equations.slots(structure), weights.inverse_sigma * weights.used
     values = np.where(slots >= 0, equations.built * scale[:, None], 0.0)
     return SparseColumns(np.where(slots >= 0, slots, len(structure.names)), values, len(structure.names))
 
 
 def _drawn(equations: Equations, weights: Weights, stated: Structure, end: RobustSolution) -> Linearised:
-    """The linear model of the targets as drawn, smooth displacements of the image free besides."""
+    """The linear model of targets as drawn, in which smooth displacements of the image are free as well."""
     estimate = replace(end.estimate, structure=stated)
     problem = end.problem.of_sights(np.flatnonzero([key in equations.sights.keys for key in end.problem.sights.keys]))
     model = make_linear_model(problem, estimate, equations, weights)
@@ -432,7 +432,7 @@ def _drawn(equations: Equations, weights: Weights, stated: Structure, end: Robus
 def _likely(
     repeats: RepeatedAmounts, kinds: Mapping[tuple[str, Kind], Indices], targets: Mapping[str, Target]
 ) -> Iterator[AsBuilt]:
-    """The kinds that more likely scatter than not, each beside those of the others that do."""
+    """The kinds that more likely scatter than not, each estimated beside the others that do."""
     sizes = repeats.sizes(kinds, _priors(kinds, targets))
     for target, kind in kinds:
         sigma, probability = sizes.get((target, kind), (0.0, 0.0))
@@ -441,6 +441,6 @@ def _likely(
 
 
 def _priors(kinds: Iterable[tuple[str, Kind]], targets: Mapping[str, Target]) -> dict[tuple[str, Kind], SizePrior]:
-    """What is expected of each."""
+    """The prior on the size of each kind."""
     rare = {"heights": HEIGHTS, "stretch": STRETCHED}
     return {of: rare.get(of[1], AS_BUILT).times(_longer_side_m(targets[of[0]])) for of in kinds}

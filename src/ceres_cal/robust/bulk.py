@@ -1,8 +1,8 @@
-"""Very many observations of the world: some of them decide what there is, all of them say where the numbers are.
+"""Solve for very many observations of the world: a subset decides what there is, and all observations take part.
 
-A part goes all the way of a calibration: the lens, what does not belong as a whole, targets as built. From its end,
-which is off by the standard deviations of a part, all observations are judged and solved for together, in shares that
-answer with sums (`shares`): here, or wherever workers have them.
+The subset goes through all steps of a calibration: the choice of the lens, outliers as a whole, targets as built. From
+its end, which differs from the answer by standard deviations of the subset, all observations are judged and solved for
+together, in shares that answer with sums (`shares`): in this process, or on workers.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ from ceres_cal.problem.shares import Histogram, ResidualSummary, RowSelection, S
 from ceres_cal.robust.noise import SAME, Inliers, NoiseScales, Redundancy, by_count, by_leverage, noise_of
 from ceres_cal.robust.robust import RobustSolution, Rounds
 
-# Observations of the part, and views of it at least.
+# Observations of the subset, about, and views in it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200
-_STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
+_STANDING_OUT = 12  # further views of the largest residuals, and as many of the most outliers
 
 
 class Subset(Frozen):
-    """Some of the observations: all that are not of the world, and whole views of it.
+    """A subset of the observations: all that are not of the world, and evenly chosen views of the world.
 
     Attributes:
-        rows: of its points and of its curve observations among all. gone: (n + m,) what does not belong, as a whole.
+        rows: of its points and of its curve observations, among all observations. gone: (n + m,) rows that explanations
+            leave out as a whole.
     """
 
     observations: Observations
@@ -42,10 +43,11 @@ class Subset(Frozen):
 
 
 class BulkSolution(Frozen):
-    """Where all observations were solved for.
+    """The solution for all observations.
 
     Attributes:
-        end: of the part there. used: what takes part of the world. explanations: with all their rows.
+        end: the end, with inliers and residuals of the subset. used: which of all observations take part.
+        explanations: with the rows among all observations.
     """
 
     observations: Observations
@@ -55,7 +57,7 @@ class BulkSolution(Frozen):
 
 
 class Bulk:
-    """Very many observations, and the engine that asks them."""
+    """Very many observations, and the engine that computes sums over them."""
 
     def __init__(self, observations: Observations, client: Any = None) -> None:
         self.observations: Observations = observations
@@ -79,14 +81,14 @@ class Bulk:
         return engine
 
     def close(self) -> None:
-        """Let all shares go, wherever they are."""
+        """Release all shares, wherever they are."""
         for engine in self._engines:
             engine.close()
 
-    # ---- the part that decides --------------------------------------------------------------------------------------
+    # ---- the subset that decides ------------------------------------------------------------------------------------
 
     def part(self, besides: Indices | None = None) -> Subset:
-        """Views of the world, evenly, and these besides; everything that is not of the world."""
+        """The subset: views of the world, evenly, and the views `besides`; and everything that is not of the world."""
         counts = np.diff(self.observations.ends[0]) + np.diff(self.observations.ends[1])
         chosen = ~self._world
         chosen[some_views(np.where(self._world, counts, 0), _PART, _FEWEST_VIEWS)] = True
@@ -102,14 +104,14 @@ class Bulk:
         return Subset(self.observations.part(*rows), (rows[0], rows[1]))
 
     def standing_out(self, end: RobustSolution) -> Indices:
-        """Views whose residuals are the largest at a solution of a part, and those with most outliers."""
+        """Views of the largest residuals at a solution of a subset, and views of the most outliers."""
         looked = self.look(self._engine, end.estimate, end.problem.weighting, _bounds(end))[1]
         spare = np.maximum(looked.equations, 1.0)
         above = (looked.squares / spare - 1.0) * np.sqrt(spare) * (looked.equations > 0)
         worst = [looked.view[np.argsort(-by, kind="stable")[:_STANDING_OUT]] for by in (above, looked.beyond)]
         return distinct(np.concatenate(worst))
 
-    # ---- all of them ------------------------------------------------------------------------------------------------
+    # ---- all observations -------------------------------------------------------------------------------------------
 
     def settled(
         self,
@@ -119,10 +121,10 @@ class Bulk:
         explanations: Sequence[Explanation],
         progress: SolveProgress | None,
     ) -> BulkSolution:
-        """All observations judged and solved for, from the end of a part.
+        """Judge all observations and solve for them, starting from the end of a subset.
 
         Args:
-            problem: of all of the part.
+            problem: of the whole subset.
         """
         every = tuple(replace(one, rows=self._rows_of(one, part)) for one in explanations)
         taken = [(mine.rows, one.rows) for mine, one in zip(explanations, every, strict=True) if one.is_taken]
@@ -134,7 +136,7 @@ class Bulk:
         return BulkSolution(self.observations, rounds.end(), rounds.used(), every)
 
     def _rows_of(self, explanation: Explanation, part: Subset) -> Mask:
-        """(N + M,) all observations of a whole of which the part has some."""
+        """(N + M,) mask of all observations of what an explanation leaves out, of which the subset has some."""
         few, split = part.observations, len(part.observations.points)
         masks = []
         for is_curve, (own, column) in enumerate(
@@ -150,7 +152,7 @@ class Bulk:
         return np.concatenate(masks)
 
     def _also(self, rows: Mask) -> tuple[Mask, Mask]:
-        """What does not count: copies, and these rows (N + M,)."""
+        """Masks of the points and curve observations that do not count: copies, and these rows (N + M,)."""
         points, curves = np.split(rows, [len(self.observations.points)])
         return (points, curves) if self._left_out is None else (points | self._left_out[0], curves | self._left_out[1])
 
@@ -158,15 +160,17 @@ class Bulk:
         self, engine: InProcess | OnWorkers, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
         along: tuple[tuple[str, Estimate], ...] = (),
     ) -> tuple[str, ResidualSummary]:  # fmt: skip
-        """What residuals are like at an estimate, which is given a name. along: where feet were sought before."""
+        """A new name for an estimate, and the summary of the residuals at it. along: estimates of earlier searches for
+        feet.
+        """
         here = uuid4().hex, of_world(estimate)
         blank = Layout({}, frozenset(), frozenset())
         return here[0], engine.ask(Share.looked, ShareRequest(here[1], blank, weighting, here, bounds, (*along, here)))
 
 
 class _BulkResiduals(Frozen):
-    """Residuals at an estimate: the name of the shares' ones, what these are like, those of the part, and the lengths
-    of these in stated sigmas.
+    """Residuals at an estimate: the name under which shares keep theirs, their summary, the residuals of the subset,
+    their lengths in stated sigmas, and the rows of the subset that are not of the world.
     """
 
     name: str
@@ -177,11 +181,11 @@ class _BulkResiduals(Frozen):
     placed: tuple[Mask, Mask]
 
     def noise(self, redundancy: Redundancy, problem: Problem) -> NoiseScales:
-        """What they say of the noise."""
+        """The noise scales that the residuals show."""
         return noise_of(*self._histograms, redundancy, problem.options)
 
     def inside(self, noise: NoiseScales) -> tuple[int, int]:
-        """How many points and curve observations are no outliers."""
+        """Numbers of points and of curve observations that are inliers."""
         points, curves = self._histograms
         return points.within(noise.bounds[0])[0], curves.within(noise.bounds[1])[0]
 
@@ -192,17 +196,17 @@ class _BulkResiduals(Frozen):
 
 
 class _SumRound(RobustSolution, kw_only=True):
-    """Where one round over all observations ended; inliers and residuals are the part's.
+    """The end of one round over all observations. Its inliers and residuals are those of the subset.
 
     Attributes:
-        problem: as it was solved last. seen: residuals there. noise: as it was judged by them.
+        problem: as it was last solved. seen: the residuals at its end. noise: the noise that they show.
     """
 
     seen: _BulkResiduals
     noise: NoiseScales
 
     def judged_like(self, before: _SumRound, no_change: float) -> bool:
-        """Whether no scale changed, and about as many take part."""
+        """Whether no scale changed, and the numbers of inliers are about the same."""
         scales = zip(self.noise[:2], before.noise[:2], strict=True)
         rows = zip(self.seen.inside(self.noise), before.seen.inside(before.noise), strict=True)
         return all(abs(now - then) <= no_change * then for now, then in scales) and all(
@@ -211,7 +215,7 @@ class _SumRound(RobustSolution, kw_only=True):
 
 
 class _SumRounds(Rounds[_SumRound]):
-    """The rounds over sums, of shares that are anywhere."""
+    """The rounds over sums of shares, which may be on workers."""
 
     def __init__(
         self, bulk: Bulk, engine: InProcess | OnWorkers, part: Subset, problem: Problem, end: RobustSolution,
@@ -237,7 +241,7 @@ class _SumRounds(Rounds[_SumRound]):
         return _BulkResiduals(name, estimate, looked, here, (points, curves), self._placed)
 
     def _judged(self, seen: _BulkResiduals, noise: NoiseScales) -> Problem:
-        """The problem of what takes part, judged at the last estimate."""
+        """The problem of the inliers, judged at the last estimate."""
         options, (points, curves) = self._problem.options, noise.bounds
         inside = seen.lengths[0] <= points, seen.lengths[1] <= curves
         equations = 2 * seen.looked.points.within(points)[0] + seen.looked.curves.within(curves)[0]
@@ -254,8 +258,8 @@ class _SumRounds(Rounds[_SumRound]):
         )
 
     def next(self, state: _SumRound) -> _SumRound:
-        """One more solve of what was judged to take part, judged."""
-        # Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
+        """Solve once more for the inliers, and judge the result."""
+        # Relative change of the cost at which a solve for all ends: the order of sums changes the end by its root.
         to_the_last = 1e-17
         problem = self._judged(state.seen, state.noise)
         solution = solve(problem, state.seen.estimate, self._progress, precision=to_the_last)
@@ -266,23 +270,23 @@ class _SumRounds(Rounds[_SumRound]):
         self, problem: Problem, solution: Solution, seen: _BulkResiduals, redundancy: Redundancy, rounds: int,
         reduced: ReducedInformation | None = None,
     ) -> _SumRound:  # fmt: skip
-        """Where a solve ended, judged."""
+        """The state where a solve ended, judged."""
         noise = seen.noise(redundancy, self._problem)
         inliers = Inliers.by_noise(*seen.lengths, noise)
         return _SumRound(problem, solution, inliers, seen.here, rounds, reduced, seen=seen, noise=noise)
 
     def with_leverages(self, state: _SumRound) -> _SumRound:
-        """The state judged by the leverages, with what all observations say there."""
+        """The state judged by the leverages, with the information of all observations."""
         elsewhere = state.problem.elsewhere
         assert isinstance(elsewhere, SharedObservations)
-        here = replace(elsewhere, feet_along=self._along)  # else shares would seek those of before again
+        here = replace(elsewhere, feet_along=self._along)  # else shares would search for earlier feet again
         reduced = information(replace(state.problem, elsewhere=here), state.estimate)
         points, curves = state.seen.inside(state.noise)
         redundancy = by_leverage((2 * points, curves), reduced.leverages)
         return self._round(state.problem, state.solution, state.seen, redundancy, state.rounds, reduced)
 
     def end(self) -> RobustSolution:
-        """The end of the rounds, with what all observations say there."""
+        """Run the rounds. Returns their end, with the information of all observations."""
         most_rounds = 8
         before = self._before
         seen = self._look(before.estimate, _bounds(before), before.problem.weighting)
@@ -296,7 +300,7 @@ class _SumRounds(Rounds[_SumRound]):
         return RobustSolution(problem, state.solution, inliers, state.residuals, rounds, state.reduced)
 
     def used(self) -> RowSelection:
-        """What takes part at the end, of the world."""
+        """The observations that take part at the end, of the world and of everything else."""
         judged = self._judged(self._seen, self._noise)
         assert isinstance(judged.elsewhere, SharedObservations)
         used = self._engine.ask(Share.used, judged.elsewhere.asked(judged, self._seen.estimate)) + self._used_here()
@@ -305,7 +309,7 @@ class _SumRounds(Rounds[_SumRound]):
         return RowSelection(used.sums, (p[first], c[then]), (far_p[first], far_c[then]))
 
     def _used_here(self) -> RowSelection:
-        """The same of what is not of the world."""
+        """The same for the rows that are not of the world."""
         sums, rows, sigmas = [], [], []
         columns = self._few.points, self._few.curves
         each = zip(
@@ -326,6 +330,6 @@ class _SumRounds(Rounds[_SumRound]):
 
 
 def _bounds(end: RobustSolution) -> tuple[float, float]:
-    """Lengths in stated sigmas from which on observations are outliers, about."""
+    """Approximate lengths in stated sigmas beyond which observations are outliers."""
     sigmas = end.problem.options.reject_sigma
     return sigmas * end.inliers.point_scale, sigmas * end.inliers.curve_scale

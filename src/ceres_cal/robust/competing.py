@@ -1,13 +1,13 @@
-"""Competing explanations: the same observations without a line that may not belong, as a whole.
+"""Compare explanations: the same observations with and without a group, such as a line, that may be wrong as a whole.
 
-A line that lies aside as a whole outvotes the others: the fit goes half of the way towards it, no row of it is an
-outlier, and good rows elsewhere become some. So it is asked of each curve in each frame, of each feature over all
-frames, of each frame and of each placement, whether the rest is better explained without it. The linear model at the
-end of all rounds names a few suspects (see `offsets`), a solve without each of them tells what the rest says of it, and
-the more probable explanation wins.
+A line that is misplaced as a whole is not found row by row: the fit moves half of the way towards it, none of its rows
+is an outlier, and good rows elsewhere become outliers. So for each curve in each frame, each feature over all frames,
+each frame and each placement, the question is whether the rest is better explained without it. The linear model at the
+end of all rounds names a few suspects (see `offsets`), a solve without each of them shows what the rest predicts for
+it, and the more probable explanation is taken.
 
-Whether one does not belong rests on a few rows of a few views: of those that stand out, and of others, evenly. So of
-very many observations a part is compared, with all rows of the views that stand out.
+A few rows of a few views decide whether a group is wrong: views that stand out, and others taken evenly. So of very
+many observations a subset is compared, with all rows of the views that stand out.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from ceres_cal.problem.residuals import residuals, write_equations
 from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.robust.usable import require_fits
 
-# Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
-# be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
+# Standard deviations by which a view's mean square residual must exceed the largest that is expected of so many views
+# by noise; else no view is suspected. It is 2 to 4 for boards of which one in ten is drawn 3 % too short, 17 for 10 %.
 _STANDS_OUT = 2.5
 
 
-FEWEST = 3  # observations of a group: two numbers of a line's offset, and one left over
+FEWEST = 3  # observations of a group: two numbers describe the offset of a line, and one equation is left over
 
-# Share of a group's observations in use below which it is compared in any case: its other rows are good by chance.
+# Share of inliers in a group below which it is suspected in any case: the rows that are left agree only by chance.
 _LEFT = 0.5
-# Observations that are asked, and views of them: what the free numbers take up is projected out of the few rows that
-# are compared, so a solve has but to end in the right valley.
+# Observations in the subset, about, and views in it at least. The influence of the free numbers is projected out of the
+# few rows that are compared, so a solve only has to end in the right valley.
 _MOST_ASKED, _FEWEST_ASKED = 200_000, 200
 
 
 class Subproblem(Frozen):
-    """The observations that are asked, with their problem and its end.
+    """The subset of observations that is compared, with its problem and the end of its rounds.
 
     Attributes:
-        kinds: of groups, numbered as among all of them.
+        kinds: the kinds of groups, numbered as among all observations.
     """
 
     problem: Problem
@@ -51,25 +51,26 @@ class Subproblem(Frozen):
     kinds: Sequence[ObservationGroups]
 
     def of_rows(self, rows: Mask) -> Problem:
-        """The problem of these (n + m,)."""
+        """The problem of the observations given by a mask (n + m,)."""
         points = len(self.problem.observations.points)
         return self.problem.used(rows[:points], rows[points:])
 
     def without(self, rows: Mask) -> Problem:
-        """The problem of the others: no placement that they do not show is free."""
+        """The problem of the other observations. Placements that they do not show are not free."""
         others = self.of_rows(~rows)
         return replace(others, layout=others.layout.of(others.sights.keys))
 
 
 Solver = Callable[[Problem, Subproblem], RobustSolution]
-"""Solves a problem of some of the observations that are compared_part, from a start that the others had no part in."""
+"""A function that solves a problem of some observations of a subset, from an estimate that the others did not affect.
+"""
 
 
 def compete(problem: Problem, end: RobustSolution, solver: Solver) -> tuple[RobustSolution, tuple[Explanation, ...]]:
-    """The end of all rounds without the groups that do not belong, and these; also those that are in doubt.
+    """The end of all rounds without the groups that are wrong, and the explanations of these and of doubtful groups.
 
     Args:
-        problem: of all the observations. end: of its rounds.
+        problem: of all the observations. end: the end of its rounds.
     """
     every = Subproblem(problem, end, list(aside.groups_of(problem.sights)))
     if not every.kinds:
@@ -91,15 +92,16 @@ def compete(problem: Problem, end: RobustSolution, solver: Solver) -> tuple[Robu
 
 
 _Suspects = tuple[ObservationGroups, tuple[int, ...]]
-"""Groups of one kind, by their numbers."""
+"""Groups of one kind, and the numbers of those that are suspected."""
 
 
 class _Trial(Frozen):
-    """What a solve without the suspects says of them.
+    """The result of a solve without the suspects.
 
     Attributes:
-        end: of that solve. rows: (N + M,) theirs. log_odds: the least of theirs. explanations: of each.
-        next: the group that does not belong either, where one is suspected.
+        end: the end of that solve. rows: (N + M,) those of the suspects. log_odds: the least of the suspects, that they
+            are wrong.
+        explanations: one of each suspect. next: the group that is suspected next, if any.
     """
 
     suspects: _Suspects
@@ -111,7 +113,7 @@ class _Trial(Frozen):
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
-    """The most probable one, or the largest that is sure and takes all of that along."""
+    """The most probable trial, or the largest one that is certain and includes all rows of the most probable."""
     if not trials:
         return None
     best = max(trials, key=lambda trial: trial.log_odds)
@@ -120,7 +122,7 @@ def _best(trials: Sequence[_Trial]) -> _Trial | None:
 
 
 class _Competition:
-    """What is asked of all suspects. taking_part: (N + M,) the observations that none of them took along."""
+    """The comparison of all suspects. `_taking_part`: (N + M,) the observations that no decided trial left out."""
 
     def __init__(self, some: Subproblem, solver: Solver) -> None:
         self._some, self._solver = some, solver
@@ -128,7 +130,7 @@ class _Competition:
         self._taking_part = np.ones(some.problem.observations.rows, dtype=bool)
 
     def decided(self) -> list[_Trial]:
-        """The trials of groups that do not belong, one after the other; the last one may be in doubt."""
+        """The trials of wrong groups, one after the other. The last one may be doubtful."""
         most_wrong = 4  # groups
         end, decided = self._some.end, list[_Trial]()
         while sum(len(one.explanations) for one in decided) < most_wrong:
@@ -142,7 +144,7 @@ class _Competition:
         return decided
 
     def trials(self, end: RobustSolution) -> Iterator[_Trial]:
-        """What solves without the suspects say; also without one more, where a second one may hide the first."""
+        """The results of solves without each suspect. Where a second group may hide the first, both are left out."""
         for groups, numbers in self.suspects(end):
             trial = self.tried(end, (groups, numbers))
             if trial is not None and trial.log_odds < DOUBTFUL and trial.next is not None:
@@ -151,7 +153,7 @@ class _Competition:
             if trial is not None:
                 yield trial
 
-    # ---- who is looked at -------------------------------------------------------------------------------------------
+    # ---- suspects ---------------------------------------------------------------------------------------------------
 
     def suspects(self, end: RobustSolution) -> Iterator[_Suspects]:
         """Groups without which the rest may be better explained."""
@@ -164,10 +166,9 @@ class _Competition:
                     yield groups, numbers
 
     def _by_offsets(self, end: RobustSolution, groups: ObservationGroups) -> Iterator[tuple[int, ...]]:
-        """Those that the offsets speak against: single ones, and the pair of most evidence."""
-        # Log Bayes factor, by the linear model, from which on a group is looked at by a solve without it: one in thirty
-        # sound scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above
-        # -4.7.
+        """Groups whose offsets the linear model finds suspicious: single ones, and the pair with the most evidence."""
+        # Log Bayes factor of the linear model above which a solve without the group is made. One in thirty sound scenes
+        # is above -4.4; errors that are correlated along lines over 2 m reach 1.6; a line 1.2 px off is above -4.7.
         suspect = -4.4
         if isinstance(groups, ViewGroups):
             above = excess(groups, end, self._taking_part)
@@ -186,10 +187,10 @@ class _Competition:
         if both[second] > max(none, each[first]):
             yield int(chosen[first]), int(chosen[second])
 
-    # ---- what is said of them ---------------------------------------------------------------------------------------
+    # ---- trials -----------------------------------------------------------------------------------------------------
 
     def tried(self, end: RobustSolution, suspects: _Suspects) -> _Trial | None:
-        """What a solve without the suspects says of them; None where there is none, or they lie here and there."""
+        """The result of a solve without the suspects; None if it fails, or if their rows do not agree on an offset."""
         groups, numbers = suspects
         without = self._without(groups, numbers)
         if without is None:
@@ -214,9 +215,9 @@ class _Competition:
         further = None if further is None else int(chosen[further])
         return _Trial(suspects, without, rows, least, tuple(explanations), further)
 
-    @or_none  # quiet: what determines nothing without the suspects is no explanation
+    @or_none  # quiet: without the suspects the others determine nothing, so it is no explanation
     def _without(self, groups: ObservationGroups, numbers: tuple[int, ...]) -> RobustSolution | None:
-        """The end of a solve without some groups; None where the others determine nothing."""
+        """The end of a solve without some groups; None where the others do not determine everything."""
         gone = groups.among(numbers)
         end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
         every = self._some.problem
@@ -231,9 +232,10 @@ class _Competition:
     def _offsets(
         self, end: RobustSolution, groups: ObservationGroups, back: tuple[int, ...]
     ) -> tuple[Indices, Offsets | None]:
-        """Which groups are looked at, and what is said of their offsets, with all rows of some that were left out.
+        """The numbers of the groups that are compared, and their measured offsets, including the rows of the groups
+        `back`, which were left out of the solve.
 
-        None where some of these lie here and there: they are no group.
+        The offsets are None where the rows of a group in `back` do not agree: it is then no group.
         """
         recalled = groups.among(back) & self._taking_part
         rows = rows_compared(groups, end, self._taking_part, recalled)
@@ -258,16 +260,16 @@ class _Competition:
             return chosen, None
         weights = replace(weights, used=used, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(self._some.problem, end.estimate, equations, weights)
-        prior = groups.prior  # that it is one of those that are compared
+        prior = groups.prior  # that a group is wrong: reduced to that of the groups that are compared
         return chosen, aside.measure_offsets(model, effect, replace(prior, absent=1.0 - share * (1.0 - prior.absent)))
 
 
-# ---- what is asked, and what is compared ----------------------------------------------------------------------------
+# ---- the subset -----------------------------------------------------------------------------------------------------
 
 
 def compared_part(every: Subproblem) -> Subproblem:
-    """All observations, or of very many some: of views that stand out, and of others evenly."""
-    most_rejected = 4  # such groups of a kind, whose views are asked
+    """All observations, or of very many a subset: views that stand out, and others evenly."""
+    most_rejected = 4  # mostly rejected groups of each kind whose views are included
     sights, observations = every.problem.sights, every.problem.observations
     if len(sights.point_rows) + len(sights.curve_rows) <= _MOST_ASKED:
         return every
@@ -283,7 +285,7 @@ def compared_part(every: Subproblem) -> Subproblem:
 
 
 def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
-    """Some rows (n + m,) of all, the first of them points, as if there were no others."""
+    """The subproblem of some rows (n + m,), the first `split` of them points, as if there were no others."""
     p, c = rows[:split], rows[split:] - len(every.problem.observations.points)
     problem, there = every.problem.of_rows(p, c), every.end.residuals.of_rows(p, c)
     inliers, weighting = every.end.inliers.of_rows(p, c), every.end.problem.weighting
@@ -297,10 +299,10 @@ def _part(every: Subproblem, rows: Indices, split: int) -> Subproblem:
 
 
 def rows_compared(groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask) -> Mask:
-    """(N + M,) of some views, and of each group in them some.
+    """(N + M,) mask of the rows that are compared: in some views, some rows of each group.
 
     Args:
-        taking_part: (N + M,) all that may be. recalled: (N + M,) what is compared whether or not it is an inlier.
+        taking_part: (N + M,) the rows that may be chosen. recalled: (N + M,) rows that are compared even if rejected.
     """
     most_rows = 40  # of a group in one view
     inside, view = taking_part & (end.inliers.rows | recalled), column_of(groups.observations, "view")
@@ -312,8 +314,8 @@ def rows_compared(groups: ObservationGroups, end: RobustSolution, taking_part: M
 
 
 def views_compared(groups: ObservationGroups, end: RobustSolution, taking_part: Mask, recalled: Mask) -> Mask:
-    """(V,) those with what is recalled, those that stand out, some of the others, and some without any group."""
-    most_others = 16  # views besides, which tell the lens
+    """(V,) mask: views with recalled rows, views that stand out, some of the others, and some without any group."""
+    most_others = 16  # views without any group, which determine the lens
     view = column_of(groups.observations, "view")
     shows_some = np.bincount(view[taking_part & (groups.of >= 0)], minlength=len(groups.frames))
     largest, most = standing_out(groups, end, taking_part), groups.most_views
@@ -329,11 +331,11 @@ def views_compared(groups: ObservationGroups, end: RobustSolution, taking_part: 
 def groups_compared(
     groups: ObservationGroups, end: RobustSolution, rows: Mask, recalled: Sequence[int]
 ) -> tuple[Indices, float]:
-    """The numbers of those that have enough of the rows (N + M,), and which share of them that is.
+    """The numbers of groups that have enough of the rows (N + M,), and their share among all such groups.
 
-    Of very many those that are recalled, those that stand out, and others evenly.
+    Of very many groups: those recalled, those that stand out, and others evenly.
     """
-    most_together = 256  # groups, at the cube of the number: 8 views of a field of 32 lines; 1350 took 25 s
+    most_together = 256  # groups, since time grows with their cube: 8 views of a field of 32 lines; 1350 took 25 s
     every = np.flatnonzero(groups.count(rows) >= FEWEST)
     if len(every) <= most_together:
         return every, 1.0
@@ -345,29 +347,27 @@ def groups_compared(
 
 
 def mostly_rejected(groups: ObservationGroups, end: RobustSolution, taking_part: Mask, most: int) -> list[int]:
-    """The groups with most outliers, where most of their observations are."""
+    """The groups with the most outliers among those in which most observations are outliers."""
     counts, used = groups.count(taking_part), groups.count(end.inliers.rows & taking_part)
     gone = np.where((counts > FEWEST) & (used < _LEFT * counts), counts - used, 0)
     return [int(one) for one in np.argsort(-gone, kind="stable")[:most] if gone[one]]
 
 
 def excess(groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Array:
-    """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
-    median one.
-    """
+    """(size + 1,) by how many standard deviations the mean square residual of each group exceeds the median one."""
     lengths = end.inliers.sigmas
     points, size = len(groups.observations.points), groups.size + 1
     of = np.where(end.inliers.rows & taking_part & (groups.of >= 0), groups.of, np.int64(groups.size))
     spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
     square = np.bincount(of, lengths**2, minlength=size)
-    spare[-1] = square[-1] = 0.0  # of what is in none
+    spare[-1] = square[-1] = 0.0  # the last entry is for rows in no group
     square, there = square / np.maximum(spare, 1.0), spare > 0.0
     middle = median(square[there]) if np.any(there) else 1.0
     return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
 
 
 def standing_out(groups: ObservationGroups, end: RobustSolution, taking_part: Mask) -> Array:
-    """(V,) the largest excess of the groups that each view shows."""
+    """(V,) the largest excess among the groups that each view shows."""
     largest, rows = np.full(len(groups.frames), -np.inf), np.flatnonzero(groups.of >= 0)
     above, view = excess(groups, end, taking_part), column_of(groups.observations, "view")
     np.maximum.at(largest, view[rows], above[groups.of[rows]])

@@ -1,14 +1,15 @@
-"""What was known beforehand against what everything else says: stated numbers, held ones, tolerances, an old posterior.
+"""Compare prior knowledge with everything else: stated numbers, held ones, tolerances, an earlier posterior.
 
-The linear picture of it (Wald's test, below) stands at residuals that a wrong prior has swollen or thrown out as
-outliers. What looks suspicious in it is solved again without the prior and judged there, at the noise there.
+The linear model (Wald's test, below) uses residuals that a wrong prior has enlarged, or that were rejected as outliers
+because of it. A prior that looks suspicious is left out, the problem is solved again, and the prior is judged there, at
+the noise found there.
 
-Wald's test of what is stated: how far everything else is from it.
+Wald's test measures how far everything else is from what is stated.
 
-With C the covariance of some numbers x, P what their priors say of them and z = sum P_j (x - mean_j) their slope,
-everything else says M = C^-1 - P and stands at x + M^-1 z; a prior j is d = x + M^-1 z - mean_j away from that, with
-covariance M^-1 + P_j^-1, and the squared distance is Fisher's F. A number that is held is a prior without width, z the
-slope of the cost along it.
+With C the covariance of some numbers x, P the information of their priors and z = sum P_j (x - mean_j) their slope,
+everything else has the information M = C^-1 - P and its estimate at x + M^-1 z. A prior j is d = x + M^-1 z - mean_j
+away from that, with covariance M^-1 + P_j^-1, and the squared distance follows Fisher's F. A number that is held is a
+prior without width, with z the slope of the cost along it.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ from ceres_cal.robust.stated import (
 )
 
 LARGEST_FREEDOM = 1e6
-"""Degrees of freedom that count as infinitely many."""
-_LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
+"""Degrees of freedom that count as infinite."""
+_LEAST_TOLD = 1e-7  # share of the information on a number that the rest must contribute to say anything about it
 
 
 class Rest(Frozen):
-    """What everything else says of a statement's numbers: a step from an estimate, and how well that is known."""
+    """What everything else says of a statement's numbers: a step from an estimate, its information, and freedom."""
 
     estimate: Estimate
     step: Array
@@ -66,10 +67,10 @@ class Rest(Frozen):
 
 
 def linear_rest(statement: Statement, end: RobustSolution, near: RobustSolution | None = None) -> Rest:
-    """By the linear picture where the problem with the statement was solved.
+    """The rest by the linear model, where the problem with the statement was solved.
 
     Args:
-        near: where everything that is stated said little, if that was solved: less noise than there is none.
+        near: the solution with all statements loosened, if there is one; the noise is at least that found there.
     """
     estimate, freedom = end.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
@@ -86,7 +87,7 @@ def linear_rest(statement: Statement, end: RobustSolution, near: RobustSolution 
         rest = information(freed, estimate).shared.marginal(statement.keys)
         slope = -_slopes(freed, estimate, statement.keys)
         step = rest.inverse @ slope
-    # It swells the noise that the rest is measured by, as far as the linear picture goes.
+    # A wrong statement enlarges the noise estimate by which the rest is weighted: by as much as this.
     noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
     if near is not None:
         ratios = np.divide(near.problem.weighting.scales, end.problem.weighting.scales)
@@ -95,7 +96,7 @@ def linear_rest(statement: Statement, end: RobustSolution, near: RobustSolution 
 
 
 def _beside(covariance: Array, stated: Array, slope: Array) -> tuple[Array, Array]:
-    """M = C^-1 - P and the step M^-1 z, both 0 where M is lost in rounding beside P."""
+    """M = C^-1 - P and the step M^-1 z; both are 0 in directions where M is lost in rounding beside P."""
     root, back = _roots(stated, _LEAST_TOLD)
     share, turned = np.linalg.eigh(root.T @ covariance @ root)
     share = np.clip(share, 1e-300, None)
@@ -105,7 +106,7 @@ def _beside(covariance: Array, stated: Array, slope: Array) -> tuple[Array, Arra
 
 
 def _roots(stated: Array, least: float) -> tuple[Array, Array]:
-    """(n, k) R and B with R R^T = P and B^T R = 1, over what is stated by more than the least at unit diagonal."""
+    """(n, k) R and B with R R^T = P and B^T R = 1, over directions stated by more than `least` at unit diagonal."""
     size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))[:, None]
     values, vectors = np.linalg.eigh(stated / size / size.T)
     kept = values > least
@@ -114,7 +115,7 @@ def _roots(stated: Array, least: float) -> tuple[Array, Array]:
 
 
 def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """Derivative of the cost by what was held of a camera, everything else where it is."""
+    """Derivatives of the cost by the held intrinsics of a camera, with everything else at its place."""
     name = keys[0].owner
     own = freed.sights.of_camera(name)
     if not len(own):
@@ -125,7 +126,7 @@ def _slopes(freed: Problem, estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 
 def rest_at(statement: Statement, end: RobustSolution, known: Information | None = None) -> Rest:
-    """Where a problem without the statement was solved, by what is known of its numbers there; else by the model."""
+    """The rest where a problem without the statement was solved, from `known`, else from the model's information."""
     reduced = end.information
     freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     known = (known or reduced.shared).marginal(statement.keys)
@@ -133,7 +134,7 @@ def rest_at(statement: Statement, end: RobustSolution, known: Information | None
 
 
 def worst_test(statement: Statement, rest: Rest) -> WaldTest:
-    """The test of what is farthest off of a statement."""
+    """The test of that prior of a statement which is contradicted most."""
     if not statement.priors:
         off = values_of(rest.estimate, statement.keys) + rest.step - statement.held
         return _tested(off, None, rest)
@@ -146,7 +147,7 @@ def worst_test(statement: Statement, rest: Rest) -> WaldTest:
 
 
 def _tested(off: Array, stated: Information | None, rest: Rest) -> WaldTest:
-    """The test of numbers that are off by so much; `stated` None: they were held."""
+    """The test of numbers that differ by `off` from what is stated; `stated` is None if they were held."""
     matrix = rest.information.matrix
     squared = max(float(off @ matrix @ off), 0.0) if stated is None else _squared(off, stated.matrix, matrix)
     own = np.zeros(len(off)) if stated is None else stated.spread.sd
@@ -166,36 +167,36 @@ def _tested(off: Array, stated: Information | None, rest: Rest) -> WaldTest:
 
 
 def _squared(off: Array, stated: Array, rest: Array) -> float:
-    """off^T (M^-1 + P^-1)^-1 off: where everything else, M, says nothing beside what is stated, P, it is 0 however far
-    off that seems.
+    """off^T (M^-1 + P^-1)^-1 off. It is 0 however large `off` seems where everything else, M, says nothing beside what
+    is stated, P.
     """
-    least = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
+    least = 1e-14  # eigenvalue at unit diagonal above which a direction counts as stated
     root, back = _roots(stated, least)
-    told, turn = np.linalg.eigh(back.T @ rest @ back)  # in directions in which each is stated to one
+    told, turn = np.linalg.eigh(back.T @ rest @ back)  # in units in which each direction is stated with information 1
     along = off @ root @ turn
     return float(np.sum(np.where(told > _LEAST_TOLD, told / (1.0 + told), 0.0) * along**2))
 
 
 def log_probability(squared: float, rest: Rest) -> float:
-    """Natural logarithm of the probability of so large a squared distance."""
+    """Natural logarithm of the probability of a squared distance this large."""
     rank = max(rest.information.known_rank, 1)
     return float(log_f_tail(squared / rank, rank, max(rest.freedom, 1.0)))
 
 
-# Probability of a linear picture from which on other groups are judged without a statement: 2.2 sigma, where one in
-# twenty is wrong.
+# Probability in the linear test of all statements together below which the problem is solved without any of them: 2.2
+# sigma, if one statement in twenty is wrong.
 _SUSPICIOUS = 0.028
-_RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
+_RIVAL = 0.6  # share of the largest squared distance above which another statement may be the wrong one instead
 
 
 class Conflicts(Frozen):
-    """What contradicts what, and how the numbers move with each of it.
+    """The statements that are contradicted, and how the numbers move without each of them.
 
     Attributes:
-        every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when
-            statements in conflict are left out, or are not.
-        answer: without what was stated and is contradicted; None where the answer stays.
-        doubts: priors that look wrong, and are too likely right to be set aside.
+        every: the conflicts. shifts: (K,) each, over the shared keys (K): by how much the numbers move when statements
+            in conflict are left out, or when they are kept.
+        answer: the solution without contradicted statements; None where the answer stays.
+        doubts: priors that look wrong but are too likely right to be set aside.
     """
 
     every: tuple[Conflict, ...] = ()
@@ -206,12 +207,12 @@ class Conflicts(Frozen):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """One line of each."""
+        """One line for each conflict and each doubt."""
         return (*(one.words for one in self.every), *(one.words for one in self.doubts))
 
 
 class Doubt(Frozen):
-    """That a prior may be wrong: its numbers, how probable that is, (K,) by how much everything moves without it."""
+    """A prior that may be wrong: its keys, the probability of that, and the shift (K,) of the numbers without it."""
 
     keys: tuple[Key, ...]
     probability: float
@@ -228,15 +229,15 @@ def find_conflicts(
     shifts_at: ShiftsAt | None = None,
     near: RobustSolution | None = None,
 ) -> Conflicts:
-    """Everything stated that the rest contradicts, the worst first, each with those before it left out.
+    """Find all statements that the rest contradicts: the worst first, each with those found before left out.
 
     Args:
-        problem: of all the observations. end: its solution. solver: of the same without something, from an estimate.
-        part: of those that have a part in the answer: it is solved without what was stated and is contradicted, as
-            without an outlier; None where the answer stays. shifts_at: by which numbers scatter besides.
-        near: where it was solved without what looks wrong, if it was: a wrong statement may lead to another minimum.
+        problem: of all the observations. end: its solution. solver: solves a changed problem from an estimate.
+        part: the problem of the observations that determine the answer. It is solved without contradicted statements,
+            as without outliers; None where the answer stays. shifts_at: further scatter of the numbers.
+        near: the solution with all statements loosened, if there is one: a wrong one may lead to another minimum.
     """
-    most = 4  # solves
+    most = 4  # solves without a statement
     every = tuple(statements(problem, end.estimate))
     if not every:
         return Conflicts()
@@ -261,7 +262,7 @@ def find_conflicts(
 def contradicted_by(
     priors: Sequence[GaussianPrior], estimate: Estimate, posterior: Information, degrees_of_freedom: float
 ) -> str | None:
-    """The prior that a solution without any of them contradicts most, in words; None where it contradicts none."""
+    """The prior that a solution without these priors contradicts most, in words; None where it contradicts none."""
     known = set(posterior.keys)
     groups = [one for one in grouped([prior.given(known) for prior in priors]) if one.kind == "prior" and one.keys]
     freedom = min(degrees_of_freedom, LARGEST_FREEDOM)
@@ -274,7 +275,7 @@ def contradicted_by(
 
 
 def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
-    """(K,) how everything free moves with one number that moves by so much."""
+    """(K,) by how much all shared numbers move when one of them moves by `offset`."""
     if key not in reduced.shared.keys:
         return np.zeros(len(reduced.shared.keys))
     covariance = reduced.shared.inverse
@@ -284,7 +285,7 @@ def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
 
 @or_none  # quiet: the linear test decides, and the answer stays
 def _solved(problem: Problem, end: RobustSolution, solver: SolvedFrom) -> RobustSolution | None:
-    """The problem solved from where another one ended; None where it cannot be."""
+    """The problem solved from the end of another one; None where that fails."""
     after = solver(replace(problem, feet=end.residuals.feet), end.estimate)
     return None if after.solution.failed else after
 
@@ -294,10 +295,10 @@ class _ForwardSelection:
     """Forward selection: the worst statement is left out, then the worst of the others.
 
     Attributes:
-        problem, end: without what was left out. left: statements that are not judged yet.
-        out: those in conflict, their tests, and names of others that may be wrong in their place.
-        doubts: see `Conflicts`. places: (K,) from the first end: it, ends without statements, and where rivals that are
-            left out would lead.
+        problem, end: without the statements left out so far. left: statements that are not judged yet.
+        out: statements in conflict, their tests, and the names of others that may be wrong instead.
+        doubts: see `Conflicts`. places: (K,) each, shifts from the first end: to itself, to ends without statements,
+            and to where leaving out a rival would lead.
     """
 
     problem: Problem
@@ -318,8 +319,8 @@ class _ForwardSelection:
         self.places, self._start = [np.zeros(len(self._first.shared.keys))], self.end.estimate
 
     def leave_out_the_worst(self) -> bool:
-        """Judge the most suspicious statement; False where none is."""
-        # Probability of the linear picture from which on a solve decides. It stands where a wrong statement has bent
+        """Judge the most suspicious statement. Returns False where none is suspicious."""
+        # Probability in the linear test below which a solve decides. That test is made where a wrong statement has bent
         # everything: of heights 5 % wrong at 20 deg, which the true lens contradicts at 2 to 3 sigma, three of twenty
         # were above 0.028.
         worth_a_solve = 0.2
@@ -351,7 +352,7 @@ class _ForwardSelection:
         return True
 
     def _start_of(self, freed: Problem) -> RobustSolution:
-        """Where little was stated, with what is held still."""
+        """The end to start from: the one with loosened statements, with the values that are held kept."""
         if self.near is None:
             return self.end
         cameras, there = dict(self.near.estimate.cameras), self.end.estimate.cameras
@@ -362,8 +363,8 @@ class _ForwardSelection:
         return self.near.moved_to(replace(self.near.estimate, cameras=cameras), freed)
 
     def _linear_test(self, one: Statement) -> WaldTest:
-        """By the linear picture under everything that is stated, or where it said little: a lens without a formula, as
-        rough as it becomes under a wrong phi, says nothing against it.
+        """The linear test with all statements, or with loosened ones, whichever is worse. Under a wrong phi, a lens
+        without a formula becomes rough enough to agree with it.
         """
         near = self.near
         test = worst_test(one, linear_rest(one, self.end, near))
@@ -374,7 +375,7 @@ class _ForwardSelection:
         return min(test, worst_test(one, linear_rest(loose, near)), key=lambda test: test.log_p)
 
     def leave_out_together(self) -> None:
-        """Judge all that is left of what was stated by what is solved for without any of it."""
+        """Judge all remaining priors by what is solved for without any of them."""
         out = [one for one, *_ in self.out]
         parts = [one for one in self.every if one.kind == "prior" and one not in out]
         every = together(parts)
@@ -398,16 +399,18 @@ class _ForwardSelection:
             self.problem, self.end = freed, after
 
     def _rise(self, after: RobustSolution) -> float | None:
-        """By how much the least squares rise, over the same observations, when what was left out there is added."""
+        """The rise of the sum of squares, over the same observations, when the statements left out are added."""
         without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
         starts = (without, after.estimate), (bound, self.end.estimate)
         ends = attempt(lambda: [solve(*start).cost for start in starts])  # quiet: the linear test decides
-        # Of exact observations it is rounding.
+        # With exact observations the rise may be negative, by rounding.
         return None if isinstance(ends, CalibrationError) else max(2.0 * (ends[1] - ends[0]), 0.0)
 
     def conflicts(self) -> list[Conflict]:
-        """What is in conflict still when all of it is left out: a wrong height may have made others look wrong."""
+        """Conflicts that remain when all of them are left out: a wrong height may have made other statements look
+        wrong.
+        """
         alone = all(prior.is_usual for prior in self.problem.priors) and len(self.out) == len(self.every)
         found = []
         for number, (statement, test, rivals) in enumerate(self.out):
@@ -418,7 +421,7 @@ class _ForwardSelection:
         return found
 
     def _known(self, end: RobustSolution) -> Information:
-        """About the shared numbers at an end, as the observations scatter."""
+        """The information on the shared numbers at an end, with the scatter of the observations and of the effects."""
         estimate = end.estimate
         reduced = end.information
         known = scattered(reduced, measure_scatter(end.problem, end.residuals, estimate, reduced))
@@ -428,8 +431,8 @@ class _ForwardSelection:
         return known.widened(over(np.array(shifts), keys, known.keys)) if len(shifts) else known
 
     def _confirmed(self, statement: Statement, after: RobustSolution) -> WaldTest:
-        """The test where the problem without the statement was solved. In a bent valley the least squares themselves
-        say how far apart the two are: by how much they rise, over the same observations, when the statement is added.
+        """The test where the problem without the statement was solved. In a bent valley the sum of squares itself says
+        how far apart both are: by how much it rises, over the same observations, when the statement is added.
         """
         rest = rest_at(statement, after)
         alone = worst_test(statement, rest)

@@ -1,11 +1,11 @@
-"""Effects that `calibrate` solves for: their sizes, their best amounts, and by how much they widen.
+"""Solve for effects with a prior: their sizes, their best amounts, and what they add to the covariance.
 
-Such an effect displaces the observations by amounts that are the same in all views. Its size is read off the residuals
-(`effects.evidence`); where it is likelier that there is one than not, its best amounts are taken off the observations
-and everything else is solved for again, until the amounts stay. What is then open of the amounts, and the explanation
-without the effect as far as it is probable, go into the covariance; an effect that is in doubt, but not solved for,
-does with all of its amounts. So does the stretch of a board that few views show: `as_built` solves for what views
-repeat beside what a lens may leave.
+Such an effect displaces the observations by amounts that are the same in all views. Its size is estimated from the
+residuals (`effects.evidence`). Where the effect is likelier present than absent, its best amounts are subtracted from
+the observations and everything else is solved for again, until the amounts converge. The covariance then includes the
+uncertainty of the amounts and, with its probability, the explanation without the effect. An effect that is in doubt but
+not solved for adds all of its amounts, with its probability, to the covariance. So does the stretch of a board in few
+views: `as_built` solves only for what repeats in many views beside what a lens may leave.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from ceres_cal.effects.table import estimated
 from ceres_cal.problem import Estimate, Key, Problem, free_keys, write_equations
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 
-_MOST_ROUNDS, _AT_REST = 3, 0.05  # standard deviations by which amounts may still move
+_MOST_ROUNDS, _AT_REST = 3, 0.05  # solves; change of the amounts, in standard deviations, below which they converged
 
 
 class EffectsEnd(Frozen):
-    """The end of a solve beside effects.
+    """The result of a solve beside effects.
 
     Attributes:
-        problem: of all the observations, the effects' best amounts taken off. end: of its rounds.
-        estimates: of what was solved for. shifts_at: what all of them add to the covariance of the shared numbers.
+        problem: of all the observations, with the effects' best amounts subtracted. end: the end of its rounds.
+        estimates: the effects that were solved for. shifts_at: what all effects add to the covariance of the shared
+            numbers.
     """
 
     problem: Problem
@@ -40,11 +41,12 @@ class EffectsEnd(Frozen):
 
 
 def solve_beside_effects(problem: Problem, part: Problem, end: RobustSolution, *, solves: bool = True) -> EffectsEnd:
-    """The end with everything solved for that likely displaces the observations.
+    """Solve for all effects that likely displace the observations, together with everything else.
 
     Args:
-        problem: of all the observations. part: without those that were taken out as a whole. end: of its rounds.
-        solves: whether likely effects are; where the observations are a part of those that count, they only widen.
+        problem: of all the observations. part: without observations that were left out as a whole. end: of its rounds.
+        solves: whether likely effects are solved for. If not, as for a subset of the observations that count, effects
+            only widen the covariance.
     """
     points, off = len(problem.observations.points), np.zeros((problem.observations.rows, 2))
 
@@ -65,7 +67,7 @@ def solve_beside_effects(problem: Problem, part: Problem, end: RobustSolution, *
     last, solved = end, end.estimate
 
     def shifts_at(there: Estimate, other: Problem | None) -> tuple[Sequence[Key], Sequence[Array]]:
-        # Along a valley, and where something else is stated, numbers go together differently.
+        # Along a valley, and where something else is stated, the numbers are correlated differently.
         own, under = amounts, displaced
         if there is not solved or other is not None:
             under = displaced if other is None else replace(displaced, priors=other.priors, layout=other.layout)
@@ -79,7 +81,7 @@ def solve_beside_effects(problem: Problem, part: Problem, end: RobustSolution, *
 
 
 class _EffectGroup(Frozen):
-    """A group of an effect, and which amounts are its own."""
+    """One group of an effect, with the numbers of its amounts among all amounts."""
 
     effect: Effect
     columns: EffectColumns
@@ -91,8 +93,8 @@ class _Amounts(Frozen):
     """What the residuals say of the amounts of all effects.
 
     Attributes:
-        taken: (K, Q) how the shared numbers move with each amount. groups: by number. sizes: of each group, its sigma
-            and probability. solves: whether those are solved for that are likely.
+        taken: (K, Q) by how much the shared numbers move with each amount. groups: by number.
+        sizes: sigma and probability of each group. solves: whether likely groups are solved for.
     """
 
     case: Case
@@ -104,7 +106,7 @@ class _Amounts(Frozen):
 
     @classmethod
     def of(cls, problem: Problem, end: RobustSolution, off: Array, solves: bool) -> _Amounts:
-        """At the end of a problem of displaced observations, from which a displacement (N + M, 2) px was taken off."""
+        """The amounts at the end of a problem from whose observations a displacement (N + M, 2) px was subtracted."""
         estimate = end.estimate
         equations = write_equations(problem.sights, estimate, end.residuals)
         equations = replace(equations, residual=equations.residual - equations.along(off))
@@ -121,8 +123,8 @@ class _Amounts(Frozen):
                     groups.append(_EffectGroup(effect, columns, number, own))
                 size += parts[-1].size
         every = SparseColumns.side_by_side(parts, len(equations))
-        # Of few views, curves tell by how much errors that go together displace; not what a lens is that is wrong.
-        fewest_sights = 3  # that tell an effect from a lens that leaves something
+        # With few views, curves show how far correlated errors displace, but not by how much a lens is wrong.
+        fewest_sights = 3  # sights from which on an effect differs from what a wrong lens leaves
         few = len(problem.sights) < fewest_sights
         repeated = RepeatedAmounts.of(model, every, strand_names(equations, equations.sight) if few else None)
         each = ((number, one.effect.prior_of(one.columns, one.number, case)) for number, one in enumerate(groups))
@@ -133,7 +135,7 @@ class _Amounts(Frozen):
 
     @cached_property
     def likely(self) -> list[int]:
-        """Numbers of the groups that are solved for; how boards are built is by itself (`as_built`), or widens."""
+        """Numbers of the groups that are solved for. How boards are built is left to `as_built`, or only widens."""
         if not self.solves:
             return []
         of_world = (number for number, group in enumerate(self.groups) if not group.effect.built)
@@ -141,7 +143,7 @@ class _Amounts(Frozen):
 
     @cached_property
     def _best(self) -> tuple[Array, Array]:
-        """Amounts (Q,) of the likely groups, 0 of the others, and their covariance (Q, Q)."""
+        """Best amounts (Q,) of the likely groups, 0 for all others, and their covariance (Q, Q)."""
         amounts, covariance = np.zeros(len(self.repeated.score)), np.zeros_like(self.repeated.information)
         if self.likely:
             at = np.concatenate([self.groups[number].own for number in self.likely])
@@ -150,14 +152,14 @@ class _Amounts(Frozen):
         return amounts, covariance
 
     def stay(self, before: _Amounts) -> bool:
-        """Whether they are nearly the same as before, of the same groups."""
+        """Whether the likely groups are the same as before, and their amounts have converged."""
         amounts, covariance = self._best
         moved, sd = amounts - before._best[0], np.sqrt(np.diagonal(covariance))
         return self.likely == before.likely and bool(np.all(np.abs(moved) <= _AT_REST * sd))
 
     @property
     def _explained(self) -> Array:
-        """(E,) px by which the best amounts of the likely groups move the model."""
+        """(E,) px by which the best amounts of the likely groups move the observations in the model."""
         likely, amounts = (self.groups[number] for number in self.likely), self._best[0]
         shifts = (group.columns.of(group.number) @ amounts[group.own] for group in likely)
         return sum(shifts, np.zeros(len(self.case.equations)))
@@ -167,7 +169,9 @@ class _Amounts(Frozen):
         return self.case.equations.displacement(self._explained, observations)
 
     def estimates(self) -> Iterator[EffectEstimate]:
-        """Of what is solved for, and how likely it is that a floor or a board is off, which is not."""
+        """The effects that are solved for; and, if not solved for, whether a floor or a board is likely off its
+        drawing.
+        """
         case, (amounts, covariance) = self.case, self._best
         left = case.model.left_over + case.model.left_of_column(self._explained * case.model.weight)
         for number in self.likely:
@@ -183,8 +187,8 @@ class _Amounts(Frozen):
                 yield EffectEstimate(group.effect.kind, subject, None, *self.sizes[number], "", ())
 
     def shifts(self) -> Iterator[Array]:
-        """(K,) each, see `EffectsEnd`."""
-        # Probability below which an effect is nothing: by as much of its amounts' variance nothing is visibly wider.
+        """(K,) each: vectors whose outer products are added to the covariance, see `EffectsEnd`."""
+        # Probability below which an effect is ignored: such a share of its amounts' variance visibly widens nothing.
         negligible = 0.01
         amounts, covariance = self._best
         yield from shifts_by(self.taken, covariance)

@@ -1,8 +1,8 @@
-"""Reading the residuals: how large the noise is, and which observations do not belong.
+"""Estimate the noise from the residuals, and decide which observations are outliers.
 
-Residuals are taken in units of their stated sigma; the noise scale is the factor by which the stated sigmas of a kind
-(points, curves) must be multiplied to describe what is seen. Where it is in doubt, an outlier is what the others alone
-predict elsewhere.
+Residuals are taken in units of their stated sigma. The noise scale is the factor on the stated sigmas of a kind
+(points, curves) that describes the residuals. Where residuals leave it in doubt, an outlier is judged by what the other
+observations alone predict.
 """
 
 from __future__ import annotations
@@ -20,56 +20,58 @@ from ceres_cal.problem.residuals import Equations, Residuals, equations_of, pair
 if TYPE_CHECKING:
     from ceres_cal.problem.shares import Histogram
 
-# Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
-# are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
+# Degrees of freedom below which the stated sigmas are taken as they are: at 8 the spread has an error of 25 %. Errors
+# of fits to ten points are 1.16 of their stated sigmas with 8; with 4 they are 1.46, and with 16 they are 0.8, because
+# then the stated sigmas are taken.
 _LEAST_SPARE = 8.0
-# Spare equations that the other kind's noise counts as: a handful of points beside many curve observations, which the
-# fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
+# Degrees of freedom for which the noise of the other kind counts: a few points beside many curve observations, which
+# the fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
 _BORROWED = 4.0
-# Spare equations that a scale seen before stands for: few exact ones must not make it 0. Nothing changes from half to
-# double.
+# Degrees of freedom for which a noise scale known from earlier observations counts, so that a few exact observations do
+# not make the scale 0. Halving or doubling changes nothing.
 USUAL_EQUATIONS = 10.0
-# Share by which rows kept may outnumber those that their scale was taken from, and still be the tail of the same noise:
-# of Student's t with two degrees of freedom it is 1 %, of outliers more.
+# Share by which the observations within the bound may grow when the bound follows their own scale, and still be the
+# tail of the same noise: it is 1 % for Student's t with two degrees of freedom, and more for outliers.
 _TAIL = 0.02
-# Of the root of how many there are: so many outliers more or fewer, at the bound, move what is shared by no 0.05 sd.
-# None of fewer than 60 000.
+# Share of the square root of the number of observations. If no more of them at the rejection bound change sides, shared
+# numbers move by less than 0.05 sd. Of fewer than 60 000 observations none may.
 SAME = 4e-3
-# Over what is stated, usually a third of a pixel: no image is measured to better than a thousandth of one. Of exact
-# observations at less all that is known beforehand drowns in rounding.
+# Least noise scale. The stated sigma is usually a third of a pixel, and no image is measured to better than a
+# thousandth of a pixel. With exact observations and a smaller scale, all prior knowledge is lost in rounding.
 _LEAST_SCALE = 3e-3
-# Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound
-# scene is a finding; at 2.3 noise of twice the stated one is missed.
+# Factor on the stated sigmas up to which noise counts as stated: sigmas are guessed to a tenth or two. Below 1 every
+# sound scene would be a finding; at 2.3, noise of twice the stated one is missed.
 LARGER = 1.15
-_BLOCK = 1 << 16  # lengths at once: what is made of them stays where the processor is quick
-_RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
-_NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
+_BLOCK = 1 << 16  # lengths summed at once, so that intermediate arrays stay in the processor's cache
+_RAYLEIGH_MEDIAN = 1.177410022515474  # median length of a two-dimensional standard normal vector
+_NORMAL_MEDIAN = 0.674489750196082  # median absolute value of a standard normal variable
 
 
 Redundancy = tuple[float, float]
-"""The share of the equations of points and of curves that is left over for the noise: 1 less the mean leverage."""
+"""Share of the equations of points, and of curves, that is left for the noise: 1 minus the mean leverage."""
 
 
 def by_count(equations: int, unknowns: float) -> Redundancy:
-    """As if every equation determined as much as any other."""
+    """The redundancy if every equation had the same leverage."""
     return (1.0 - unknowns / max(equations, 1),) * 2
 
 
 def by_leverage(counts: tuple[int, int], leverages: tuple[float, float]) -> Redundancy:
-    """Of so many equations of points and of curves, of which the free numbers take up so many."""
+    """The redundancy from the numbers of equations of points and of curves, and the sums of their leverages."""
     points, curves = (1.0 - taken / max(count, 1) for taken, count in zip(leverages, counts, strict=True))
     return points, curves
 
 
 class Inliers(Frozen):
-    """Which observations take part, and the noise scales they were judged by.
+    """The observations that take part, and the noise scales by which they were judged.
 
     Attributes:
-        points: (N,), curves: (M,) bool. point_scale, curve_scale: factors on the stated sigmas.
-        point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
-            cannot show the observation.
-        degrees_of_freedom: spare equations that the scales rest on; infinite where they are the stated ones.
-        bound: standard deviations from which on an observation is an outlier.
+        points: (N,), curves: (M,) bool; True where an observation takes part.
+        point_scale, curve_scale: noise scales, factors on the stated sigmas.
+        point_sigmas, curve_sigmas: lengths of the residuals in standard deviations; infinite where the estimate cannot
+            show the observation.
+        degrees_of_freedom: of the noise scales; infinite where the stated sigmas were taken.
+        bound: length in standard deviations beyond which an observation is an outlier.
     """
 
     points: Mask
@@ -82,8 +84,8 @@ class Inliers(Frozen):
     bound: float = np.inf
 
     def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
-        """Whether nothing worth another solve changed: scales by no more than `relative`, and rows by none, or by a few
-        of very many where that is no strict comparison.
+        """Whether nothing changed that is worth another solve: neither scale by more than `relative`, and no row. If
+        the comparison is not strict, a few of very many rows may differ.
         """
         changed = self.rows != other.rows
         few = SAME * len(changed) ** 0.5 if relative >= SAME else 0.0
@@ -95,49 +97,49 @@ class Inliers(Frozen):
 
     @classmethod
     def by_noise(cls, points: Array, curves: Array, noise: NoiseScales) -> Inliers:
-        """Of these lengths at a noise."""
+        """The inliers among observations of these lengths, in stated sigmas, at a given noise."""
         p, c = noise.bounds
         scales, relative = (noise.points, noise.curves), (points / noise.points, curves / noise.curves)
         return cls(points <= p, curves <= c, *scales, *relative, noise.degrees_of_freedom, noise.reject_sigma)
 
     def of_rows(self, points: Indices, curves: Indices) -> Inliers:
-        """Those of some of the observations, as if there were no others."""
+        """The inliers of some observations, given by their rows, as if there were no others."""
         own = {"points": points, "curves": curves, "point_sigmas": points, "curve_sigmas": curves}
         return replace(self, **{name: getattr(self, name)[rows] for name, rows in own.items()})
 
     def weighting(self, options: Options) -> Weighting:
-        """Of the observations at these noise scales."""
+        """The weighting of the observations at these noise scales."""
         return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
 
     @property
     def rows(self) -> Mask:
-        """(N + M,) which observations take part, points by row and then curves by row."""
+        """(N + M,) bool, which observations take part: points by row, then curves by row."""
         return np.concatenate([self.points, self.curves])
 
     @property
     def sigmas(self) -> Array:
-        """(N + M,) how many standard deviations each residual is long."""
+        """(N + M,) lengths of the residuals in standard deviations."""
         return np.concatenate([self.point_sigmas, self.curve_sigmas])
 
     def with_rows(self, rows: Mask) -> Inliers:
-        """The same with other observations (N + M,) taking part."""
+        """A copy in which the observations given by a mask (N + M,) take part."""
         return replace(self, points=rows[: len(self.points)], curves=rows[len(self.points) :])
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Of points and of curves."""
+        """Noise scales of points and of curves."""
         return self.point_scale, self.curve_scale
 
 
 def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
-    """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
+    """All observations that the initial estimate can show, at the scale of the median residual, for the first solve."""
     points, curves = relative_lengths(observations, residuals)
     p, c = median_scales(points, curves)
     return Inliers(np.isfinite(points), np.isfinite(curves), p, c, points / p, curves / c)
 
 
 def median_scales(points: Array, curves: Array) -> tuple[float, float]:
-    """Noise scales by the medians of lengths of points and of curves in their stated sigmas."""
+    """Noise scales of points and of curves by the medians of residual lengths in stated sigmas."""
     return _median_scale(EachLength(points), _RAYLEIGH_MEDIAN), _median_scale(EachLength(curves), _NORMAL_MEDIAN)
 
 
@@ -146,9 +148,9 @@ def _median_scale(lengths: Lengths, median_of_one: float) -> float:
 
 
 def _middle(lengths: Array) -> float:
-    """The median, of some of very many."""
+    """The median; for very many lengths, the median of a subset."""
     enough = 5_000
-    some = lengths[:: max(1, len(lengths) // enough)]  # its median is that of all within two hundredths
+    some = lengths[:: max(1, len(lengths) // enough)]  # its median is within two hundredths of the median of all
     middle = len(some) // 2
     return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
@@ -160,14 +162,15 @@ def judge(
     options: Options,
     usual: tuple[float, float] | None = None,
 ) -> Inliers:
-    """Noise scales and inliers at one estimate.
+    """Estimate the noise scales and the inliers at one estimate.
 
-    The median gives a first scale that half the data may not spoil, the spread of the inliers the final one: where the
-    noise has tails, these are more than lie within the bound by the first scale.
+    The median gives a first scale that up to half of the data may not spoil. The spread of the inliers gives the final
+    scale; where the noise has tails, more observations are inliers than lie within the bound of the first scale.
 
     Args:
-        options: how far off an outlier is, and whether the stated sigmas hold (scale 1).
-        usual: scales of points and curves seen before; they count as much as a few spare equations do.
+        options: the rejection bound, and whether the stated sigmas hold (scale 1).
+        usual: noise scales of points and of curves known from earlier observations; they count as `USUAL_EQUATIONS`
+            degrees of freedom.
     """
     points, curves = relative_lengths(observations, residuals)
     noise = noise_of(EachLength(points), EachLength(curves), redundancy, options, usual)
@@ -175,8 +178,8 @@ def judge(
 
 
 class NoiseScales(NamedTuple):
-    """Noise scales of points and of curves, the length in them from which on an observation is an outlier, and the
-    spare equations that they rest on; infinite where they are the stated ones.
+    """Noise scales of points and of curves, the outliers' bound in standard deviations, and the degrees of freedom of
+    the scales, which are infinite where the stated sigmas were taken.
     """
 
     points: float
@@ -186,18 +189,18 @@ class NoiseScales(NamedTuple):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Lengths in stated sigmas from which on points and curve observations are outliers."""
+        """Lengths in stated sigmas beyond which points and curve observations are outliers."""
         return self.points * self.reject_sigma, self.curves * self.reject_sigma
 
 
 Lengths: TypeAlias = "EachLength | Histogram"
-"""Lengths of residuals in their stated sigmas, or what was added up of them: of all that can be shown."""
+"""Lengths of residuals in stated sigmas, or a histogram of them; only of observations that the estimate can show."""
 
 
 def noise_of(
     points: Lengths, curves: Lengths, redundancy: Redundancy, options: Options, usual: tuple[float, float] | None = None
 ) -> NoiseScales:
-    """The noise that lengths show; see `judge`."""
+    """Noise scales from the lengths of residuals; see `judge`."""
     if options.noise_scale == "stated":
         return NoiseScales(1.0, 1.0, options.reject_sigma, np.inf)
     floor = usual or (0.0, 0.0)
@@ -218,11 +221,11 @@ def noise_of(
 
 
 def _as_rare(sigmas: float, degrees: float) -> float:
-    """The length that is as rare among residuals over a scale that was estimated from so few spare equations as
-    `sigmas` is over a known one: (1 + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), that of Student's t in
-    two dimensions. Where the stated sigmas are taken it is `sigmas`.
+    """The bound that is as rare at a scale estimated with these degrees of freedom as `sigmas` is at a known scale: (1
+    + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), Student's t in two dimensions. It is `sigmas` where the
+    stated sigmas are taken.
     """
-    beyond = 100.0  # an exponent: no observation is so rare
+    beyond = 100.0  # exponent: no observation is so rare
     if degrees < _LEAST_SPARE:
         return sigmas
     return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, beyond))))
@@ -233,19 +236,21 @@ _Sums = tuple[int, float]
 
 
 def _scale(sums: _Sums, spare: float, other: _Sums, other_spare: float) -> float:
-    """The scale of lengths that bring so many spare equations: that of the other kind counts as much as a few."""
+    """The noise scale of a kind from its sums and degrees of freedom; the other kind counts for up to `_BORROWED`."""
     borrowed = min(_BORROWED, max(other_spare, 0.0))
     variance = borrowed * other[1] / max(other_spare, 1.0)
     return max(float(np.sqrt((sums[1] + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE)
 
 
 def _scale_from(usual: float, sums: _Sums, spare: float) -> float:
-    """The same when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
+    """The noise scale where a usual one counts for a few degrees of freedom, so that few exact lengths do not make it
+    0.
+    """
     return float(np.sqrt((sums[1] + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
 
 
 class EachLength:
-    """Lengths one by one; infinite ones are of what cannot be shown."""
+    """Residual lengths one by one. Infinite lengths, of observations that cannot be shown, are left out."""
 
     def __init__(self, lengths: Array) -> None:
         finite = np.isfinite(lengths)
@@ -253,15 +258,15 @@ class EachLength:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """The number of lengths."""
         return len(self._seen)
 
     def middle(self) -> float:
-        """Their median; 0 of none."""
+        """The median of the lengths; 0 if there are none."""
         return _middle(self._seen)
 
     def within(self, bound: float) -> _Sums:
-        """Of those that are no longer."""
+        """Number and sum of squares of the lengths up to the bound."""
         count, squares = 0, 0.0
         for first in range(0, len(self._seen), _BLOCK):
             block = self._seen[first : first + _BLOCK]
@@ -271,10 +276,10 @@ class EachLength:
 
 
 def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> _Sums:
-    """Of the lengths that the scale they have keeps.
+    """Number and sum of squares of the lengths within the rejection bound of their own scale.
 
     Args:
-        least: a scale that theirs is no smaller than. degrees: spare equations of each.
+        least: lower limit of the scale. degrees: degrees of freedom that each length brings.
     """
     most_wider = 5
     first = _median_scale(lengths, median_of_one)
@@ -291,21 +296,21 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
 
 
 def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict[str, float]:
-    """Name of `Observations.noise_names` -> factor on the stated sigmas of its observations; none where all are about
-    as noisy as each other.
+    """The noise of each name in `Observations.noise_names`, as a factor on the stated sigmas of its observations;
+    unchanged where all are about equally noisy.
 
-    A photograph out of focus, a camera of fewer pixels or another detector, a field that was clicked beside boards that
-    were detected: at the mean noise what is stated by the noisiest is too sure, and by the others too unsure. Of few
-    observations the mean counts as much as in `judge`. A camera's own numbers are counted against what it sees by the
-    number of equations, poses against what shows them; as many of the shortest residuals say nothing, for a pose may go
-    through some of few clicks, and the others then seem to be outliers (Rousseeuw and Leroy 1987, Robust Regression and
-    Outlier Detection, 3.4).
+    The noise differs, for example, in a photograph out of focus, in a camera of fewer pixels or with another detector,
+    or in a field that was clicked beside boards that were detected. At the mean noise, the noisiest would seem too
+    certain and the others too uncertain. With few observations the mean counts as much as in `judge`. The unknowns of a
+    camera are divided among its observations by number of equations, those of a pose among the observations that show
+    it. As many of the shortest residuals are left out: a pose may go through some of few clicks, and the others would
+    then seem to be outliers (Rousseeuw and Leroy 1987, Robust Regression and Outlier Detection, 3.4).
 
     Args:
-        problem: at the noise of all together. judged: (N + M,) those that are not known to be something else.
+        problem: weighted by the noise of all together. judged: (N + M,) observations that are not known outliers.
     """
-    alike = 1.25  # ratio up to which sds are right within what statistics of hundreds of runs tell
-    by_chance = 3.0  # standard errors of a scale
+    alike = 1.25  # ratio of noise scales up to which sds are right, as far as hundreds of runs can tell
+    by_chance = 3.0  # standard errors of a scale up to which a difference counts as chance
     observations, layout, usual = problem.observations, problem.layout, problem.weighting.scales
     lengths = relative_lengths(observations, residuals(problem.sights, estimate, problem.feet))
     kinds, columns = np.split(judged, [len(observations.points)]), (observations.points, observations.curves)
@@ -315,7 +320,7 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
     each = {name: [at[own & np.isfinite(at)] for at, own in zip(lengths, rows[name], strict=True)] for name in seen}
     counts = {name: (2 * len(points), len(curves)) for name, (points, curves) in each.items()}
     for name, views in seen.items():
-        if not any(counts[name]):  # all of it is something else, or cannot be shown
+        if not any(counts[name]):  # all of its observations are left out, or cannot be shown
             continue
         camera, equations = views[0].camera, sum(counts[name])
         of_camera = sum(sum(counts[other]) for other, shown in seen.items() if shown[0].camera == camera)
@@ -334,18 +339,19 @@ def noise_of_cameras(problem: Problem, estimate: Estimate, judged: Mask) -> dict
 # ---- outliers by deleted residuals ----------------------------------------------------------------------------------
 
 
-# How far off an observation is where the others alone predict it. A residual that the fit has taken up is short whether
-# or not it belongs, and one that only a guess predicts is long though it belongs: the only corner at a picture's rim,
-# once left out, would stay out. So where nothing changes any more those in doubt are judged by what the others say of
-# them, at the standard deviation of that (Cook and Weisberg 1982, Residuals and Influence in Regression, 2.2).
+# A deleted residual is the distance of an observation from what the others alone predict. A residual that the fit has
+# taken up is short whether or not the observation is an outlier. A residual that is hardly predicted is long even if
+# the observation is an inlier: the only corner at the rim of a picture would, once rejected, stay rejected. So after
+# convergence, doubtful observations are judged by their deleted residuals in units of those residuals' standard
+# deviations (Cook and Weisberg 1982, Residuals and Influence in Regression, 2.2).
 
 
 class InlierFit(Frozen):
-    """An estimate of some observations, and what these say there.
+    """An estimate from some of the observations, and its information.
 
     Attributes:
-        problem: of all the observations. used: (N + M,) which took part. residuals: of all. reduced: what those that
-            took part, and what was known before, say there.
+        problem: of all the observations. used: (N + M,) those that took part. residuals: of all observations.
+        reduced: the information of those that took part and of the priors.
     """
 
     problem: Problem
@@ -356,9 +362,9 @@ class InlierFit(Frozen):
 
 
 def by_deleted_residuals(inliers: Inliers, fitted: InlierFit) -> Inliers:
-    """The inliers by deleted residuals, where the residuals alone, by which these are, leave it in doubt."""
-    # Share of the bound from which on an inlier is asked about: a shorter one is an outlier only where it says more of
-    # its place than all others, and then nobody knows which of the two is wrong.
+    """Judge the doubtful ones among the observations by deleted residuals; the others stay as their residuals say."""
+    # Share of the bound beyond which an inlier is doubtful. A shorter residual belongs to an outlier only if it says
+    # more about its place than all others do, and then it cannot be known which of the two is wrong.
     doubted = 0.5**0.5
     doubtful = np.isfinite(inliers.sigmas) & (inliers.sigmas > doubted * inliers.bound)
     if not np.any(doubtful):
@@ -370,8 +376,8 @@ def by_deleted_residuals(inliers: Inliers, fitted: InlierFit) -> Inliers:
 
 
 def deleted_lengths(rows: Mask, weighting: Weighting, fitted: InlierFit) -> tuple[Indices, Array]:
-    """Of some of the observations (N + M,), whose residuals are finite: which one each is, and the length of its
-    deleted residual in that one's standard deviations.
+    """The observation numbers of some observations (N + M,) with finite residuals, and the lengths of their deleted
+    residuals in standard deviations.
     """
     estimate = fitted.estimate
     sights = fitted.problem.sights.used(*np.split(rows, [len(fitted.problem.observations.points)]))
@@ -387,10 +393,10 @@ def deleted_lengths(rows: Mask, weighting: Weighting, fitted: InlierFit) -> tupl
 def _leverages(
     equations: Equations, weight: Array, estimate: Estimate, reduced: ReducedInformation
 ) -> tuple[Array, Array]:
-    """(E,) what the estimate's covariance adds to the variance of equations of this weight, in theirs, and (P,) to the
-    covariance of the two of each point.
+    """(E,) what the covariance of the estimate adds to the variance of equations of this weight, in units of that
+    variance, and (P,) what it adds to the covariance of the two equations of each point.
 
-    How targets were built is held: what it would add is its own scatter.
+    Structure is held as it is: letting it vary would only add the scatter of the targets' construction.
     """
     keys = [key for key in reduced.shared.keys if not key.is_structure]
     covariance = reduced.shared.given(keys).inverse

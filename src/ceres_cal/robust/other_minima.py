@@ -1,14 +1,15 @@
-"""Other minima than the one that a solve ends in.
+"""Try other minima than the one in which a solve ended.
 
 A small or distant board looks almost the same tilted either way, and each of the two mirrored poses of its plane has a
-minimum of its own. Which is the lower one can only be told by trying both; they are tried where they compete, that is,
-where perspective is too weak to have decided at the start.
+minimum of its own. Only trying both shows which is the lower one. They are tried where they compete, that is, where
+perspective is too weak to have decided at the start.
 
-A start that is far off leaves most of a board's corners outside the rejection bound, and what is rejected pulls no
-more. With the lens solved from the other boards, four good corners pose a lost one by consensus.
+From a poor initial estimate, most of a board's corners may lie outside the rejection bound, and rejected observations
+do not attract the pose. With the lens solved from the other boards, four good corners give a lost board a pose by
+consensus.
 
-A floor seen by few points and lines may be explained from two places, by two lenses; a start cannot tell which of the
-minima is the least, nor that there are two.
+A floor seen by few points and lines may be explained from two places, by two lenses. The initial estimate shows neither
+which minimum is the least nor that there are two.
 """
 
 from __future__ import annotations
@@ -26,26 +27,27 @@ from ceres_cal.robust.noise import Inliers
 from ceres_cal.scene import TURNED, Camera, Target, is_seen_turned
 from ceres_cal.start import consensus_homography, pose_from_homography
 
-# Perspective that bends a view by so many standard deviations leaves no doubt. Of 200 small boards none stays
-# mirrored from 12 to 200, four do at 0; of 20 000, six did at 50.
+# Standard deviations by which perspective bends a view; above this the pose is not in doubt. Of 200 small boards, none
+# stays mirrored for values from 12 to 200, four do at 0; of 20 000, six did at 50.
 _DECIDED_SIGMA = 100.0
-# Of rotations and metres: the two minima of a plane are degrees apart, rounding is not. Nothing changes from half to
-# double.
+# Difference of rotation matrices, and of positions in metres, below which two poses are the same: the two minima of a
+# plane are degrees apart, rounding is not. Halving or doubling changes nothing.
 _SAME = 1e-3
-# Squared standard deviations: ten of them decide, whatever the lens still does. Nothing changes from half to double.
+# Difference of costs in squared standard deviations above which the pose is decided: ten standard deviations decide,
+# however the lens still changes. Halving or doubling changes nothing.
 _MUCH_WORSE = 100.0
 
 
 def without_mirrored_poses(
     problem: Problem, estimate: Estimate, among: frozenset[SightKey]
 ) -> tuple[Estimate, int, frozenset[SightKey]]:
-    """The estimate with private placements in the better one of their two poses.
+    """Put private placements into the better one of their two mirrored poses.
 
     Args:
         among: keys of the sights that are tried.
 
     Returns:
-        The estimate, how many placements were changed, and the keys of those whose other pose is not much worse.
+        The estimate, the number of placements changed, and the keys of sights whose other pose is not much worse.
     """
     sights, weighting = problem.sights, problem.weighting
     changed, undecided = 0, frozenset[SightKey]()
@@ -69,7 +71,7 @@ def _with_better_poses(
     costs, poses = placement_costs(sights.take(np.tile(ambiguous, 2)), estimate, weighting, twice)
     (as_is, other), (posed, turned) = np.split(costs, 2), np.split(poses, 2)
     better = np.flatnonzero(other < as_is * (1.0 - 1e-6))
-    two = np.max(np.abs(turned - posed), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
+    two = np.max(np.abs(turned - posed), axis=(1, 2)) > _SAME  # else the search from the mirrored pose came back
     close = np.flatnonzero(two & (np.abs(other - as_is) < _MUCH_WORSE))
     undecided = frozenset(few.keys[i] for i in close)
     if not len(better):
@@ -78,15 +80,15 @@ def _with_better_poses(
 
 
 def _boxes(sights: Sights) -> tuple[Array, Array]:
-    """Middle (S, 3) and half diagonal (S,) of the box around each sight's points; every sight has some."""
+    """Centre (S, 3) and half diagonal (S,) of the box around each sight's points; every sight must have points."""
     starts = sights.point_bounds[:-1]
     low, high = np.minimum.reduceat(sights.points, starts), np.maximum.reduceat(sights.points, starts)
     return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
 
 def _ambiguous(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Indices:
-    """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
-    cos(tilt), against the noise.
+    """Sights of points whose two poses hardly differ: the bend by perspective, phi (size / depth)^2 sin(tilt)
+    cos(tilt), is small against the noise.
     """
     seen = np.flatnonzero(np.diff(sights.point_bounds) >= 4)
     if not len(seen):
@@ -104,8 +106,8 @@ def _ambiguous(sights: Sights, poses: Array, estimate: Estimate, weighting: Weig
 
 
 def mirrored(sights: Sights, poses: Array) -> Array:
-    """cam_from_target (S, 3, 4) with the depth of each target's points reversed about its middle, along the line of
-    sight: R' = (1 - 2 d d^T) R diag(1, 1, -1), a rotation again.
+    """cam_from_target (S, 3, 4) with the depth of each target's points reversed about their middle, along the line of
+    sight: R' = (1 - 2 d d^T) R diag(1, 1, -1), which is again a rotation.
     """
     centres, _ = _boxes(sights)
     middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
@@ -116,19 +118,19 @@ def mirrored(sights: Sights, poses: Array) -> Array:
     return np.concatenate([rotations, translations[:, :, None]], axis=2)
 
 
-# Share of a sight's observations; with less of them in use its pose was not understood. Of 40 boards before a
-# fisheye, 30 % outliers, 9 end in a wrong pose, 19 at 0.33; nothing changes at 0.67.
+# Share of a sight's observations in use below which its pose counts as lost. Of 40 boards before a fisheye with 30 %
+# outliers, 9 end in a wrong pose, and 19 at 0.33; at 0.67 nothing changes.
 _LOST = 0.5
-# Points that a consensus is sought among: four make a pose, two more agree by chance hardly ever. Nothing changes
-# from half to double.
+# Least number of points for a consensus: four determine a pose, and two more hardly ever agree by chance. Halving or
+# doubling changes nothing.
 _FEWEST = 6
 
 
 def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimate) -> tuple[Estimate, int]:
-    """The estimate with lost placements posed again where that lowers their cost, and how many were.
+    """Pose lost placements anew where that lowers their cost. Returns the estimate and the number of them.
 
     Args:
-        problem: of all observations, those rejected too, weighted with a loss that bears outliers.
+        problem: of all observations, including rejected ones, weighted with a loss that tolerates outliers.
     """
     sights, weighting, count = problem.sights, problem.weighting, 0
     for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):
@@ -153,20 +155,20 @@ def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimat
 
 
 def _suits_all(sights: Sights, there: Estimate, before: Estimate, weighting: Weighting) -> bool:
-    """Whether all sights of a placement suit where it lies there by much better than where it lay before: what of two
-    cameras shows another moment suits either as badly.
+    """Whether a new pose of a placement suits all its sights much better than its pose before. Two cameras that show it
+    at different moments fit either pose badly.
     """
-    much = 0.5  # of Cauchy's cost
+    much = 0.5  # ratio of Cauchy's costs below which the new pose is much better
     costs = []
     for estimate in (there, before):
         points, _ = residuals_alone(sights, estimate).lengths
         far = np.nan_to_num(points / (weighting.point_scale * weighting.loss_scale * sights.sigma_px), nan=np.inf)
-        costs.append(float(np.sum(np.log1p(np.minimum(far, 1e6) ** 2))))  # what is not shown at all is very far
+        costs.append(float(np.sum(np.log1p(np.minimum(far, 1e6) ** 2))))  # places that are not shown count as very far
     return costs[0] < much * costs[1]
 
 
 def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Array | None:
-    """cam_from_target (1, 3, 4) that most points agree on, or None."""
+    """cam_from_target (1, 3, 4) on which most points agree, or None."""
     camera = estimate.cameras[sight.key.camera]
     rays = camera.rays(sight.pixels)
     ahead = rays[:, 2] > 0.0  # NaN is not
@@ -183,23 +185,24 @@ def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Ar
     return np.column_stack([pose.rotation, translation])[None]
 
 
-FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
-# Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
+FEW = 300  # equations above which only one minimum was ever seen: the cases with two had fewer than 200
+# Share of the cost that the normal equations predict at another end; above it, the end is the same minimum, not quite
+# reached, which costs nearly all of it.
 _OTHER = 0.25
-_APART = 0.05  # of the height: places that are no farther apart are one valley, which the standard deviations show
+_APART = 0.05  # share of the height: places no farther apart are one valley, which the standard deviations cover
 
 
 def least_of_few(
     problem: Problem, estimate: Estimate, elsewhere: Sequence[Estimate] = (), *, is_whole: bool = True
 ) -> tuple[Estimate, tuple[Solution, ...]]:
-    """The estimate in the least minimum that is found from there, and others, with what they cost beyond it; of very
-    many observations the estimate as it is, but for cameras that nothing tells from turned ones.
+    """The estimate in the lowest minimum found from it, and other minima with their cost above it. Many observations
+    keep the estimate, unless a turned camera shows them as well.
 
     Args:
-        elsewhere: starts that showed the observations alike. is_whole: whether the problem is of all the observations:
-            what was taken out belongs to the minimum it was judged in.
+        elsewhere: initial estimates that explained the observations equally well. is_whole: whether the problem has all
+            the observations; rejected ones were judged in their own minimum.
     """
-    lower = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
+    lower = 1.0  # of twice the cost: rounding is smaller, and a minimum lower by less than this is as likely
     is_few, turned = is_whole and problem.sights.equations < FEW, tuple(_seen_turned(problem.sights, estimate))
     if not (is_few or turned):
         return estimate, ()
@@ -215,8 +218,8 @@ def least_of_few(
 
 
 def _seen_turned(sights: Sights, estimate: Estimate) -> Iterator[Estimate]:
-    """The estimate with a station turned by half about the middle of the world, where all that it shows lies as well
-    then: the halfway line, the centre line and the circle.
+    """The estimate with a station turned by half a turn about the centre of the world, if all that it shows looks the
+    same then: the halfway line, the centre line and the circle.
     """
     for name, station in estimate.stations.items():
         own = [number for number, key in enumerate(sights.keys) if key.station == name]
@@ -228,7 +231,7 @@ def _seen_turned(sights: Sights, estimate: Estimate) -> Iterator[Estimate]:
 
 
 def _shown(sights: Sights) -> Iterator[tuple[Target, set[int], set[tuple[int, int]]]]:
-    """Each target with the numbers of its points, and numbers and sides of its curves, that sights show."""
+    """Each target with the numbers of its observed points, and the numbers and sides of its observed curves."""
     seen = sights.observations
     points, curves = seen.points.take(sights.point_rows), seen.curves.take(sights.curve_rows)
     names = np.array([view.target for view in seen.views])
@@ -240,14 +243,14 @@ def _shown(sights: Sights) -> Iterator[tuple[Target, set[int], set[tuple[int, in
 def minima_of(
     others: Sequence[Solution], estimate: Estimate, information: Information, half_width: float
 ) -> tuple[list[Array], list[float]]:
-    """(K,) from the estimate to each other minimum that costs no more than 95 % intervals reach, and their
+    """The shifts (K,) from the estimate to other minima whose cost is within the reach of 95 % intervals, and their
     probabilities.
 
     Args:
-        others: with what they cost beyond the estimate. information: by the model, about the K numbers.
-        half_width: standard deviations from the middle to an end of an interval.
+        others: solutions with their cost above that of the estimate. information: of the model, about the K numbers.
+        half_width: of an interval, in standard deviations.
     """
-    alike = 0.01  # of natural sizes: two solves that ended no farther apart are one minimum
+    alike = 0.01  # of natural sizes: solves whose ends are no farther apart have found the same minimum
     sizes = natural_sizes(estimate, information.keys)
     shifts, odds = list[Array](), list[float]()
     here = np.zeros(len(sizes))
@@ -263,11 +266,11 @@ def minima_of(
 def seen_alike(
     others: Sequence[Solution], estimate: Estimate, stations: Iterable[str], half_width: float
 ) -> Iterator[tuple[str, bool]]:
-    """A warning for each of these stations that may stand elsewhere, with the likeliest other place, and whether it
-    shows other places on the floor from there: of those, if there are any.
+    """A warning for each station that may stand elsewhere, with its likeliest other place, and whether it would then
+    show other places on the floor; such places come first.
 
     Args:
-        stations: that see the world; of boards alone no place on the floor is known. others, half_width: see
+        stations: those that see the world; boards alone determine no place on the floor. others, half_width: see
             `minima_of`.
     """
     likely = [one.estimate for one in sorted(others, key=lambda other: other.cost) if 2.0 * one.cost < half_width**2]
@@ -291,8 +294,8 @@ def seen_alike(
 
 
 def _floors_apart_m(camera: Camera, other: Camera) -> float:
-    """How far apart two cameras show the floor, median over the picture; along a valley of phi and height that is
-    nothing.
+    """Median distance (m) over the picture between the places on the floor that two cameras show; it is nearly 0 along
+    a valley of phi and height.
     """
     grid = np.linspace(0.1, 0.9, 5)
     pixels = np.stack(np.meshgrid(*(grid * size for size in camera.image_size)), axis=-1).reshape(-1, 2)
@@ -300,12 +303,12 @@ def _floors_apart_m(camera: Camera, other: Camera) -> float:
     return median(apart[np.isfinite(apart)]) if np.isfinite(apart).any() else np.inf
 
 
-@or_none  # quiet: nothing is seen from there, so no minimum is
+@or_none  # quiet: nothing is visible from that start, so there is no minimum
 def solved_soon(problem: Problem, start: Estimate, *, is_near: bool = True) -> Solution | None:
-    """Where a short solve ends; None where it finds nothing. Along a flat valley the solver creeps for hundreds of
-    iterations that change nothing here.
+    """The end of a short solve; None where it finds nothing. Along a flat valley the solver would make hundreds of
+    small steps that change nothing here.
     """
-    near = 1e-6  # of a variance: how nearly an end costs the least; by a thousandth of a standard deviation it is off
+    near = 1e-6  # of a variance: the end is off the minimum by a thousandth of a standard deviation
     short = replace(problem.options, max_iterations=min(30, problem.options.max_iterations))
     precision = near / max(problem.equations, 1)
     solution = solve(replace(problem, options=short), start, is_near=is_near, precision=precision)
@@ -313,7 +316,7 @@ def solved_soon(problem: Problem, start: Estimate, *, is_near: bool = True) -> S
 
 
 def _at_other_phi(problem: Problem, estimate: Estimate) -> Iterator[Estimate]:
-    factors = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
+    factors = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys seen so far began within a sixth
     for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         for factor in factors:
             camera = estimate.cameras[name]

@@ -1,6 +1,6 @@
-"""Solve, judge the noise and the outliers, solve again, until nothing changes.
+"""The robust loop: solve, estimate the noise, reject outliers, and solve again until nothing changes.
 
-One loop for rows that are at hand and for sums over shares of very many: what an engine does in each step differs.
+One loop serves rows in memory and sums over shares of very many rows; the two engines differ in how they do each step.
 """
 
 from __future__ import annotations
@@ -31,19 +31,22 @@ from ceres_cal.robust.noise import (
 from ceres_cal.robust.other_minima import with_lost_boards_posed, without_mirrored_poses
 
 MOST_ROUNDS = 15
-# Relative change of a noise scale that is no change. From half to double the answer moves by under 1 % of its error;
-# a refit must give the same answer to the same question, and nothing changes from half to double there.
+# Relative changes of a noise scale that count as no change. Halving or doubling the first moves the answer by less than
+# 1 % of its error. The second is for a refit, which must give the same answer to the same question; halving or doubling
+# it changes nothing.
 AT_REST, AT_REST_AGAIN = 1e-2, 1e-5
 
 
 class RobustSolution(Frozen):
-    """Where a round ended, and where all of them did.
+    """The state after one round, and after the last one.
 
     Attributes:
-        problem: of the inliers there alone, at their noise: what is to be solved next, and at the end what was solved.
-        solution: of the last one. inliers, residuals: of all observations there. rounds: how many solves there were.
-        reduced: what observations and priors say there, once nothing changes; None before, and where the rounds ran
-            out.
+        problem: the problem of the inliers at this estimate, weighted by their noise. The next round solves it; at the
+            end it is what was solved.
+        solution: the result of the last solve. inliers, residuals: those of all observations at its estimate.
+        rounds: the number of solves so far.
+        reduced: the information of observations and priors at the estimate, once nothing changes; None before, and
+            where the rounds ran out.
     """
 
     problem: Problem
@@ -55,59 +58,59 @@ class RobustSolution(Frozen):
 
     @property
     def estimate(self) -> Estimate:
-        """Where it is."""
+        """The estimate of the last solve."""
         return self.solution.estimate
 
     @cached_property
     def information(self) -> ReducedInformation:
-        """What observations and priors say there."""
+        """The information of observations and priors at the estimate."""
         return self.reduced or information(self.problem, self.estimate)
 
     def judged_like(self, before: Self, no_change: float) -> bool:
-        """Whether nothing worth another solve changed since another round."""
+        """Whether nothing that is worth another solve has changed since the round `before`."""
         return self.inliers.same_as(before.inliers, no_change)
 
     def weights_of(self, equations: Equations) -> Weights:
-        """How the equations counted."""
+        """The weights of these equations in the solve."""
         taking_part = self.inliers.points, self.inliers.curves
         return equation_weights(self.problem.weighting, equations, self.residuals, taking_part)
 
     def moved_to(self, estimate: Estimate, problem: Problem) -> RobustSolution:
-        """The same with another estimate. `problem`: of all the observations."""
+        """A copy with another estimate and its residuals. `problem`: that of all the observations."""
         there = residuals(problem.sights, estimate, self.residuals.feet)
         return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
 
 
 SolvedFrom = Callable[[Problem, Estimate], RobustSolution]
-"""How a problem is solved from an estimate."""
+"""A function that solves a problem from an initial estimate."""
 _Round = TypeVar("_Round", bound=RobustSolution)
 
 
 class Rounds(ABC, Generic[_Round]):
-    """An engine that solves and judges."""
+    """The loop over rounds. A subclass is an engine that solves and judges."""
 
     no_change = AT_REST
 
     @abstractmethod
     def next(self, state: _Round) -> _Round:
-        """One more solve of what was judged to take part, judged."""
+        """Solve once more for the current inliers, and judge the result."""
 
     @abstractmethod
     def with_leverages(self, state: _Round) -> _Round:
-        """The state with what its problem says there, judged by the leverages; without it where that asks for another
-        round.
+        """The state with its information, judged by the leverages; `reduced` is None where this judgement asks for
+        another round.
         """
 
     def mended(self, state: _Round, undecided: frozenset[SightKey]) -> tuple[_Round, int, frozenset[SightKey]]:
-        """The state with poses changed that a solve cannot get out of, how many, and which sights are undecided."""
+        """The state with poses changed that a solve cannot leave by itself, their number, and the undecided sights."""
         return state, 0, undecided
 
     def refined(self, state: _Round) -> _Round:
-        """The state after the first solve, nearer to what it settles at."""
+        """The state after the first solve, brought nearer to convergence."""
         return state
 
     def to_rest(self, state: _Round, most_rounds: int = MOST_ROUNDS, *, is_near: bool = False) -> _Round:
-        """Round after round, until nothing changes."""
+        """Run rounds until nothing changes, or until `most_rounds` solves were made."""
         undecided: frozenset[SightKey] = frozenset(state.problem.sights.keys)
         before: _Round | None = None
         while state.rounds < most_rounds:
@@ -126,12 +129,12 @@ class Rounds(ABC, Generic[_Round]):
         return state
 
 
-# Of a camera: with them it is known well enough to place all others; fewer cost another round, more cost time.
-# Nothing changes from half to double.
+# Private placements per camera in a rough solve: with these the camera is known well enough to place all others. Fewer
+# cost another round, more cost time. Halving or doubling changes nothing.
 _ENOUGH_PLACEMENTS = 20
-_MOST_REFINED = 3
-# Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
-# is painted aside is told from noise only at a scale near the noise's own.
+_MOST_REFINED = 3  # further rough solves at most
+# Share of the residuals' scale. Where a rough solve leaves a scale below this share of the one before, another rough
+# solve follows at the new scale: a misplaced line differs from noise only at a scale near that of the noise.
 _MUCH_LESS = 0.3
 
 
@@ -145,17 +148,17 @@ def solve_robustly(
     *,
     is_near: bool = False,
 ) -> RobustSolution:
-    """The minimum over the inliers, at the noise that they show.
+    """Solve for the inliers, weighted by the noise that they show.
 
-    A start is off by more than the noise, so the first solve rejects nothing that the start can show: a redescending
-    loss at the residuals' median keeps gross errors from deciding.
+    An initial estimate is off by more than the noise, so the first solve rejects nothing that the initial estimate can
+    show: a redescending loss at the median residual keeps gross errors from dominating.
 
     Args:
-        problem: of all the observations; its weighting is not looked at.
-        usual: noise scales of points and curves that were seen before, where there are any.
-        most_rounds: solves, the rough one counted; 2 end near the minimum.
-        is_near: whether the start is near the minimum but for private placements: then there is no rough solve.
-
+        problem: the problem of all the observations; its weighting is ignored.
+        usual: noise scales of points and of curves known from earlier observations, if any.
+        most_rounds: the maximum number of solves, the rough one included; after 2 the estimate is near the minimum.
+        is_near: whether the initial estimate is near the minimum except for private placements; if so, there is no
+            rough solve.
     Raises:
         CalibrationError: see `solve`.
     """
@@ -165,44 +168,44 @@ def solve_robustly(
 
 
 def judge_at(problem: Problem, estimate: Estimate) -> RobustSolution:
-    """Noise and outliers by the leverages at an estimate, where nothing is solved."""
+    """Estimate noise and outliers by the leverages at an estimate, without a solve."""
     rounds = _RowRounds(problem, None, None)
     return rounds.by_leverages(rounds.at(estimate))
 
 
 class _RowRounds(Rounds[RobustSolution]):
-    """The rounds over rows that are at hand."""
+    """The rounds over rows in memory."""
 
     def __init__(self, problem: Problem, usual: tuple[float, float] | None, progress: SolveProgress | None) -> None:
         self._problem, self._usual, self._progress = problem, usual, progress
         self._redundancy: Redundancy | None = None
         self._moving = 0.0
-        self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
+        self._scales = (1.0, 1.0)  # scales of points and of curves by which the last rough solve was weighted
         self._last: tuple[Inliers, Sights] | None = None
         self.no_change = AT_REST if usual is None else AT_REST_AGAIN
-        # Relative change of the cost at which the first solve ends, and every further one.
+        # Relative change of the cost at which the rough solves end, and at which all further ones do.
         self._rough_end, self._end = 1e-3, 1e-14
         options = problem.options
         lenses = {name: options.of_camera(name).blank_lens for name in problem.layout.free}
         if options.is_rough and not any(problem.knows_lens(name, lens) for name, lens in lenses.items()):
-            # From farther off the next solve, whose lens is as smooth as the data say, begins with steps in vain. With
-            # sigmas of a tenth a hundredth of a variance may be left, and no number is off by 0.1 of its sd.
-            # Measured are a hundredth of that and 0.01.
+            # From a rougher end, the next solve, whose lens is as smooth as the data say, begins with rejected steps.
+            # The remaining cost may be a hundredth of a variance: no number is then off by more than 0.1 of its
+            # standard deviation. Measured: a hundredth of that cost, and 0.01 standard deviations.
             self._rough_end, self._end = 1e-4, 1e-2 / max(problem.equations, 1)
 
     def first(self, estimate: Estimate) -> RobustSolution:
-        """The rough solve from a start."""
+        """Run the rough solve from an initial estimate."""
         there = residuals(self._problem.sights, estimate, self._problem.feet)
         return self._rough(estimate, there, visible_from(self._problem.observations, there), 1)
 
     def at(self, estimate: Estimate) -> RobustSolution:
-        """An estimate as it is, judged."""
+        """The state at an estimate that is taken as it is, judged."""
         there = residuals(self._problem.sights, estimate, self._problem.feet)
         solution = Solution(estimate, np.nan, False, "", ())
         return self._with(self._judge(solution, there), solution, there, 0)
 
     def posed(self, estimate: Estimate) -> RobustSolution:
-        """A start near the minimum, its private placements at their best."""
+        """The state at an initial estimate near the minimum, with its private placements solved for."""
         there = residuals(self._problem.sights, estimate, self._problem.feet)
         visible = visible_from(self._problem.observations, there)
         weighting = Weighting(visible.point_scale, visible.curve_scale, "cauchy", loss_scale=1.0)
@@ -211,23 +214,23 @@ class _RowRounds(Rounds[RobustSolution]):
         return self._judged(Solution(estimate, np.nan, False, "", ()), there, 0)
 
     def refined(self, state: RobustSolution) -> RobustSolution:
-        """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
+        """Repeat the rough solve, each time at the residuals' scale of the last one, while that scale falls."""
         for _ in range(_MOST_REFINED):
             visible = visible_from(self._problem.observations, state.residuals)
             if not _much_below(visible.scales, self._scales):
                 break
             state = self._rough(state.estimate, state.residuals, visible, state.rounds + 1)
-        # Of one kind of observations without priors the leverages add up to the count.
+        # With one kind of observations and no priors, `by_count` suffices: leverages sum to the number of unknowns.
         stated = any(not prior.is_usual for prior in self._problem.priors_at(state.estimate))
-        if self._problem.smoothness:  # which tells as much, of fewer sights
+        if self._problem.smoothness:  # it was estimated from fewer sights by their leverages, which say as much
             return state
         mixed = stated or all(kind.equations for kind in self._problem.sights.by_kind)
         return self.by_leverages(state) if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
-        """A solve of few placements, which the others follow, that gross errors do not decide."""
+        """A rough solve of a few placements that gross errors do not dominate; the others are placed afterwards."""
         self._scales = visible.scales
-        # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
+        # A misplaced line is an outlier under a redescending loss, but not under Huber's with its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
         problem = replace(self._problem.rough(weighting), feet=there.feet).used(visible.points, visible.curves)
@@ -239,7 +242,7 @@ class _RowRounds(Rounds[RobustSolution]):
         if problem.options.is_rough and len(few.sights) < len(problem.sights):
             of_few = _RowRounds(few, self._usual, self._progress)
             end = of_few.to_rest(of_few.first(estimate), most_rounds=2)
-            self._scales = of_few._scales  # at which they were solved, not those of the start
+            self._scales = of_few._scales  # those of the last rough solve, not those at the initial estimate
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
             solution = end.solution
         else:
@@ -249,7 +252,7 @@ class _RowRounds(Rounds[RobustSolution]):
         return self._judged(solution, there, rounds)
 
     def _of_few(self, few: Problem, estimate: Estimate, others_follow: bool) -> Solution:
-        """A rough solve; where others follow, which takes time, again at the scale that it left while that falls."""
+        """A rough solve. Where others are placed afterwards, which takes time, it is repeated while the scale falls."""
         solution = solve(few, estimate, self._progress, precision=self._rough_end, is_near=False)
         for _ in range(_MOST_REFINED if others_follow else 0):
             points, curves = residuals_alone(few.sights, solution.estimate, few.feet).lengths
@@ -264,8 +267,8 @@ class _RowRounds(Rounds[RobustSolution]):
         return solution
 
     def next(self, state: RobustSolution) -> RobustSolution:
-        """One more solve, from where the last one ended, of what was judged to be inliers; with the same rows where
-        others are as good.
+        """Solve once more for the inliers, from the last estimate, and judge. The same rows take part again where the
+        new ones are as good.
         """
         solution = solve(state.problem, state.estimate, self._progress, precision=self._end)
         return self._judged(solution, state.residuals, state.rounds + 1, state.inliers)
@@ -273,8 +276,8 @@ class _RowRounds(Rounds[RobustSolution]):
     def mended(
         self, state: RobustSolution, undecided: frozenset[SightKey]
     ) -> tuple[RobustSolution, int, frozenset[SightKey]]:
-        """The state with lost boards posed again and mirrored poses turned over, how many there were of both, and which
-        sights' poses compete still.
+        """The state with lost boards posed anew and mirrored poses turned over, the number of both, and the sights
+        whose two poses still compete.
         """
         weighting = state.problem.weighting
         everything = self._problem.weighted(replace(weighting, loss="cauchy"))
@@ -285,10 +288,10 @@ class _RowRounds(Rounds[RobustSolution]):
         return state, lost + turned, undecided
 
     def with_leverages(self, state: RobustSolution) -> RobustSolution:
-        """The state with what its problem says there, where the noise is judged no other by the leverages, and nothing
-        moves by how smooth lenses are; else judged by them, for another round.
+        """The state with its information, where the leverages confirm the noise and the smoothness of lenses moves
+        nothing; else the state judged by the leverages, for another round.
         """
-        # Variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd.
+        # Variances by which numbers may still move with the smoothness of lenses: none is off by more than 0.23 sd.
         still = 0.05
         anew, reduced = self._anew(state)
         if self._moving > still or not anew.same_as(state.inliers, self.no_change):
@@ -298,11 +301,11 @@ class _RowRounds(Rounds[RobustSolution]):
         return replace(state, problem=problem, inliers=inliers, reduced=reduced)
 
     def by_leverages(self, state: RobustSolution) -> RobustSolution:
-        """The state judged by the leverages there."""
+        """The state judged by the leverages at its estimate."""
         return self._with(self._anew(state)[0], state.solution, state.residuals, state.rounds)
 
     def _anew(self, state: RobustSolution) -> tuple[Inliers, ReducedInformation]:
-        """Noise and inliers by the leverages there, and what they were taken from."""
+        """Noise and inliers by the leverages at the estimate, and the information that the leverages come from."""
         reduced = information(state.problem, state.estimate)
         if any(camera.lens.roughness for camera in state.estimate.cameras.values()):
             from ceres_cal.effects.smoothness import with_smoothness
@@ -320,7 +323,7 @@ class _RowRounds(Rounds[RobustSolution]):
     def _judged(
         self, solution: Solution, before: Residuals, rounds: int, inliers: Inliers | None = None
     ) -> RobustSolution:
-        """Where a solve, of these inliers, ended, and the problem that the inliers there make."""
+        """The state where a solve of these inliers ended, with the inliers and the problem judged there."""
         there = residuals(self._problem.sights, solution.estimate, before.feet)
         anew = self._judge(solution, there)
         if inliers is not None and anew.same_as(inliers, self.no_change):
@@ -335,7 +338,7 @@ class _RowRounds(Rounds[RobustSolution]):
         return judge(problem.observations, there, redundancy, problem.options, self._usual)
 
     def _with(self, inliers: Inliers, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
-        """The state with the problem that the inliers make; rows are not moved where the last ones were the same."""
+        """The state with the problem of these inliers. The sights are reused where the same rows took part before."""
         last = self._last
         if last is None or not np.array_equal(inliers.rows, last[0].rows):
             self._last = last = inliers, self._problem.sights.used(inliers.points, inliers.curves)
@@ -345,15 +348,17 @@ class _RowRounds(Rounds[RobustSolution]):
 
 
 def _much_below(scales: tuple[float, float], before: tuple[float, float]) -> bool:
-    """Whether the scale of points or that of curves fell to a small share of what it was."""
+    """Whether the scale of points or that of curves fell below the share _MUCH_LESS of what it was."""
     return any(now < _MUCH_LESS * then for now, then in zip(scales, before, strict=True))
 
 
 def _evenly(problem: Problem) -> Indices:
-    """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
-    # Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
+    """Numbers of sights that determine each camera well enough for a rough solve: not all private placements."""
+    # Placements for a lens without a formula, which says nothing of places where it was not observed. They are solved
+    # until convergence, and its smoothness is estimated from them.
     enough_without_formula = 100
-    # Of very many: a camera of 20 has so many others' rows on the wrong side of the bound that another solve follows.
+    # At least one in 25 placements takes part: a camera known from 20 of very many puts so many rows of the others on
+    # the wrong side of the rejection bound that another solve follows.
     share_of_placements = 25
     private = problem.private
     chosen: list[int] = []

@@ -1,4 +1,4 @@
-"""What is stated of a problem's numbers beforehand, each for itself, and how one of it is contradicted in words."""
+"""Statements on a problem's numbers, made beforehand, and the words for a statement that is contradicted."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from ceres_cal.effects.evidence import FEATURE_ASIDE
 from ceres_cal.problem import Estimate, GaussianPrior, Information, Key, Options, Problem, intrinsic_keys, values_of
 
 LEVEL = 1e-3
-"""Probability of a conflict where everything stated is right, over all that is stated: a conflict takes a calibration's
-word back, so it is as rare as a coin that falls on one side ten times."""
+"""Probability of any conflict, over all statements, where everything stated is right. A conflict withdraws a
+calibration's promise, so it is as rare as ten heads in a row.
+"""
 DOUBTED = float(1.0 / (1.0 + np.exp(DOUBTFUL)))
-"""Probability that a statement is wrong, from which on both explanations are named, as of a feature aside."""
+"""Probability that a statement is wrong above which both explanations are named, as for a misplaced feature."""
 _FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 1e-3: "km"}
 _STATED = {"prior": "stated", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
 
 
 class Conflict(Frozen, eq=True):
-    """Something known beforehand that everything else contradicts.
+    """A statement that everything else contradicts.
 
     Attributes:
-        kind: "prior", "fixed", "tolerance", "earlier" (the posterior of an earlier
-            calibration) or "priors" (two of them contradict each other). owner, quantity, unit: of the number.
-        stated, stated_sd: what was known; the sd of what was fixed is 0.
-        seen, seen_sd: what everything else says, or the other of two priors.
-        sigmas: how far they are apart, in standard deviations of their difference.
+        kind: "prior", "fixed", "tolerance", "earlier" (the posterior of an earlier calibration) or "priors" (two of
+            them contradict each other). owner, quantity, unit: of the number.
+        stated, stated_sd: the value as stated and its sd, which is 0 for a fixed number.
+        seen, seen_sd: the value that everything else says, or that of the other one of two priors, and its sd.
+        sigmas: distance of both values, in standard deviations of their difference.
         words: all of it in one line.
     """
 
@@ -47,16 +48,17 @@ class Conflict(Frozen, eq=True):
 
     @property
     def number(self) -> tuple[str, str, str]:
-        """Whose, what, and in which unit: of a key without its kind."""
+        """Owner, quantity and unit of the number: its key without the kind."""
         return self.owner, self.quantity, self.unit
 
 
 class WaldTest(NamedTuple):
-    """One prior of a statement, or what it holds, against the rest.
+    """The test of one prior of a statement, or of the numbers that it holds, against the rest.
 
     Attributes:
-        squared: distance, in variances. log_p: natural logarithm of its probability.
-        key: the number that is farthest off, with its mean and sd as stated and as the rest has it; sigmas: how far.
+        squared: squared distance, in variances. log_p: natural logarithm of its probability.
+        key: the number that differs most. stated, seen: its mean and sd as stated, and by the rest. sigmas: their
+            distance.
     """
 
     squared: float
@@ -68,7 +70,7 @@ class WaldTest(NamedTuple):
 
 
 class Statement(Frozen):
-    """Priors on the same numbers, or numbers that are held (no prior)."""
+    """Priors on the same numbers; or, without priors, numbers that are held."""
 
     kind: str
     keys: tuple[Key, ...]
@@ -77,7 +79,7 @@ class Statement(Frozen):
 
     @property
     def name(self) -> str:
-        """How messages name it."""
+        """Its name in messages."""
         if self.kind == "earlier":
             return "the earlier calibration"
         names = " and ".join(key.quantity for key in self.keys)
@@ -85,7 +87,7 @@ class Statement(Frozen):
 
     @property
     def spanning(self) -> GaussianPrior:
-        """One normal distribution with the moments of its priors, each as likely as any other."""
+        """One normal distribution with the moments of a mixture of its priors in equal parts."""
         means, variances = [], []
         for key in self.keys:
             known = np.array([stated_value(prior, key) for prior in self.priors if key in prior.keys])
@@ -95,7 +97,7 @@ class Statement(Frozen):
         return GaussianPrior(Information.of_sigmas(sigmas), np.array(means))
 
     def left_out(self, problem: Problem, estimate: Estimate) -> Problem:
-        """The problem without it."""
+        """The problem without the statement."""
         if self.priors:
             rest = [prior.without(self.keys) if is_plain(prior) else prior for prior in problem.priors]
             return replace(problem, priors=tuple(prior for prior in rest if prior.keys))
@@ -106,12 +108,12 @@ class Statement(Frozen):
 
 
 def is_plain(prior: GaussianPrior) -> bool:
-    """Whether each number is stated by itself: not a posterior."""
+    """Whether each number is stated by itself, unlike in a posterior."""
     return is_diagonal(prior.information.matrix)
 
 
 def statements(problem: Problem, estimate: Estimate) -> Iterator[Statement]:
-    """Everything stated of a problem's numbers, and what is held by name; a tolerance that was estimated is none."""
+    """All statements on a problem's numbers, and numbers held by name. Estimated tolerances are no statements."""
     told, every = problem.options.tolerances, problem.stated_at(estimate)
     plain = ([key for key in prior.keys if key.kind != "structure" or key.owner in told] for prior in every)
     yield from grouped([one.given(own) if is_plain(one) else one for one, own in zip(every, plain, strict=True)])
@@ -119,7 +121,7 @@ def statements(problem: Problem, estimate: Estimate) -> Iterator[Statement]:
 
 
 def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
-    """Priors that have a number in common together, tolerances one by one."""
+    """Statements of priors: those with a number in common are one statement, tolerances are one each."""
     groups: list[Statement] = []
     nothing = np.empty(0)
     for prior in (one for one in priors if one.keys):
@@ -139,8 +141,8 @@ def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
 
 
 def together(every: Iterable[Statement]) -> Statement | None:
-    """Priors of different numbers as one statement, for wrong ones may confirm one another: a phi and a height that are
-    both a fifth too large, heights that are all in feet. None where there are no two.
+    """One statement of all priors, since wrong ones may confirm one another: a phi and a height that are both a fifth
+    too large, or heights that are all in feet. None where there are fewer than two.
     """
     parts = [one for one in every if one.kind == "prior"]
     keys, priors = (tuple(chain.from_iterable(getattr(one, of) for one in parts)) for of in ("keys", "priors"))
@@ -148,8 +150,8 @@ def together(every: Iterable[Statement]) -> Statement | None:
 
 
 def agreed(priors: Sequence[GaussianPrior], conflicts: Sequence[Conflict]) -> tuple[GaussianPrior, ...]:
-    """What is left of priors where some are in conflict: a statement that everything else contradicts is set aside as
-    an outlier is, and of those that contradict each other alone one is left that spans them.
+    """The priors that remain after conflicts. A prior that everything else contradicts is removed, like an outlier;
+    priors that contradict only each other are replaced by one that spans them.
     """
     left = list(priors)
     disputed = {kind: {one.number for one in conflicts if one.kind == kind} for kind in ("prior", "priors")}
@@ -163,7 +165,7 @@ def agreed(priors: Sequence[GaussianPrior], conflicts: Sequence[Conflict]) -> tu
 
 
 def _held(options: Options, estimate: Estimate) -> Iterator[Statement]:
-    """What the options hold by name, the principal point as one."""
+    """Statements of what the options hold by name; the principal point is one statement."""
     for name, camera in estimate.cameras.items():
         every = {key.quantity: key for key in intrinsic_keys(name, camera.lens)}
         centre = [q for q in ("cx", "cy") if not options.free_principal_point or q in options.fixed]
@@ -174,13 +176,13 @@ def _held(options: Options, estimate: Estimate) -> Iterator[Statement]:
 
 
 def stated_value(prior: GaussianPrior, key: Key) -> tuple[float, float]:
-    """Mean and standard deviation of one number."""
+    """Mean and standard deviation of one number in a prior."""
     column = prior.information.columns([key])[0]
     return float(prior.mean[column]), float(prior.information.spread.sd[column])
 
 
 def number_text(value: float, sd: float, key: Key) -> str:
-    """3.000 ± 0.005 m; of a number that is held its value alone."""
+    """Text such as "3.000 ± 0.005 m"; for a number that is held (sd 0), only its value."""
     unit = "" if key.unit == "1" else f" {key.unit}"
     if sd == 0.0:
         return f"{value:g}{unit}"
@@ -191,14 +193,14 @@ def number_text(value: float, sd: float, key: Key) -> str:
 
 
 def likely_wrong(squared: float) -> float:
-    """Probability that a statement so far off is wrong, which one in twenty is: as of a line that lies aside."""
+    """Probability that a statement this far off is wrong; one in twenty is, as of misplaced lines."""
     log_odds = log_odds_wrong(squared**0.5) + 0.5 * squared
     return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
 def log_odds_wrong(sigmas: float) -> float:
-    """Logarithm of how much likelier a wrong statement is, so many standard deviations off, than a right one that is
-    not off; beyond the farthest that is expected each is as likely.
+    """Logarithm of the odds of a wrong statement that is `sigmas` standard deviations off to a right one that is not
+    off. Beyond the largest expected distance the odds stay the same.
     """
     variances = 1.0 + FEATURE_ASIDE.scatter**2
     squared = min(sigmas**2, float(variances[-1]))
@@ -207,11 +209,10 @@ def log_odds_wrong(sigmas: float) -> float:
 
 
 def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequence[str]) -> Conflict:
-    """A statement in conflict, in words.
+    """The conflict of a statement, with its words.
 
     Args:
-        alone: whether nothing but observations stands against it. rivals: names of other statements that may be wrong
-            in its place.
+        alone: whether only observations contradict it. rivals: names of other statements that may be wrong instead.
     """
     key, also = test.key, "".join(f", or else {one}" for one in rivals)
     words = f"{_apart(statement, test, alone)}: {_in_another_unit(test)}correct or remove it{also}"
@@ -219,12 +220,12 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
 
 
 def doubted(statement: Statement, test: WaldTest, alone: bool, probability: float) -> str:
-    """A statement that is in doubt, in words."""
+    """The words for a statement in doubt."""
     return f"{_apart(statement, test, alone)}. It {_wrong_by(probability)}"
 
 
 def may_be_wrong(conflict: Conflict, key: Key, probability: float, lens: str) -> str:
-    """In words, that what a conflict with another lens names may be wrong."""
+    """The words for a statement that is in conflict under another lens and may be wrong."""
     stated = number_text(conflict.stated, conflict.stated_sd, key)
     seen = f"with the lens {lens} everything else says {number_text(conflict.seen, conflict.seen_sd, key)}"
     return f"the {_STATED[conflict.kind]} {key.quantity} of {key.whose}, {stated}: {seen}. It {_wrong_by(probability)}"
@@ -242,7 +243,7 @@ def _apart(statement: Statement, test: WaldTest, alone: bool) -> str:
 
 
 def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Conflict]]:
-    """Two priors of one number that exclude each other, whatever the observations say, with that number."""
+    """Pairs of priors on one number that contradict each other, whatever the observations say; with that number."""
     every = [(s, key) for s in statements if len(s.priors) > 1 for key in s.keys]
     for statement, key in every:
         known = [stated_value(prior, key) for prior in statement.priors if key in prior.keys]
@@ -258,8 +259,8 @@ def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Confli
 
 
 def _in_another_unit(test: WaldTest) -> str:
-    """The likely cause, where the two agree in another unit."""
-    near = 0.1  # relative: how near a unit must bring the two to be the likely cause
+    """The likely cause, where both values agree in another unit."""
+    near = 0.1  # relative difference up to which a unit is the likely cause
     if test.key.unit != "m" or not test.seen[0]:
         return ""
     ratio = test.stated[0] / test.seen[0]

@@ -1,20 +1,20 @@
-"""Views that are displaced by themselves, as where a lens is stabilised or rows are read out one after the other.
+"""Find views that are displaced individually, as by a stabilised lens or a rolling shutter.
 
-A stabilised lens or sensor is shifted against the hand's motion, by some pixels in each picture; and what a hand moves
-is sheared while rows are read out one after the other (a rolling shutter). In each view of a board the principal point,
-and the motion while it is read out, are random effects with sigmas that all views of a camera share: a shift of the
-picture, which is nearly all of it, and turns, which a pose hides less. So are smooth displacements of each view
-besides, and those that all views have alike, which are the lens's. The evidence of each is taken beside the others
-(`effects.evidence`): by itself the principal point of any camera seems to move where views err smoothly. Where it does,
-or where the read-out says more of what is left than everything else, best linear unbiased predictions are taken off the
-observations, and everything else is solved for again (Henderson, Biometrics 31, 1975). What they leave open goes into
-the covariance of the shared numbers.
+A stabilised lens or sensor is shifted against the hand's motion, by some pixels in each picture. What a hand moves is
+sheared while rows are read out one after the other (a rolling shutter). In each view of a board, the principal point
+and the motion during the read-out are random effects with sigmas that all views of a camera share: a shift of the
+picture, which is nearly all of it, and turns, which a pose hides less. Further random effects are smooth displacements
+of each view, and those that all views have alike, which are due to the lens. The evidence of each is computed beside
+the others (`effects.evidence`): by itself, the principal point of any camera seems to move where views err smoothly.
+Where it moves, or where the read-out explains more of the residuals than everything else, best linear unbiased
+predictions are subtracted from the observations, and everything else is solved for again (Henderson, Biometrics 31,
+1975). The uncertainty of these predictions is added to the covariance of the shared numbers.
 
-Nothing is taken off where the lens that follows from it predicts views that are left out much worse: then it was the
-lens that erred, as where a fisheye's rays do not meet in one point.
+Nothing is subtracted where the resulting lens predicts left-out views much worse: then the lens model was wrong, as for
+a fisheye whose rays do not meet in one point.
 
-Smooth displacements, and a read-out that says less, are not taken off. They are found in nearly all public photographs
-of boards; but without them lenses predict other views worse.
+Smooth displacements, and a read-out that explains less, are not subtracted. They are found in nearly all public
+photographs of boards, but without them lenses predict other views worse.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _ROLLING_WORDS = (
     "(rolling shutter) while the camera or the target moves (most in {named}). A place in a single picture may be as "
     "far off. Hold both still"
 )
-# What a view's coefficients are, in their order, how many, and what is expected of them; those of all views come last.
+# Coefficients of a view, in their order: name, number and prior. The smooth displacements of all views come last.
 _CENTRE_OF_VIEW, _READ_OUT, _TURNS = "principal point", "read-out", "read-out, turns"
 _MODES = {
     _CENTRE_OF_VIEW: (2, CENTRE_MOVES),
@@ -77,23 +77,23 @@ _MODES = {
 }
 _IMAGE = "image"
 _OF_MODE = np.repeat(list(_MODES), [count for count, _ in _MODES.values()])
-_CENTRE = [2, 3]  # places of the principal point in the intrinsics vector
-_FEWEST, _ENOUGH = 5, 20  # views of a camera: that tell anything, and whose coefficients are asked how large they are
-_LEAST_PX = 3.0  # by which a principal point moves: no lens is stabilised for a third of an arc minute
-_TOLD = 1e-4  # share of the largest: of directions that tell anything beside the poses
-_NONE_PX = 1e-6  # a sigma of coefficients that there are none of
+_CENTRE = [2, 3]  # positions of the principal point in the intrinsics vector
+_FEWEST, _ENOUGH = 5, 20  # views of a camera: the least that are tested, and those that determine the sigmas
+_LEAST_PX = 3.0  # least sigma of a moving principal point: no lens is stabilised for a third of an arc minute
+_TOLD = 1e-4  # share of the largest eigenvalue above which a direction is determined beside the poses
+_NONE_PX = 1e-6  # sigma of coefficients that are absent
 
 Sizes = Mapping[str, float]
-"""Sigma, px, of each likely kind of a camera's coefficients."""
+"""Sigma (px) of each likely kind of coefficients of a camera."""
 
 
 class ViewDisplacement(Frozen):
-    """By how much views are displaced, of cameras whose principal point moves or whose shutter rolls.
+    """Displacements of views, for cameras whose principal point moves or whose shutter rolls.
 
     Attributes:
-        sizes: camera -> sigmas. displacement: (N + M, 2) px by which the observations are moved. taken_up: equations
-            that this uses up. keys, shifts: (R, K) of the shared numbers, whose products with themselves go into their
-            covariance.
+        sizes: camera -> sigmas. displacement: (N + M, 2) px by which the observations are moved. taken_up: degrees of
+            freedom that this uses. keys, shifts: (R, K) of the shared numbers; the outer products of the shifts are
+            added to their covariance.
     """
 
     sizes: Mapping[str, Sizes]
@@ -103,14 +103,14 @@ class ViewDisplacement(Frozen):
     shifts: Array
 
     def taken_off(self, problem: Problem) -> Problem:
-        """The problem without it."""
+        """The problem with the displacement subtracted from its observations."""
         points = len(problem.observations.points)
         sights = problem.sights.displaced(-self.displacement[:points], -self.displacement[points:])
         return replace(problem, sights=sights, taken_up=self.taken_up)
 
     @property
     def of_views(self) -> ViewEffects:
-        """The same where something else is asked."""
+        """The displacement for another linear model, see `ViewEffects`."""
         return ViewEffects(self.displacement, self._columns)
 
     def _columns(self, model: Linearised) -> tuple[SparseColumns, Others]:
@@ -122,7 +122,7 @@ class ViewDisplacement(Frozen):
         return columns, [(numbers, sigma) for numbers, sigma in each if len(numbers)]
 
     def estimates(self, observations: Observations) -> tuple[EffectEstimate, ...]:
-        """What is said of each camera."""
+        """One estimate for each camera, with its sentence."""
         points = observations.points
         views, moved = len(observations.views), np.sum(self.displacement[: len(points)] ** 2, axis=1)
         count = np.bincount(points.view, minlength=views)
@@ -148,10 +148,10 @@ def _centre_moves(sizes: Sizes) -> bool:
 
 
 def find_unsteady(problem: Problem, end: RobustSolution, before: ViewDisplacement | None) -> ViewDisplacement | None:
-    """What is found of cameras whose views are likely to be displaced; None where none is.
+    """The displacement of cameras whose views are likely displaced; None where there is none.
 
     Args:
-        problem: of all the observations, what was found `before` taken off. end: of its rounds.
+        problem: of all the observations, with what was found `before` subtracted. end: of its rounds.
     """
     estimate = end.estimate
 
@@ -162,9 +162,9 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: ViewDisplacemen
     def modelled(some: Problem) -> Linearised:
         return make_linear_model(some, estimate, *seen(some))
 
-    # The squares by which others mispredict a view, over the same with nothing taken off, are 0.4 to 1.6 in simulations
-    # of both kinds, and 0.4 to 1.5 in a GoPro and a Sony held by hand. In a public fisheye rig they are 2.5 to 40: what
-    # seemed to move was the lens's, and held-out views were predicted up to six times worse.
+    # Squared errors with which the others predict a view, relative to those with nothing subtracted: 0.4 to 1.6 in
+    # simulations of both kinds, 0.4 to 1.5 for a GoPro and a Sony held by hand. For a public fisheye rig it is 2.5 to
+    # 40: what seemed to move was the lens's error, and left-out views were predicted up to six times worse.
     much_worse = 2.0
     sizes, noise = {}, 0.0
     for camera in problem.sights.cameras:
@@ -177,7 +177,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: ViewDisplacemen
         if before is not None or _seem_displaced(*seen(*some.built_as(estimate))):
             model = modelled(some)
             if before is None and any(lens_changes(Case(some, estimate, model))):
-                continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` tells that
+                continue  # pictures of two cameras were joined, or the lens was touched: `diagnose` says so
             own, left = _sizes(model, smooth_image(model.equations, estimate))
             if own and _told(model, estimate, {camera: own}, left).mispredicts(left) < much_worse:
                 sizes[camera], noise = own, max(left, noise)
@@ -189,7 +189,7 @@ def find_unsteady(problem: Problem, end: RobustSolution, before: ViewDisplacemen
 def without_unsteadiness(
     problem: Problem, estimate: Estimate, taking_part: tuple[Mask, Mask], effects: Sequence[EffectEstimate]
 ) -> Problem:
-    """The problem of all the observations, what was found to move them taken off."""
+    """The problem of all the observations, with the displacements of the estimated effects subtracted."""
     sizes = {one.subject: {a.name: a.value for a in one.amounts} for one in effects if one.kind in _KINDS}
     if not sizes:
         return problem
@@ -208,10 +208,10 @@ def _equations(
     problem: Problem,
     seen_once: Collection[str | None],
 ) -> tuple[Equations, Weights]:
-    """Of a problem's sights, with the residuals `before` anything was taken off; views that were taken out as a whole
-    speak again, for they may be those that are displaced most. Of a placement that is not `seen_once` another camera
-    says where it is, and what contradicts that may be of another moment. What takes part counts whole: a robust weight
-    is that of an observation whose view is displaced.
+    """Equations and weights of a problem's sights, with the residuals `before` anything was subtracted. Views that were
+    rejected as a whole take part again, since they may be the most displaced. A view of a placement that is not
+    `seen_once` does not: another camera determines that placement, and a contradicting view may be of another moment.
+    Inliers have full weight: a robust weight would reduce observations of displaced views.
     """
     equations = write_equations(problem.sights, estimate, there)
     if before is not None:
@@ -224,9 +224,9 @@ def _equations(
 
 
 def _modes(equations: Equations, *, smooth: bool = True) -> list[Array]:
-    """(E, 20) px per px of each coefficient of a view, side by side: the principal point's x and y; a shift of the
-    picture, and a turn and a shift of the pose, that grow from row to row; polynomials along both axes of the image,
-    where `smooth` asks for them.
+    """(E, 20) px per px of each coefficient of a view, side by side: x and y of the principal point; a shift of the
+    picture, and a turn and a shift of the pose, that grow from row to row; and, if `smooth`, polynomials along both
+    axes of the image.
     """
     place = places_in_view(equations)
     turns = equations.pose * place[:, 1:]
@@ -238,9 +238,9 @@ def _modes(equations: Equations, *, smooth: bool = True) -> list[Array]:
 
 
 def _seem_displaced(equations: Equations, weights: Weights) -> bool:
-    """Whether views may be displaced, at a glance, nothing but poses free: half of all squares go with their read-out,
-    or their principal points seem to move by themselves, by moments: their scores have the variance T + T^2 sigma^2.
-    Beside what else displaces views they move by less.
+    """A quick test whether views may be displaced, with only poses free: half of all squares are explained by the
+    read-out, or principal points seem to move by the method of moments: their scores have the variance T + T^2 sigma^2.
+    Beside other displacements of views they move by less.
     """
     columns = np.column_stack([*_modes(equations, smooth=False), equations.pose, equations.residual])
     columns *= (weights.inverse_sigma * weights.used)[:, None]
@@ -258,23 +258,24 @@ def _seem_displaced(equations: Equations, weights: Weights) -> bool:
 
 
 def _of_views(model: Linearised) -> SparseColumns:
-    """Of the coefficients of each view, one after the other."""
+    """The columns of the coefficients of each view, one view after the other."""
     equations = model.equations
     weighted = np.hstack(_modes(equations)) * model.weight[:, None]
     return SparseColumns.of_groups(model, weighted, equations.sight, len(equations.bounds) - 1)
 
 
 def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
-    """Those that are likely, each beside the others, where principal points move or the read-out says most; and the
-    mean square of the noise beside all of them.
+    """Sigmas of the likely kinds, each beside the others, where principal points move or the read-out explains most,
+    and the mean square of the noise beside all of them.
 
     Args:
         model: of some views. image: (E, I) smooth displacements that all views have alike.
     """
-    # Squares by the read-out over those by everything else, and views, from which on it is taken off. Halves of a GoPro
-    # held by hand have 3.7 to 44. Half of a public fisheye set has 0.7 to 1.9, by which corners are stray; taken off,
-    # phi was six standard deviations elsewhere with one than with another. At 1.5, in 15 views of a public stereo
-    # camera, lenses predict other views worse by a tenth. Of fewer views it may be the lens's, or the target's.
+    # Ratio of the squares explained by the read-out to those of everything else, and number of views, from which on the
+    # read-out is subtracted. Halves of a GoPro set held by hand have 3.7 to 44. Half of a public fisheye set has 0.7 to
+    # 1.9, because of stray corners; if subtracted, phi of two halves differed by six standard deviations. At 1.5, in 15
+    # views of a public stereo camera, lenses predict other views worse by a tenth. Fewer views may show errors of the
+    # lens or of the target.
     says_most, enough_views = 2.5, 10
     of_views, views = _of_views(model), len(model.equations.bounds) - 1
     together = np.zeros(len(image), dtype=np.int64)
@@ -297,12 +298,12 @@ def _sizes(model: Linearised, image: Array) -> tuple[Sizes, float]:
 
 
 class _ViewSums(Frozen):
-    """What the equations of each of S views say of its C coefficients beyond its pose, and of P shared directions.
+    """Sums over the equations of each of S views: about its C coefficients, beyond its pose, and P shared directions.
 
     Attributes:
         model: with smooth displacements that all views have alike. modes: (E, C) px per px of each coefficient.
         products: (S, C + P + 1, C + P + 1) of coefficients, shared directions and residuals, over the noise.
-        left_open: (S, C, C) what they leave open of the coefficients, (T + 1 / sigma^2)^-1.
+        left_open: (S, C, C) covariance of the coefficients given the rest, (T + 1 / sigma^2)^-1.
     """
 
     model: Linearised
@@ -312,17 +313,17 @@ class _ViewSums(Frozen):
 
     @property
     def told(self) -> Array:
-        """(S, C, C) T, of the coefficients."""
+        """(S, C, C) T, the information on the coefficients."""
         return self.products[:, : self._width, : self._width]
 
     @property
     def common(self) -> Array:
-        """(S, C, P) G, what shared directions have in common with them."""
+        """(S, C, P) G, the products of coefficients and shared directions."""
         return self.products[:, : self._width, self._width : -1]
 
     @property
     def slope(self) -> Array:
-        """(S, C, 1) half the derivative of the squares by them."""
+        """(S, C, 1) half the derivative of the squares by the coefficients."""
         return self.products[:, : self._width, -1:]
 
     @property
@@ -330,7 +331,7 @@ class _ViewSums(Frozen):
         return int(self.modes.shape[1])
 
     def mispredicts(self, noise: float) -> float:
-        """Squares that each view leaves where all others say what is shared, over those with nothing taken off."""
+        """Squares that views leave when the others determine what is shared, over those with nothing subtracted."""
         alone = self.products[:, self._width :, self._width :]
         across = self.products[:, : self._width, self._width :]
         prior = np.eye(alone.shape[1] - 1) - np.sum(alone[:, :-1, :-1], axis=0)
@@ -346,7 +347,7 @@ class _ViewSums(Frozen):
 
 
 def _told(own: Linearised, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float) -> _ViewSums:
-    """At these sizes and a mean square of the noise."""
+    """The sums of a model's views at these sizes and this mean square of the noise."""
     equations, image_px = own.equations, max(one.get(_IMAGE, _NONE_PX) for one in sizes.values())
     model = own.with_columns(smooth_image(equations, estimate), image_px / np.sqrt(noise))
     modes = np.hstack(_modes(equations))
@@ -363,10 +364,10 @@ def _told(own: Linearised, estimate: Estimate, sizes: Mapping[str, Sizes], noise
 def _predicted(
     own: Linearised, problem: Problem, estimate: Estimate, sizes: Mapping[str, Sizes], noise: float
 ) -> ViewDisplacement:
-    """The best linear unbiased predictions at these sizes and a mean square of the noise, everything that is free at
-    its best beside them.
+    """The best linear unbiased predictions at these sizes and this mean square of the noise, with everything that is
+    free at its best.
 
-    Of the shared directions 1 - sum of G^T C G is known (see `_ViewSums`), and what follows of these goes back into the
+    The information on the shared directions is 1 - sum of G^T C G (see `_ViewSums`); their step corrects the
     coefficients.
     """
     equations, all_told = own.equations, _told(own, estimate, sizes, noise)
@@ -376,7 +377,7 @@ def _predicted(
     step = model.step / np.sqrt(noise) - np.sum(through.transpose(0, 2, 1) @ slope, axis=0)[:, 0]
     coefficients = through @ (covariance @ step) - (all_told.left_open @ slope)[:, :, 0]
     moved = np.sum(modes * coefficients[equations.sight], axis=1)
-    moved = model.beyond_private((moved * model.weight)[:, None])[:, 0] / model.weight  # what poses do not follow
+    moved = model.beyond_private((moved * model.weight)[:, None])[:, 0] / model.weight  # what poses do not absorb
     return ViewDisplacement(
         sizes,
         equations.displacement(moved, problem.observations.rows),
@@ -387,12 +388,12 @@ def _predicted(
 
 
 def _of_sight(sizes: Sizes) -> Array:
-    """(20,) the sigma of each coefficient."""
+    """(20,) the sigma of each coefficient of a view."""
     return np.array([sizes.get(kind, _NONE_PX) for kind in _OF_MODE.tolist()])
 
 
 def _shifts(own: Linearised, common: Array, through: Array, covariance: Array) -> Array:
-    """(R, K) by which what is open of the coefficients moves the shared numbers, over the noise."""
+    """(R, K) by how much the uncertainty of the coefficients moves the shared numbers, over the noise."""
     taken = common[:, :, : own.shared.shape[1]].transpose(0, 2, 1)
     across = np.sum(taken @ through, axis=0)
     alone = across[:, : taken.shape[1]]

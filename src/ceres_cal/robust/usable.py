@@ -1,12 +1,13 @@
-"""May a solution be used? Whether it explains the observations, its lens folds, and nothing was lost on the way.
+"""Decide whether a solution may be used: it must explain the observations, and its lens and geometry must be possible.
 
-Geometry that cannot be: a camera under the floor that it sees from above, or what it sees behind it.
+Impossible geometry is a camera under the floor that it sees from above, or observed places behind a camera.
 
-A flat scene fits as well when its picture is mirrored: its columns h1 and h2 of R are mirrored, and r3 = h1 x h2 turns
-round, so that the camera stands as far under the floor as it stood above. Exchanged axes and y upwards are mirrored
-pictures, too, turned about the principal point; residuals tell nothing of any of it.
+A flat scene fits as well when its picture is mirrored: the columns h1 and h2 of R are mirrored, r3 = h1 x h2 is
+reversed, and the camera stands as far under the floor as it stood above. Exchanged axes and y upwards are also mirrored
+pictures, turned about the principal point. Residuals say nothing about any of these.
 
-Points of a target that are listed in another order than drawn, or are those of another kind of grid.
+Also detected are points of a target that are listed in another order than drawn, or that belong to another kind of
+grid.
 """
 
 from __future__ import annotations
@@ -24,18 +25,19 @@ from ceres_cal.robust.robust import RobustSolution
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
-# The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
-# over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
+# Ratio of the principal point's distances from the image centre and from that of the image with its sides exchanged. If
+# one is below this share of the other, the principal point decides between them; in the tests' scenes its distance from
+# its own centre is a tenth of that between the two.
 _NEARER = 0.5
-_BELOW = 0.5  # of the camera's height over the floor: noise sinks a board by centimetres
+_BELOW = 0.5  # share of the camera's height over the floor: noise lowers a board only by centimetres
 
-# Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
-# that is too simple stays below a few pixels. Nothing changes from half to double.
+# Share of the image's diagonal (24 px for 1600 px wide images). If half of a camera's observations are farther off, it
+# is no calibration; a lens that is too simple leaves at most a few pixels. Halving or doubling changes nothing.
 _NO_FIT = 0.015
 
 
 def require_fits(end: RobustSolution, problem: Problem) -> None:
-    """Raise SolutionError where the solve failed, or its end explains too little."""
+    """Raise SolutionError where the solve failed, or where the solution misses too many observations."""
     if end.solution.failed:
         raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
     points, curves = end.residuals.lengths
@@ -46,20 +48,21 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
         met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
         if 2 * met < len(own.point_rows) + len(own.curve_rows):
             count, checks = own.equations, "check labels, target dimensions and which lens it is"
-            few = count < 4 * (len(camera.lens.values) + 10)  # of a camera with its pose: too few to tell
+            few = count < 4 * (len(camera.lens.values) + 10)  # equations for a camera and its pose: too few to decide
             what = f"show it more of the targets, which it has only {count} numbers of, or {checks}" if few else checks
             missed = f"the best solution misses half of its observations by more than {limit_px:.0f} px"
             raise SolutionError(f"camera {name!r}: {missed}: {what}", name)
 
 
 def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -> None:
-    """Raise SolutionError where a station cannot stand where it does.
+    """Raise SolutionError where the position of a station is impossible.
 
-    Only a floor is asked that lies in the world: boards are seen from either side, a wall stands upright, a ceiling is
-    above the origin. Give what is seen from below in coordinates whose z points to the camera.
+    This is decided only for stations that see a floor of the world: boards are seen from either side, a wall stands
+    upright, and a ceiling is above the origin. Scenes seen from below must be given in coordinates whose z axis points
+    to the camera.
 
     Args:
-        sights: of all the observations, as the solve took them.
+        sights: those of all the observations, with the targets as they were solved for.
     """
     for station, sight in sights.of_world.items():
         camera = estimate.camera_at(station)
@@ -75,7 +78,7 @@ def require_possible(sights: Sights, estimate: Estimate, residuals: Residuals) -
 
 
 def _require_above(least_m: float, observations: Observations, estimate: Estimate) -> None:
-    """Raise SolutionError where most placements of a target lie so deep under the floor that its size is wrong."""
+    """Raise SolutionError where most placements of a target lie so deep under the floor that its size must be wrong."""
     for name, target in observations.targets.items():
         placed = dict.fromkeys(v.placement for v in observations.shown_views if v.target == name and v.placement)
         tops = [float(np.max(estimate.placements[one].transform(target.places)[:, 2])) for one in placed]
@@ -87,7 +90,7 @@ def _require_above(least_m: float, observations: Observations, estimate: Estimat
 
 
 def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
-    """Raise SolutionError where the station has most of what it saw behind it, or beyond its lens."""
+    """Raise SolutionError where most of what the station observed lies behind it, or beyond its lens."""
     points, curves = residuals.lengths
     lengths = np.concatenate([points[sight.point_rows], curves[sight.curve_rows]])
     behind = np.count_nonzero(~np.isfinite(lengths))
@@ -99,8 +102,8 @@ def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
 
 
 def _places_of_world(sight: Sights) -> Array:
-    """(P, 3) m of what a sight shows of targets that nobody put there: its points, starts and ends of its lines, and
-    of its arcs the centre and a quarter.
+    """(P, 3) m, places on immovable targets that a sight shows: its points, the starts and ends of its lines, and the
+    centre and a quarter point of its arcs.
     """
     observations = sight.observations
     world = np.array([not observations.targets[view.target].movable for view in observations.views])
@@ -110,7 +113,7 @@ def _places_of_world(sight: Sights) -> Array:
 
 
 def _cause(camera: Camera) -> str:
-    """Which mirrored picture it may be: of an image that is not square the principal point tells swapped axes."""
+    """The likely kind of mirrored picture; the principal point of an image that is not square tells swapped axes."""
     width, height = camera.image_size
     sizes = np.array([[width, height], [height, width]])
     off, other = np.linalg.norm(camera.principal_point - (sizes - 1.0) / 2.0, axis=1)
@@ -120,16 +123,17 @@ def _cause(camera: Camera) -> str:
     return f"the image is mirrored, or {swapped}, or y points upwards"
 
 
-# Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
+# Share of the image's diagonal (240 px of 1600): lenses are mounted within some hundredths, unless a picture was
+# cropped.
 _OFF_CENTRE = 0.15
-# Share of a side that observations of an image usually reach beyond.
+# Share of an image's side beyond which observations usually reach.
 _UNFILLED = 0.9
-# Of the image's diagonal: three standard deviations of usual principal points (`priors.USUAL_CENTRE`).
+# Share of the image's diagonal: three standard deviations of usual principal points (`priors.USUAL_CENTRE`).
 _UNUSUAL = 0.045
 
 
 def all_shown(camera: Camera, sights: Sights) -> bool:
-    """Whether the lens folds nowhere inside of what was observed: the camera's sights `about` it."""
+    """Whether the lens folds nowhere within the observed part of the image. `sights`: the camera's, `about` it."""
     places = (sights.pixels, sights.curve_pixels)
     return all(bool(np.all(camera.lens.shows(pixels, camera.phi))) for pixels in places)
 
@@ -137,11 +141,11 @@ def all_shown(camera: Camera, sights: Sights) -> bool:
 def require_usable(
     end: RobustSolution, problem: Problem, groups: Sequence[Mask], *, is_refit: bool = False
 ) -> tuple[str, ...]:
-    """Warnings about the solution; SolutionError where it must not be used.
+    """Warnings about the solution. Raises SolutionError where it must not be used.
 
     Args:
-        groups: (N + M,) of each the observations that were taken out as one. is_refit: whether the lens was chosen
-            before.
+        groups: masks (N + M,) of the observations that were left out as one group each. is_refit: whether the lens was
+            chosen earlier.
     """
     instead = "choose fewer or other coefficients, or observe nearer to the corners"
     if is_refit:
@@ -178,8 +182,8 @@ def require_usable(
 
 
 def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
-    """Whether the principal point suits another image than the stated one: one that ends where the observations do, or
-    that has width and height in the other order, as where pixels are given as (row, column).
+    """Whether the principal point suits another image size than the stated one: the extent of the observations, or
+    width and height exchanged, as where pixels are given as (row, column).
     """
     size = np.array(camera.image_size, dtype=float)
     others = [size[::-1]]
@@ -190,7 +194,7 @@ def _suits_another(camera: Camera, reach: Array, off_px: float) -> bool:
 
 
 def _lost(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterator[str]:
-    """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
+    """Warn of sights with most observations rejected one by one: they were not explained, whatever the rest is."""
     used = inliers.rows
     for rows in groups:
         used |= rows
@@ -207,16 +211,17 @@ def _lost(inliers: Inliers, problem: Problem, groups: Sequence[Mask]) -> Iterato
         yield f"{key}: {100.0 * (1.0 - share):.0f} % of its observations were taken out: {checks}"
 
 
-# ---- targets whose points are others than those that are drawn ------------------------------------------------------
+# ---- targets whose points are not those of the drawing ---------------------------------------------------------------
 
-# Of the distance between neighbours, root mean square of offsets along one axis. Where the points of a grid are listed
-# in another order, or are those of another kind of grid, it is 0.17 to 0.5; boards are built to a hundredth.
+# Share of the distance between neighbouring points, for the root mean square of offsets along one axis. Where the
+# points of a grid are listed in another order, or belong to another kind of grid, it is 0.17 to 0.5; boards are built
+# to a hundredth.
 _NOT_BUILT = 0.1
 
 
 def is_another(one: AsBuilt, target: Target) -> bool:
-    """Whether points lie so far aside that they are others than those that are drawn."""
-    most_probes = 500  # points whose neighbours are sought
+    """Whether the points lie so far from their nominal positions that they cannot be those of the drawing."""
+    most_probes = 500  # points whose nearest neighbours are determined
     if one.kind != "points":
         return False
     places = target.point_array
@@ -225,7 +230,7 @@ def is_another(one: AsBuilt, target: Target) -> bool:
 
 
 def misnamed(every: Sequence[AsBuilt], targets: Mapping[str, Target]) -> Iterator[str]:
-    """A warning of each target whose points are others than those that are drawn."""
+    """A warning for each target whose points cannot be those of its drawing."""
     for one in every:
         if is_another(one, targets[one.target]):
             yield (
