@@ -1,4 +1,4 @@
-"""From observations to a calibration: choose a lens where that is asked for, initialise, and solve (`solving`)."""
+"""Calibrate from observations: choose a lens where that is asked for, initialise, and solve (`solving`)."""
 
 from __future__ import annotations
 
@@ -59,18 +59,19 @@ def calibrate(
 ) -> Calibration:
     """Calibrate every camera, station and placement that the observations show.
 
-    Of very many observations of the world a part decides the lens, what does not belong and which statements are in
-    conflict; all of them are judged and solved for, in shares (docs/scale.md).
+    For very large data sets of the world, the lens, the outliers and the conflicting statements are determined from a
+    subset; then all observations are judged and solved for, in shares (docs/scale.md).
 
     Args:
-        progress: called at every iteration of every solve, from this thread.
-        client: a `distributed.Client` whose workers keep the shares, however many observations there are.
+        progress: called at every iteration of every solve, in the caller's thread.
+        client: a `distributed.Client` whose workers hold the shares, however many observations there are.
 
     Raises:
         DegenerateError: the observations cannot determine the unknowns; the message names the frame or the numbers.
-        SolutionError: no usable camera came out.
-        InputError: a prior or a fixed number that the camera does not have; pixels outside their image, or in a corner
-            of one that is far larger; a mirrored picture; points that are listed in another order than their target's.
+        SolutionError: the solution is no usable camera.
+        InputError: a prior or a fixed number does not exist in the camera's lens; pixels lie outside their image, or in
+            one corner of a far larger image; a picture is mirrored; points are listed in another order than their
+            target's.
     """
     options = options or Options()
     require_possible_numbers(observations, options)
@@ -81,7 +82,7 @@ def calibrate(
     with for_small_matrices(), at_most(options.threads):
         try:
             return _measured(observations, options, progress, client)
-        # quiet: what agrees with all that was stated is an answer, wherever the search for it began
+        # quiet: a solution that agrees with every statement is an answer, wherever its search began
         except (DegenerateError, SolutionError) as error:
             if odd := next(chain(unfilled(observations), odd_sizes(observations)), None):
                 raise type(error)(f"{error}; {odd}") from None
@@ -96,7 +97,7 @@ def calibrate(
 
 
 def _others_can(failure: CalibrationError, observations: Observations, options: Options) -> str:
-    """What follows the failure's line where the other cameras make a calibration without those that see too little."""
+    """Return the end of the error message that says that the other cameras can be calibrated; "" where they cannot."""
     left_out, found = list[str](), cast("CalibrationError | Calibration", failure)
     while isinstance(found, CalibrationError):
         if found.camera is None or len(observations.cameras) < 2 or is_bulk(observations):
@@ -109,18 +110,18 @@ def _others_can(failure: CalibrationError, observations: Observations, options: 
 
 
 def lenses_by_held_out(observations: Observations, options: Options) -> Mapping[str, LensChoice]:
-    """The lens of each camera that predicts held-out parts of its observations best, whichever the options name."""
+    """Return each camera's choice of the lens that best predicts held-out observations; the options' is ignored."""
     return calibrate(observations, any_lens(options)).lens_choices
 
 
 def calibrate_near(camera: Camera, observations: Observations, options: Options, *, knows: bool = True) -> Calibration:
-    """Calibrate the one camera that the observations show, with a lens by its name, from about where it is known to be:
-    where it stands, but for how what is known of it bends.
+    """Calibrate the only camera of the observations with a named lens, from its approximately known numbers and pose.
+
+    The curvature of the posterior is not evaluated.
 
     Args:
-        knows: whether it is asked which curves do not belong, and what is then known of its numbers: else phi may be
-            anywhere along its valley, and outliers are single places.
-
+        knows: whether whole curves are tested for being outliers and a posterior is made. Otherwise phi may end
+            anywhere along its valley, and only single observations are rejected.
     Raises:
         CalibrationError: see `calibrate`.
     """
@@ -134,11 +135,11 @@ def calibrate_near(camera: Camera, observations: Observations, options: Options,
 
 
 def _measured(observations: Observations, options: Options, progress: SolveProgress | None, client: Any) -> Calibration:
-    """With targets drawn as long, and cameras as noisy, as they were found to be; from there again where that is not
-    how they were taken. Very many observations, of which a part decides, have one noise.
+    """Calibrate, with the dimensions of targets and the noise of cameras as they were found; repeat from there where
+    they differ from what was assumed. Very large data sets, of which a subset decides, keep their noise.
     """
-    # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start
-    # and outliers are those of the right drawing; and how many there may be.
+    # A dimension may differ from its drawing by this share without another solve; beyond it the start and the outliers
+    # are those of a wrong drawing. And the largest number of such solves.
     redrawn, most_drawings = 0.005, 4
     for _ in range(most_drawings):
         calibration = _of_same_moments(_calibrated(observations, options, progress, client), observations)
@@ -158,10 +159,10 @@ def _measured(observations: Observations, options: Options, progress: SolveProgr
 
 
 def _of_same_moments(calibration: Calibration, observations: Observations) -> Calibration:
-    """With a warning where the cameras of a rig contradict one another at most moments.
+    """Add a warning where the cameras of a rig contradict one another at most moments.
 
     Raises:
-        SolutionError: they do by more than noise.
+        SolutionError: they contradict one another by more than noise.
     """
     if len(observations.cameras) < 2 or is_bulk(observations) or not calibration.rounds:
         return calibration
@@ -172,7 +173,7 @@ def _of_same_moments(calibration: Calibration, observations: Observations) -> Ca
 
 
 def _noise_of_cameras(calibration: Calibration, observations: Observations) -> Mapping[str, float]:
-    """See `noise_of_cameras`: by all observations but copies and those that were found to be something else."""
+    """See `noise_of_cameras`: from all observations except copies and those that were rejected as a whole group."""
     if not calibration.rounds or len({*observations.noise_names}) < 2 or calibration.options.noise_scale == "stated":
         return {}
     masks = zip(calibration.inlier_masks(observations), calibration.outlier_masks(observations), strict=True)
@@ -199,9 +200,10 @@ def _calibrated(
 
 
 def _chosen(task: Task, observations: Observations, options: Options) -> Calibration:
-    """With the lens that is named, or the one that is chosen; what is stated says little until all is explained.
+    """Calibrate with the named lens or a chosen one; statements get wide sigmas until everything is explained.
 
-    A height 25 % wrong was taken up by a principal point that moves from view to view and by a board that is bent.
+    Otherwise a wrong statement biases the rest: a height 25 % wrong was absorbed by a principal point that moved from
+    view to view and by a bent board.
     """
     sights, free = gather_sights(observations), freed(observations, options)
 
@@ -228,15 +230,15 @@ def _chosen(task: Task, observations: Observations, options: Options) -> Calibra
 def _or_as_asked(
     found: Calibration, as_asked: Callable[[], Calibration], observations: Observations, *, is_held: bool
 ) -> Calibration:
-    """What was found where what is stated said little, or what is where it says all, if that agrees with it.
+    """Return the solution with loose statements, or the one with all as stated where that agrees with the statements.
 
-    A number that is held, and agrees, tells the rest: without it another lens was taken, and a height 10 sd off, and
-    one of a few lines' outliers was not. What only the lens contradicts that was chosen without it may be right.
+    A held number that agrees determines others: without it another lens was chosen, a height came out 10 sd off, and an
+    outlier among a few lines was kept. A statement may be right that only the lens chosen without it contradicts.
     """
     asks_again = found.lens_choices and not is_held if found.conflicts else is_held
     if not asks_again:
         return found
-    again = attempt(as_asked)  # quiet: from where it starts nothing agrees; what was found does
+    again = attempt(as_asked)  # quiet: no solution from that start agrees with the statements; `found` does
     if isinstance(again, CalibrationError) or again.conflicts:
         return found
     if not found.conflicts:
@@ -253,14 +255,14 @@ def _of_lens_asked(task: Task, start: Start, sights: Sights, options: Options) -
 
 
 def _named(options: Options) -> Options:
-    """With the paper's lens where none is named."""
+    """Return the options, with the paper's lens where they name none."""
     from ceres_cal.calibration.lens_forms import papers
 
     return options if options.lens != AUTO else papers(options)
 
 
 def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
-    """With the lenses that the data ask for."""
+    """Calibrate with the lenses that the data choose."""
     from ceres_cal.calibration.lenses import choose_lenses
 
     if options.closed_form_only:
@@ -277,9 +279,9 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
     too_few = {name for name in seen.leaving_alike if chosen.each[name].choice.share < 1.0}
     anew = [*chosen.each] if seen.as_built and not chosen.built.every else sorted(too_few | chosen.far_better)
     if anew:
-        # Seen on targets as they are built lenses differ by more than on targets as drawn: by the noise alone. And what
-        # all views leave in the same places need not show in the few of them that lenses were compared by. Where only a
-        # lens without a formula came near, the others may have ended in a wrong valley, which they leave from there.
+        # With targets as built, lenses differ more clearly than with targets as drawn, because only noise remains. What
+        # all views leave in the same places need not show in the few views by which lenses were compared. Where only a
+        # lens without a formula came near, the others may have ended in a wrong valley, which they leave from here.
         near = replace(seen.end.estimate, structure=EXACT)
         before, built = chosen, Construction(seen.as_built, seen.end.estimate.structure)
         chosen = chosen.anew(anew, near, built, too_few)
@@ -312,7 +314,7 @@ def _of_any_lens(task: Task, start: Start, sights: Sights, options: Options) -> 
 
 
 def _part(bulk: Bulk, options: Options) -> Subset:
-    """The part that decides: of the world some views, with those that stand out at a first solution of others."""
+    """Return the subset that decides: some views of the world, with those that stand out at a solution of others."""
     sights, options = gather_sights(bulk.part().observations), _named(options)
     start = initialise(sights, options)
     problem = problem_of(sights, options, start.estimate)
@@ -320,7 +322,7 @@ def _part(bulk: Bulk, options: Options) -> Subset:
 
 
 def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Calibration:
-    """With a lens that is named."""
+    """Calibrate with a named lens."""
     options = options.with_first_power(len(sights))
     problem = problem_of(sights, options, start.estimate)
     if options.closed_form_only:
@@ -330,17 +332,17 @@ def _of_lens(task: Task, start: Start, sights: Sights, options: Options) -> Cali
 
 @or_none  # quiet: the caller raises the first failure
 def _without_priors(observations: Observations, options: Options) -> Calibration | None:
-    """A calibration without any priors; None where there are none, or it makes none either."""
+    """A calibration without any priors; None where there are no priors, or where it fails without them, too."""
     if not (observations.priors or options.priors):
         return None
     return _calibrated(replace(observations, priors=()), replace(options, priors=()))
 
 
 def _from_there(free: Calibration, observations: Observations, options: Options) -> Calibration:
-    """What agrees with what was stated from where the observations alone lead to.
+    """Return the calibration that agrees with the statements, started where the observations alone lead.
 
     Raises:
-        SolutionError: they contradict it, or nothing agrees from there either.
+        SolutionError: the observations contradict a statement, or no solution from that start agrees with all of them.
     """
     stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior

@@ -45,32 +45,32 @@ _ALIKE = (
     *("phi_from", "warnings", "remarks", "ambiguities", "digest", "versions", "conflicts", "lens_choices", "as_built"),
     *("effects", "aspects_alone"),
 )
-"""What the file has as it is."""
+"""Attributes that the file stores unchanged, under the same names."""
 
 
 class Calibration(Frozen):
-    """Calibrated cameras and where they stood.
+    """Calibrated cameras, their stations and the placements of targets.
 
     Attributes:
         estimate: cameras, stations, placements, and the targets as built. targets: as drawn, by name.
-        fit: residuals and noise. rejected: every observation that was taken out.
-        termination: why the last solve stopped. converged: whether it had come to rest.
-        rounds: solves it took. history: cost at each iteration of the last one.
-        phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on; after a refit
-            "posterior", where phi is under what was known of it.
-        warnings: what may be wrong with it, each one line. remarks: what was made of the observations, which costs no
-            trust. ambiguities: those warnings that say that the world is seen alike from another place.
-        posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
+        fit: residuals and noise. rejected: every observation that did not take part.
+        termination: why the last solve stopped. converged: whether it converged.
+        rounds: number of solves. history: cost at each iteration of the last one.
+        phi_from: camera -> source of the initial phi: "fixed", "views", "prior" or "guess"; after a refit "posterior",
+            where the earlier calibration's posterior is a prior on phi.
+        warnings: what may be wrong, one line each. remarks: how the observations were treated, without loss of trust.
+            ambiguities: those warnings that say that the world looks the same from another place.
+        posterior: what is known of every number; None where nothing was minimised, or where a file has none.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
-        refitted: how it came from an earlier calibration; None for one from scratch.
-        conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
-        lens_choices: camera -> how its lens was chosen; none where it was given.
-        as_built: what of the targets is not where it is drawn, and was solved for under the sigmas that the data show;
-            these are in the options' tolerances.
-        effects: what else displaces the observations, and was solved for.
-        aspects_alone: camera -> fy / fx and its standard deviation by the observations alone, where it is 1 by what is
-            usual.
-        notes: whatever somebody wants to keep with it, plain data.
+        refitted: how it was derived from an earlier calibration; None for one from scratch.
+        conflicts: statements that everything else contradicts; the posterior includes what is in dispute.
+        lens_choices: camera -> how its lens was chosen; empty where the lens was given.
+        as_built: features of targets that are off their nominal position and were solved for, with the standard
+            deviations that the data show; these are in the options' tolerances.
+        effects: other effects that displace the observations and were solved for.
+        aspects_alone: camera -> fy / fx and its standard deviation by the observations alone, for cameras whose aspect
+            is 1 by the prior of usual cameras.
+        notes: user data to keep with the calibration, plain data.
     """
 
     estimate: Estimate
@@ -113,7 +113,7 @@ class Calibration(Frozen):
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
-        """Cameras by name, at no particular pose."""
+        """Cameras by name, without a particular pose."""
         return self.estimate.cameras
 
     @cached_property
@@ -127,7 +127,7 @@ class Calibration(Frozen):
         return self.estimate.placements
 
     def station(self, name: str | None = None) -> Camera:
-        """The camera at a station; without a name, at the only one there is.
+        """The camera at a station; without a name, at the only station.
 
         Raises:
             InputError: no such station, or no name where there are several.
@@ -139,7 +139,7 @@ class Calibration(Frozen):
         """How well everything is known: verdicts, weak directions, maps in mm.
 
         Raises:
-            InputError: nothing was minimised, or the file says nothing of it.
+            InputError: nothing was minimised, or the file has no posterior.
         """
         if self.posterior is None:
             raise InputError("this calibration does not say how well it is known: calibrate again")
@@ -148,10 +148,10 @@ class Calibration(Frozen):
         return Uncertainty(self.estimate, self.posterior, self.targets, self.conflicts)
 
     def disagreement(self, observations: Observations, first: str, second: str) -> Disagreement:
-        """What two stations say of what both observed in the observations that this calibration was made from.
+        """How far two stations disagree about what both observed, in the observations of this calibration.
 
         Raises:
-            InputError: there is no uncertainty to compare with, see `uncertainty`; or other observations.
+            InputError: there is no posterior, see `uncertainty`; or these are other observations.
         """
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
@@ -166,11 +166,11 @@ class Calibration(Frozen):
         return ~points, ~curves
 
     def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
-        """(N,) of points and (M,) of curve observations: which were taken out each for its own residual."""
+        """(N,) of points and (M,) of curve observations: which rows were rejected for their own residual."""
         return _rows_of((entry for entry in self.outliers if not entry.is_of_whole), observations)
 
     def redrawn(self) -> Calibration:
-        """The same with targets that are drawn with the dimensions that were solved for."""
+        """Return a copy whose targets are drawn with the dimensions that were solved for."""
         found = self.estimate.structure.dimensions
         targets = {
             name: redrawn(
@@ -182,8 +182,8 @@ class Calibration(Frozen):
         return replace(self, estimate=estimate, targets=targets) if found else self
 
     def as_taken(self, observations: Observations) -> Observations:
-        """The observations as they were taken here: of targets of the dimensions that were solved for, each camera's at
-        its noise.
+        """Return the observations as this calibration used them: with the dimensions of targets that were solved for,
+        and with each camera's noise.
         """
         targets = dict(observations.targets)
         for name, target in targets.items():
@@ -193,19 +193,20 @@ class Calibration(Frozen):
                 targets[name] = redrawn(target, {one: lengths_m[one] for one in own if one in lengths_m})
             known = self.targets.get(name)
             if known is not None and targets[name] == known and target.movable != known.movable:
-                targets[name] = known  # which is a board there, or none
+                targets[name] = known  # whether it is a board is as it was there
         return observations.with_targets(targets).at_noise(self.fit.of_cameras)
 
     @property
     def outliers(self) -> tuple[Rejection, ...]:
-        """What was taken out for its residual: all that was but copies of other observations."""
+        """Observations that were rejected for their residuals: all rejected ones except copies of others."""
         return tuple(entry for entry in self.rejected if not entry.reason.startswith(COPY))
 
     def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
-        """The problem of which this is the solution, of all the observations, at the noise that was found.
+        """Return the problem of which this is the solution: all the observations, at the estimated noise.
 
         Args:
-            new_data: that the observations are others: then as if they were calibrated with the same options.
+            new_data: whether the observations are new ones; they are then treated as in a calibration with these
+                options.
         """
         observations, options = self.as_taken(observations), self.options
         sights = gather_sights(observations)
@@ -224,8 +225,8 @@ class Calibration(Frozen):
         return without_unsteadiness(problem, self.estimate, taking_part, self.effects)
 
     def prior_of(self, keys: Sequence[Key], *, of_lens: bool = False) -> GaussianPrior:
-        """What the posterior says of some numbers, all others integrated out, as the prior of the next solve; on demand
-        where the chosen lens is the right one.
+        """Return the marginal posterior of some numbers as the prior of the next solve; on demand under the condition
+        that the chosen lens is the right one.
         """
         known = self.uncertainty.posterior
         return GaussianPrior.about((known.normal_of_lens if of_lens else known.normal).marginal(keys), self.estimate)
@@ -236,7 +237,7 @@ class Calibration(Frozen):
         return self.fit.rms_px
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration as JSON; every number comes back exactly."""
+        """Write the calibration as JSON; every number is restored exactly by `load`."""
         write_json(path, self.to_file())
 
     @classmethod
@@ -244,7 +245,8 @@ class Calibration(Frozen):
         """Read a calibration.
 
         Raises:
-            InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
+            InputError: one line that names the file and the place in it; also for a radial lens that folds inside the
+                image.
         """
         if not (content := read_bytes(path)).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
             raise InputError(f"{path}: no calibration of ceres-cal: `ceres-cal import` makes one of another program's")
@@ -253,7 +255,7 @@ class Calibration(Frozen):
             return cls.from_file(data)
 
     def to_file(self) -> CalibrationFile:
-        """The calibration as its file has it."""
+        """Return the calibration in the form of its file."""
         return self._file
 
     @cached_property
@@ -278,7 +280,7 @@ class Calibration(Frozen):
 
     @classmethod
     def from_file(cls, data: CalibrationFile) -> Calibration:
-        """The calibration that a file describes; InputError naming the place inside it."""
+        """Return the calibration that a file describes; raise InputError naming the place in the file."""
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
         estimate = data.estimate(targets, options)
@@ -300,7 +302,7 @@ class Calibration(Frozen):
 
 
 def _rows_of(entries: Iterable[Rejection], observations: Observations) -> tuple[Mask, Mask]:
-    """(N,) of points and (M,) of curve observations: those that are named."""
+    """(N,) of points and (M,) of curve observations: the rows of the entries."""
     masks = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
     for entry in entries:
         masks[entry.kind == "curve"][entry.row] = True

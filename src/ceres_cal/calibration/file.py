@@ -1,4 +1,4 @@
-"""How a calibration came about, and how it stands in JSON files (docs/files.md): every number comes back exactly."""
+"""Records of how a calibration was made, and its JSON file (docs/files.md), which restores every number exactly."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene import CameraFile, Matrix, PoseFile, Target, Vector
 
 COPY = "a copy"
-"""How the reason begins of an observation that repeats another one, and was not taken out for its residual."""
+"""Beginning of the reason of an observation that repeats another one, and was not rejected for its residual."""
 
 
 class Rejection(Frozen, eq=True):
-    """One observation that was taken out: its permanent id (kind and row), what it shows, and why it was taken out."""
+    """A rejected observation: its permanent id (kind and row), what it shows, and why it was rejected."""
 
     kind: str
     row: int
@@ -35,7 +35,7 @@ class Rejection(Frozen, eq=True):
 
     @property
     def is_of_whole(self) -> bool:
-        """Whether it was taken out with all others of its line, frame or placement; the reason then says which."""
+        """Whether it was rejected together with all others of its line, frame or placement, which the reason names."""
         return self.reason.startswith("the whole of ")
 
 
@@ -54,11 +54,11 @@ class TriedLens(Frozen, eq=True):
     """A lens that was compared with others.
 
     Attributes:
-        label: kind with powers or free coefficients. coefficients: how many are free.
-        rms_px: of the errors with which views or features are predicted by all others; None where there is no answer.
-        worse: by how many standard errors of the paired difference it predicts worse than the one that was chosen.
-        failed: why there is no answer, "" where there is.
-        probability: that it is the one that predicts best; None where there is no answer, and in files of before.
+        label: kind with powers or free coefficients. coefficients: number of free ones.
+        rms_px: rms error of predicting held-out views or features from all others; None where the lens cannot be used.
+        worse: by how many standard errors of the paired difference it predicts worse than the chosen lens.
+        failed: why it cannot be used, else "".
+        probability: that it predicts best; None where it cannot be used, and in older files.
     """
 
     label: str
@@ -73,8 +73,8 @@ class LensChoice(Frozen, eq=True):
     """Which lens was chosen, over what, and by how much.
 
     Attributes:
-        chosen: its label. tried: every lens that was compared, the chosen one first, then as they predict.
-        groups: views, placements or features that were held out in turn. share: of the observations that took part.
+        chosen: its label. tried: every lens that was compared, the chosen one first, the others by prediction error.
+        groups: number of views, placements or features held out in turn. share: of the observations that took part.
     """
 
     chosen: str
@@ -84,7 +84,7 @@ class LensChoice(Frozen, eq=True):
 
     @property
     def words(self) -> str:
-        """In a line."""
+        """One line for people."""
         if not self.groups:
             return f"{self.chosen}, not compared by what it predicts: {self.tried[0].failed or TOO_FEW}"
         others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
@@ -98,7 +98,7 @@ class LensChoice(Frozen, eq=True):
 
     @property
     def caveat(self) -> str:
-        """What speaks against the lens that was taken, "" where nothing does."""
+        """Warning about the lens that was taken, "" where there is none."""
         taken = self.tried[0]
         if taken.worse:
             return _NOT_THE_BEST.format(taken.label, taken.worse)
@@ -110,15 +110,15 @@ class Fit(Frozen, eq=True):
 
     Attributes:
         points, curves: numbers of observations that took part.
-        points_rms_px: root mean square length of the points' residual vectors, of those that took part (OpenCV's rms).
-            curves_rms_px: the same of the distances to the curves. They say how consistent the data are with the model,
+        points_rms_px: root mean square length of the residual vectors of points that took part (OpenCV's rms).
+            curves_rms_px: root mean square distance to the curves. Both say how consistent the data are with the model,
             not how well the camera is known.
         point_scale, curve_scale: estimated factors on the stated sigmas.
-        unknowns: free numbers.
+        unknowns: number of free numbers.
         point_sigma_px, curve_sigma_px: root mean square of the stated sigmas of those that took part; None in files of
-            0.1, which do not have them.
-        of_cameras: camera, or "camera/target" of several targets, -> its own factor on the stated sigmas, before these
-            scales; none where all are alike.
+            version 0.1, which do not have them.
+        of_cameras: camera, or "camera/target" where there are several targets, -> its own factor on the stated sigmas,
+            multiplied by these scales; empty where all factors are equal.
     """
 
     points: int
@@ -134,9 +134,10 @@ class Fit(Frozen, eq=True):
 
     @property
     def noise_px(self) -> tuple[float, float]:
-        """Standard deviations of each coordinate of a point and of the distance to a curve, px; 0 of what nobody saw.
+        """Standard deviation of a point's coordinate and of the distance to a curve, px; 0 where there are none.
 
-        Where the stated sigmas are not known, from the residuals, as if every equation determined as much as any other.
+        Where the stated sigmas are unknown, it is computed from the residuals, as if every equation had the same
+        leverage.
         """
         if self.point_sigma_px is not None and self.curve_sigma_px is not None:
             return self.point_scale * self.point_sigma_px, self.curve_scale * self.curve_sigma_px
@@ -160,14 +161,14 @@ _Q = TypeVar("_Q")
 
 
 class RefitRecord(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unknown_fields=True):
-    """How a calibration came from an earlier one.
+    """How a calibration was derived from an earlier one.
 
     Attributes:
-        what: was free, one of `moves.WHAT`. moved: stations whose poses were sought.
-        explanation: what the observations say has happened, in words.
-        prior: what was known beforehand of everything that was carried over; in a file as that has it.
-        scales: noise scales of points and curves of the calibration before.
-        digests: of the observations that are in the prior.
+        what: what was free, one of `moves.WHAT`. moved: stations whose poses were solved for.
+        explanation: what happened according to the observations, in words.
+        prior: what was known beforehand of all numbers that were carried over; in a file as `PriorFile`.
+        scales: noise scales of points and curves in the earlier calibration.
+        digests: of the observations that the prior already contains.
     """
 
     what: str
@@ -178,13 +179,13 @@ class RefitRecord(msgspec.Struct, Generic[_P], frozen=True, eq=False, forbid_unk
     digests: tuple[str, ...]
 
     def with_prior(self, prior: _Q) -> RefitRecord[_Q]:
-        """The same with the prior in its other form."""
+        """Return a copy with the prior in its other form."""
         return RefitRecord(self.what, self.moved, self.explanation, prior, self.scales, self.digests)
 
 
 @cache
 def package_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of the packages on which the numbers depend."""
     return {"ceres-cal": __version__, "pyceres": solver_version, "numpy": np.__version__}
 
 
@@ -194,7 +195,7 @@ _ALSO_WARPED = tuple(f"/{part}" for part in WARP[2:])
 
 
 class StationFile(PoseFile, forbid_unknown_fields=True):
-    """A station; position, Euler angles and H of the floor (the paper's) are there for people and other programs."""
+    """A station; position, Euler angles and the floor's H (the paper's) are redundant, for people and other tools."""
 
     camera: str
     position_m: Vector
@@ -203,15 +204,15 @@ class StationFile(PoseFile, forbid_unknown_fields=True):
 
     @classmethod
     def of_station(cls, station: Station) -> StationFile:
-        """As a file has it."""
+        """Return the station in the form of a file."""
         pose = station.cam_from_world
         rotation, translation, position = (part.tolist() for part in (pose.rotation, pose.translation, pose.position))
         homography = np.column_stack([pose.rotation[:, :2], pose.translation]).tolist()
         return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation), homography)
 
     def station(self) -> Station:
-        """The station; InputError where what is there for people says something else than the pose."""
-        alike = 1e-5  # somebody who edits a file rounds
+        """Return the station; raise InputError where the redundant numbers contradict the pose."""
+        alike = 1e-5  # tolerance (rad, and share of the distance plus 1 m): people who edit a file round
         station = Station(self.camera, self.pose())
         again, reach_m = StationFile.of_station(station), 1.0 + float(np.linalg.norm(self.translation_m))
         turned = np.max(np.abs(rotation_from_euler(*self.euler_rad) - station.cam_from_world.rotation))
@@ -221,7 +222,7 @@ class StationFile(PoseFile, forbid_unknown_fields=True):
 
 
 class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A prior; its mean by number, or, in files of 0.1, as the cameras, stations and structure that it is around."""
+    """A prior; its mean by number, or, in files of 0.1, as the cameras, stations and structure that have the mean."""
 
     keys: list[Key]
     information: list[float]
@@ -233,12 +234,12 @@ class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
 
     @classmethod
     def of(cls, prior: GaussianPrior) -> PriorFile:
-        """As a file has it."""
+        """Return the prior in the form of a file."""
         rotations = {name: rotation.tolist() for name, rotation in prior.rotations.items()}
         return cls(list(prior.keys), lower_triangle(prior.information), prior.mean.tolist(), rotations)
 
     def prior(self, known: Collection[Key]) -> GaussianPrior:
-        """The prior; InputError where its numbers do not fit its keys, or one is none of those known."""
+        """Return the prior; raise InputError where its numbers do not fit its keys, or where a key is unknown."""
         require_keys(self.keys, known, "refitted.prior.keys")
         information = information_from(self.information, self.keys, "refitted.prior.information")
         if self.mean is not None:
@@ -255,7 +256,7 @@ class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
 
 
 class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A calibration; `lens_choice` is that of all cameras, in files of before."""
+    """A calibration; `lens_choice`, in older files, is the choice of all cameras."""
 
     format: str
     version: int
@@ -295,7 +296,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
         return dict.fromkeys(self.cameras, self.lens_choice) if self.lens_choice else self.lens_choices
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
-        """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""
+        """Cameras, stations, placements and the targets as built; InputError where these do not fit each other."""
         cameras = {}
         for name, entry in self.cameras.items():
             cameras[name] = entry.camera()
@@ -312,7 +313,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
             with naming(f"placement {name!r}"):
                 placements[name] = placement.pose()
         structure = make_structure(targets, options.tolerances, options.dimensions)
-        flat = {name: 0.0 for name in structure.names if name.endswith(_ALSO_WARPED)}  # which 0.1 did not have
+        flat = {name: 0.0 for name in structure.names if name.endswith(_ALSO_WARPED)}  # numbers that 0.1 did not have
         if not self.structure_m.keys() <= set(structure.names) <= self.structure_m.keys() | flat.keys():
             raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")
         built = structure.with_values(np.array([(flat | self.structure_m)[name] for name in structure.names]))
@@ -320,13 +321,13 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def options_to_json(options: Options) -> dict[str, Any]:
-    """Options as plain data, their priors as observations have them."""
+    """Return options as plain data, with their priors in the form of observation files."""
     return {**asdict(options), "priors": [prior_to_json(prior) for prior in options.priors]}
 
 
 def options_from_json(data: Mapping[str, Any]) -> Options:
-    """The options that a file describes; InputError naming what is wrong."""
+    """Return the options that a file describes; raise InputError naming what is wrong."""
     entries = convert(data.get("priors", []), list[dict[str, Any]], "options.priors")
     priors = tuple(prior_from_json(entry, "options.priors") for entry in entries)
-    before = {"lens": "radial", "usual_camera": False, "free_aspect": False}  # as in older files
+    before = {"lens": "radial", "usual_camera": False, "free_aspect": False}  # defaults of older files
     return convert({**before, **data, "priors": priors}, Options, "options")

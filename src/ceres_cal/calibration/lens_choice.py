@@ -1,9 +1,9 @@
-"""Which lens the data ask for: the simplest of those that predict placements, or lines, as well as any other does.
+"""Choose the lens: the simplest of those that predict held-out placements or lines as well as any other does.
 
-Some of the observations are solved once, robustly, and from there with the longest lens of each kind. Shorter ones are
-these with coefficients held at 0: what a solve without a group of equations would leave of it follows for every lens
-from the normal equations of each group (`effects/groups.py`). Errors that go together within a group make a longer
-lens predict the others no better: a criterion that counts observations would take them for a lens.
+Some observations are solved for once, robustly, and from there with the longest lens of each kind. Shorter lenses are
+the longest with coefficients held at 0: the residuals of a group in a solve without it follow for every lens from the
+normal equations of each group (`effects/groups.py`). Errors that are correlated within a group do not make a longer
+lens predict other groups better; a criterion that counts observations would attribute them to the lens.
 """
 
 from __future__ import annotations
@@ -57,10 +57,11 @@ _EXPLAINED = "takes out observations that another lens explains"
 
 
 class LensDecision(Frozen):
-    """The lens that was chosen for a camera: options with it, where to start from, and what it was compared with.
+    """The lens that was chosen for a camera: options with it, the initial estimate, and what it was compared with.
 
     Attributes:
-        among: the lenses it was chosen from; None where nothing could be compared. untold: by these observations.
+        among: the comparison it was chosen from; None where lenses could not be compared. untold: the observations
+            where lenses could not be compared, else None.
     """
 
     options: Options
@@ -70,11 +71,12 @@ class LensDecision(Frozen):
     untold: Observations | None = None
 
     def otherwise(self, failure: str, options: Options, start: Start) -> LensDecision | None:
-        """Where all of the observations make no calibration with it, the best lens of another kind, or at last the
-        paper's; None after that. Of too few to compare lenses by, the likeliest that was not tried.
+        """Return the next lens where all of the observations cannot be calibrated with this one: the best of another
+        kind, at last the paper's, then None. Where lenses could not be compared, return the likeliest one not yet
+        tried.
 
         Args:
-            options: with the paper's lens. start: with that, too.
+            options: with the paper's lens. start: with the paper's lens, too.
         """
         if self.untold is not None:
             return _of_few(self.untold, self.options, self.start, self.choice.tried, failure)
@@ -83,18 +85,18 @@ class LensDecision(Frozen):
         return self.among.without_kind(failure) or self._papers(failure, options, start)
 
     def _papers(self, failure: str, options: Options, start: Start) -> LensDecision:
-        """The paper's lens in its place, from the first start."""
+        """Return the paper's lens instead, with the first start."""
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return LensDecision(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
 
     @property
     def built(self) -> Construction:
-        """How targets seemed to be built when lenses were compared."""
+        """Targets as built, as estimated when lenses were compared."""
         return AS_DRAWN if self.among is None else self.among.seen.built
 
     def others(self, posterior: Posterior, end: Estimate, options: Options) -> OtherLenses:
-        """What other lenses would say, as far as they are probable, see `Comparison.others`."""
+        """Return the estimates with other lenses, weighted by their probabilities; see `Comparison.others`."""
         if self.among is not None:
             return self.among.others(posterior, options)
         if self.untold is not None:
@@ -108,9 +110,10 @@ class Comparison(Frozen):
     """The lenses that were compared, and the one that was chosen.
 
     Attributes:
-        seen: the observations that took part, and `share` of all. as_good: how many standard errors worse is as good.
-        start: of everything. there: where the chosen one is at its best.
-        passed: the one that was chosen first, where all of the observations make no calibration with it.
+        seen: the inliers that took part; `share`: of all observations. as_good: a lens that predicts worse by at most
+            so many standard errors counts as good.
+        start: initial estimate of the camera. there: estimate with the chosen lens at its minimum.
+        passed: the lens that was chosen first, where all of the observations cannot be calibrated with it.
     """
 
     seen: InlierRows
@@ -125,7 +128,7 @@ class Comparison(Frozen):
 
     @property
     def worse_than_passed(self) -> float:
-        """By how many standard errors it predicts worse than the one that was passed over; 0 where that is as good."""
+        """Standard errors by which the chosen lens predicts worse than `passed`; 0 where it is as good."""
         if self.passed is None or self.passed.squares is None or self.chosen.squares is None:
             return 0.0
         worse = standard_errors(self.chosen.squares, self.passed.squares)
@@ -133,16 +136,16 @@ class Comparison(Frozen):
 
     @property
     def is_far_better(self) -> bool:
-        """Whether the chosen lens has no formula, and leaves far less than any that has one."""
-        far_less = 0.25  # of their squares: of real lenses without a formula 0.4 and more, beside a wrong valley 0.14
+        """Whether the chosen lens has no formula and leaves far smaller residuals than any lens with one."""
+        far_less = 0.25  # of their squares: real lenses without a formula 0.4 or more, wrong valleys 0.14
         of_formulas = min((one.of.least for one in self.tried if not one.form.blank.roughness), default=0.0)
         return bool(self.chosen.form.blank.roughness) and self.chosen.of.least < far_less * of_formulas
 
     def others(self, posterior: Posterior, options: Options) -> OtherLenses:
-        """What other lenses would say, as far as they are probable; nothing beside one without a formula.
+        """Return estimates with other lenses, weighted by probability; none beside a chosen lens without a formula.
 
         Args:
-            posterior: by the chosen one. options: they hold what was free when lenses were compared.
+            posterior: with the chosen lens. options: they may hold numbers that were free when lenses were compared.
         """
         least_share = 0.25  # of the observations: where fewer took part, other lenses count as if so many had
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
@@ -179,7 +182,7 @@ class Comparison(Frozen):
             return replace(found, failed=str(own_end))
         found, left = replace(found, near=own_end[0]), 1.0
         for one, weight, is_open in each:
-            # quiet: what cannot be solved for, or ends in another minimum, says nothing, and the rest share its weight
+            # quiet: a lens that fails or ends in another minimum has no estimate; the rest share its weight
             end = attempt(partial(solved, one, as_promised=True))
             if isinstance(end, CalibrationError):
                 left -= weight
@@ -187,13 +190,14 @@ class Comparison(Frozen):
             ends = self._ends(seen, one, end, is_open, median(posterior.factors))
             weights = (weight / len(ends),) * len(ends)
             found = replace(found, others=(*found.others, *ends), weights=(*found.weights, *weights))
-        # What they say by chance is less by as much as there are more observations than took part.
+        # More observations than took part leave smaller differences by chance, so the weights are reduced by their
+        # share.
         share = max(self.share, least_share) / max(left, LEAST_PROBABILITY)
         return replace(found, weights=tuple(share * one for one in found.weights))
 
     def _likely(self, least: float) -> tuple[dict[Candidate, float], list[Candidate]]:
-        """The lenses that are possible with their probabilities, and which of them are the chosen one and more. One
-        power more than any that was tried has the chosen one's probability, and takes no share from others.
+        """Return the possible lenses with their probabilities, and those that extend the chosen one. A lens with one
+        power more than any that was tried gets the chosen one's probability, without reducing that of others.
         """
         told = self._possible(least)
         likely = dict(zip(told, _probabilities(told), strict=True))
@@ -202,8 +206,8 @@ class Comparison(Frozen):
         return dict.fromkeys(longer, likely[self.chosen]) | likely, longer
 
     def _possible(self, least: float) -> list[Candidate]:
-        """The lenses without those that another of them refutes, where they are as probable as that:
-        what no choice may take is no alternative to what was chosen.
+        """Return the lenses except those that are at least this probable and that another lens refutes: a lens that
+        must not be chosen is no alternative to the chosen one.
         """
         likely = _probabilities(self.tried)
         asked = [p >= least and one is not self.chosen for one, p in zip(self.tried, likely, strict=True)]
@@ -213,13 +217,13 @@ class Comparison(Frozen):
     def _ends(
         seen: InlierRows, one: Candidate, at: tuple[Estimate, float], is_open: Sequence[OpenDirection], widened: float
     ) -> Sequence[Estimate]:
-        """Another lens so far to either side of what it leaves open that all of these scatter as it does, but no
-        farther than where twice its cost has risen as it does at 95 %; where it leaves nothing open itself.
-
-        In a bent valley normal equations of elsewhere led to ends at which that had risen by 195.
+        """Return estimates with another lens, to either side along each direction that it leaves open; its own estimate
+        where it leaves none. The steps are such that all ends scatter as the lens does, but twice the cost rises by no
+        more than it does at 95 %. In a bent valley, normal equations from elsewhere led to ends at which it had risen
+        by 195.
 
         Args:
-            at: where it is at its best, and its cost. widened: factor on standard deviations, as the data scatter.
+            at: the lens's minimum and its cost. widened: factor on standard deviations from the scatter of the data.
         """
         most, far, (near, least) = (NORMAL_95 * widened) ** 2, widened * len(is_open) ** 0.5, at
 
@@ -234,13 +238,13 @@ class Comparison(Frozen):
                 return [moved(near, open_.keys, side * open_.step) for open_ in is_open for side in (-far, far)]
             return [end(open_, side) for open_ in is_open for side in (-far, far)]
 
-        # quiet: where it ends in another minimum, its middle counts alone
+        # quiet: where a step ends in another minimum, only the estimate in the middle counts
         ends = attempt(all_of) if is_open else [near]
         return [near] if isinstance(ends, CalibrationError) else ends
 
     @property
     def outcome(self) -> LensDecision:
-        """The options with the lens that was chosen, and where to start from."""
+        """The options with the chosen lens, and the initial estimate for the solve."""
         return LensDecision(
             self.chosen.form.of(self.seen.options), _moved_to(self.there, self.start), _choice(self), self
         )
@@ -248,13 +252,13 @@ class Comparison(Frozen):
     def instead(
         self, taken_out: tuple[Mask, Mask], scales: tuple[float, float], *, is_alone: bool
     ) -> LensDecision | None:
-        """The lens in place of the chosen one, where others explain what it takes out of the observations; None where
-        none does. Of very many observations some were compared, and the rest is not looked at. What predicts clearly
-        better, a lens without a formula, stays.
+        """Return the lens to take in place of the chosen one, where others explain observations that it rejects; None
+        where none does. Where only a part of very many observations was compared, the rest is not examined. A lens
+        without a formula, which predicts clearly better, is kept.
 
         Args:
-            taken_out: (N,), (M,) the observations that it takes out. scales: of the noise beside it.
-            is_alone: whether no other camera had a say in what is taken out.
+            taken_out: (N,), (M,) the observations that it rejects. scales: noise scales of that solve.
+            is_alone: whether no other camera influenced what is rejected.
         """
         if self.share < 1.0 or self.chosen.form.blank.roughness:
             return None
@@ -264,13 +268,13 @@ class Comparison(Frozen):
         return None if found is None else found.outcome
 
     def without_kind(self, failure: str) -> LensDecision | None:
-        """The best of the other kinds, how much worse it predicts said with it; None where none gives an answer."""
+        """The best lens of the other kinds, with how much worse it predicts; None where none can be used."""
         found = self._excluding(lambda one: one.of is self.chosen.of, failure)
         return None if found is None else replace(found, passed=self.passed or self.chosen).outcome
 
-    @or_none  # quiet: the lens stays, or its own failure is told
+    @or_none  # quiet: the lens stays, or its own failure is reported
     def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison | None:
-        """Without some lenses, of which it is said why; None where no other one gives an answer."""
+        """The comparison without some lenses, which are marked as failed for a reason; None without any other."""
         known = {one.form.label for one in self.tried}
         every = [*self.tried, *(one for one in _shorter(self.tried, None) if one.form.label not in known)]
         others = [replace(one, squares=None, failed=one.failed or why) if is_out(one) else one for one in every]
@@ -278,22 +282,22 @@ class Comparison(Frozen):
 
 
 def _moved_to(there: Estimate, start: Start) -> Start:
-    """The start with what was solved for of it."""
+    """Return the start with the numbers that were solved for."""
     placements = Poses.of(start.estimate.placements)
     placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
-    others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # with a plainer lens so far
+    others = tuple(replace(other, cameras=there.cameras) for other in start.others)  # they had a plainer lens so far
     return replace(start, estimate=replace(there, placements=placements), is_near=True, others=others)
 
 
 def choose_lens(
     observations: Observations, options: Options, start: Start, built: Construction = AS_DRAWN, *, by_most: bool = False
 ) -> LensDecision:
-    """The lens that the observations of a camera ask for; the paper's where there is too little to tell by.
+    """Choose the lens that the observations of a camera ask for; the paper's where there are too few to compare.
 
     Args:
-        options: their lens is not looked at. start: of that camera, with whatever lens.
-        built: how targets were found to be built; where nothing is given that is found, too.
-        by_most: whether most of the observations are asked, not some of them, which left what goes together.
+        options: their lens is ignored. start: initial estimate of the camera, with any lens.
+        built: targets as built; AS_DRAWN lets the comparison estimate them, too.
+        by_most: whether most of the observations take part, because a lens chosen by few left correlated residuals.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     by_themselves = replace(options, priors=(*options.priors, *_about_guesses(observations, options, start)))
@@ -313,11 +317,11 @@ def choose_lens(
 def _of_few(
     observations: Observations, options: Options, start: Start, tried: tuple[TriedLens, ...], failure: str = ""
 ) -> LensDecision | None:
-    """The paper's lens, or one of another kind that is far likelier, where lenses cannot be compared; None where none
-    is left.
+    """Return the paper's lens, or a lens of another kind that is far likelier, where lenses cannot be compared; None
+    where none is left.
 
     Args:
-        tried: of which the first says why they cannot. failure: why the first makes no calibration, if it does not.
+        tried: its first entry says why lenses cannot be compared. failure: why that lens makes no calibration, else "".
     """
     from ceres_cal.calibration.lens_of_few import likeliest_of_few
 
@@ -335,8 +339,8 @@ def _of_few(
 
 
 def _about_guesses(observations: Observations, options: Options, start: Start) -> Iterator[Prior]:
-    """That phi is about what the start guessed, where the observations left it open and nobody stated it: along that
-    valley normal equations would lead from one lens to another through cameras that are none.
+    """Priors that phi is near the start's guess, where the observations leave phi open and nobody stated it: along that
+    valley normal equations would lead from one lens to another through impossible cameras.
     """
     stated = {prior.name for prior in (*observations.priors, *options.priors) if prior.quantity == "phi"}
     for name, phi_from in start.phi_from.items():
@@ -346,20 +350,20 @@ def _about_guesses(observations: Observations, options: Options, start: Start) -
 
 
 def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candidate]:
-    """The lenses of each kind that were not tried, where they may be as good as the best."""
+    """Return the shorter lenses of each kind that were not tried, where these may be as good as the best."""
     return [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
 
 
 def _among(
     seen: InlierRows, share: float, as_good: float, start: Start, kinds: Sequence[Kind], *, by_most: bool
 ) -> Comparison:
-    """The paper's lens, where it gives an answer, and the longest of each kind come first: only where it is not as good
-    as the best of them are the shorter ones looked at.
+    """Compare the paper's lens, where it can be used, and the longest of each kind first. Shorter lenses are compared
+    only where the paper's lens is not as good as the best of these.
     """
     tried = [one for kind in kinds for one in kind.candidates(first=True)]
     found: Comparison | CalibrationError | None = None
     if any(one.form.label == PAPER and one.squares is not None for one in tried):
-        # quiet: all of these fold; the shorter ones that follow need not
+        # quiet: all of these fold; shorter lenses, which follow, need not
         found = attempt(lambda: _compared(seen, share, as_good, start, tried), DegenerateError)
     if not isinstance(found, Comparison):
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
@@ -368,17 +372,18 @@ def _among(
     is_asked = may_lack_a_formula(seen, found.chosen, by_most=by_most)
     more = tuple(last_resort(seen, found.chosen, is_asked=is_asked))
     found = replace(found, tried=(*found.tried, *more))
-    # Most are asked where a lens left the same in all views. Else one that few programs know must be worth it.
+    # Most observations take part where a lens left the same residuals in all views. Otherwise a lens without a formula,
+    # which few programs know, must predict clearly better.
     least = AS_GOOD if by_most else CLEARLY
     clearly = next((one for one in more if is_asked and one.beats(found.chosen, least)), None)
     return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)
 
 
 def _compared(seen: InlierRows, share: float, as_good: float, start: Start, tried: Sequence[Candidate]) -> Comparison:
-    """Some lenses: one that folds where it must not gives no answer, nor does one that leaves more than was promised.
+    """Compare some lenses. A lens fails that folds inside the image or leaves more than normal equations predicted.
 
     Raises:
-        DegenerateError: none gives one.
+        DegenerateError: every lens fails.
     """
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
@@ -397,7 +402,7 @@ def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
 
 
 def _probabilities(among: Sequence[Candidate]) -> list[float]:
-    """That each of some lenses is the one of them that predicts best; 0 where it gives no answer."""
+    """Return the probability of each lens that it predicts best; 0 for lenses that failed."""
     known = {i: one.squares for i, one in enumerate(among) if one.squares is not None}
     likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
     return [likely.get(i, 0.0) for i in range(len(among))]

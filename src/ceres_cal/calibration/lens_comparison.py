@@ -1,14 +1,15 @@
-"""Whether the chosen lens takes out observations that another one explains: then these tell the lens, too.
+"""Decide whether another lens explains observations that the chosen one rejects; these then inform the choice, too.
 
-Where lenses predict alike, a few corners at the rim may be all that tells them apart, and the lens that is wrong there
-calls them outliers. By the odds of a mixture of good and bad observations (Aitkin and Wilson, Technometrics 22, 1980)
-what is taken out has its price, and so has every coefficient (Schwarz, Annals of Statistics 6, 1978).
+Where lenses predict alike, a few corners at the rim may be all that distinguishes them, and a lens that is wrong there
+rejects them as outliers. Each rejected observation has its price by the odds of a mixture of good and bad observations
+(Aitkin and Wilson, Technometrics 22, 1980), and so has every coefficient (Schwarz, Annals of Statistics 6, 1978).
 
-The observations that take part in the comparison of lenses, and each kind of lens near its best over them.
+`compared_kinds` selects the observations that take part in the comparison of lenses, and solves for each kind of lens
+near its minimum over them.
 
-The last resort: a lens without a formula, which takes longer than all others. It is chosen where what these leave
-behind goes together from place to place, by the mean squares of residuals between cells of the image and within them
-(analysis of variance). In one view of a floor it is also a component beside a formula.
+The last resort is a lens without a formula, which takes longer than all others. It is chosen where residuals of the
+others are correlated from place to place, by the mean squares of residuals between cells of the image and within them
+(analysis of variance). In one view of a floor it is also a component beside a lens with a formula.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 
 PRICE = 13.0
-"""Twice the log-odds of an observation that is taken out: one of a hundred is bad, somewhere within twenty sigmas."""
+"""Twice the log-odds of a rejected observation: one of a hundred is bad, and lies anywhere within twenty sigmas."""
 
 
 def explained_by_another(
@@ -49,12 +50,13 @@ def explained_by_another(
     *,
     is_alone: bool = True,
 ) -> bool:
-    """Whether another lens explains so much of what the chosen one takes out that it is the likelier one.
+    """Return whether another lens explains so much of what the chosen one rejects that it is the likelier one.
 
     Args:
-        taken_out: (N,), (M,) what the chosen one takes out of all observations. scales: of its noise; by a larger one
-            another lens would explain what the chosen one leaves no larger, but knows to be no noise.
-        is_alone: else what the chosen one explains by itself was taken out for what other cameras say.
+        taken_out: (N,), (M,) observations that the chosen lens rejects. scales: its noise scales. With larger ones
+            another lens would seem to explain residuals that the chosen one leaves as well, but knows to be no noise.
+        is_alone: whether no other camera influenced the rejection. Otherwise rejected observations that the chosen lens
+            explains by itself do not count: they were rejected because of other cameras.
     """
     sights = seen.sights
     out = taken_out[0][sights.point_rows], taken_out[1][sights.curve_rows]
@@ -73,8 +75,8 @@ def explained_by_another(
 
 @or_none  # quiet: a lens that cannot be solved for explains nothing
 def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask], scales: tuple[float, float]) -> int:
-    """How many equations of what is taken out a lens explains, less those that would be taken out instead."""
-    # Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
+    """Return how many rejected equations a lens explains, minus the number that it would reject instead."""
+    # Sigmas up to which an observation is explained: any lens may leave residuals between this and the rejection bound.
     explained = 3.0
     farthest = seen.options.reject_sigma
     points, curves = seen.in_sigmas(seen.solved_near(other).estimate, scales)
@@ -85,11 +87,11 @@ def _explained(seen: InlierRows, other: Candidate, out: tuple[Mask, Mask], scale
     return count
 
 
-# What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
+# Kind of the first solve: it shows any direction, and approximates any lens except for its decentring.
 _WIDEST = "kannala-brandt"
-# Share of its squares: a kind that leaves less is solved instead, for it may have other inliers.
+# Share of the solved kind's squares: a kind that leaves less than this is solved instead, as its inliers may differ.
 _QUIETER = 0.7
-_SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
+_SOUND_PX = 1.0  # noise above which the first solve may be in a wrong valley: all kinds get new starts
 
 
 def compared_kinds(
@@ -100,17 +102,17 @@ def compared_kinds(
     *,
     by_most: bool = False,
 ) -> tuple[InlierRows, list[Kind], float]:
-    """The observations that take part, each kind near its best over them, at the noise of the one that explains the
-    most, and their share of all.
+    """Return the inliers that take part, each kind near its minimum over them, and their share of all observations. The
+    noise is that of the kind that explains the most.
 
     Args:
-        built: how targets were found to be built; where nothing is given that is found, too.
-        by_most: whether most of the observations take part, up to where that takes long.
+        built: targets as built; where it is empty they are estimated, too.
+        by_most: whether most of the observations take part, up to a number that takes long.
 
     Raises:
-        CalibrationError: too little to tell lenses apart, or no calibration.
+        CalibrationError: too few observations to compare lenses, or no calibration.
     """
-    least_rows, most_rows, share, fewest_frames = 1_000, 12_000, 0.025, 24  # of the observations, how many take part
+    least_rows, most_rows, share, fewest_frames = 1_000, 12_000, 0.025, 24  # limits of how many observations take part
     every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     most = most_rows if by_most else max(least_rows, int(share * observations.rows))
     few = thinned(observations, most, fewest_frames)
@@ -139,8 +141,8 @@ _Found = tuple[RobustSolution, tuple[Form, ...]]
 
 
 def _solved(options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[Form, ...]]) -> _Found:
-    """The robust solve with the first of these kinds that explains the observations, or with the one that does it best,
-    up to where the noise is known well enough.
+    """Solve robustly with the first of these kinds that explains the observations, or else with the one that leaves the
+    least noise. The rounds end where the noise is known well enough.
     """
 
     def solved(own: Options, from_nothing: bool) -> RobustSolution:
@@ -168,32 +170,33 @@ def _solved(options: Options, sights: Sights, start: Estimate, kinds: Sequence[t
 
 
 def _noise_px(end: RobustSolution) -> float:
-    """Of a typical observation."""
+    """Noise of a typical observation, px (geometric mean)."""
     sights, inliers = end.problem.sights, end.inliers
     sigmas = inliers.point_scale * sights.sigma_px, inliers.curve_scale * sights.curve_sigma_px
     return float(np.exp(np.mean(np.log(np.concatenate(sigmas)))))
 
 
-# Between cells over within them, from which on residuals go together: in white noise it is 1.0 by 0.17. From half to
-# double it decides which observations are asked, seldom what is chosen.
+# Ratio of the mean squares between cells and within them above which residuals count as correlated; it is 1.0 +- 0.17
+# in white noise. From half to double this value it changes which observations take part, seldom the chosen lens.
 _TOGETHER = 1.5
 
 
 def may_lack_a_formula(seen: InlierRows, chosen: Candidate, *, by_most: bool) -> bool:
-    """Whether a lens without a formula may be chosen: where even the longest lens of the chosen kind leaves what goes
-    together, or most of the observations are asked. Within views, too: eight of a lens that no formula has do not agree
-    by two sd.
+    """Return whether a lens without a formula may be chosen: where even the longest lens of the chosen kind leaves
+    correlated residuals, or where most of the observations take part. Correlation within views counts, too: in eight
+    views of a lens that no formula describes, residuals of different views agreed by less than two sd.
     """
     return by_most or _goes_together(seen, chosen.of)
 
 
 def last_resort(seen: InlierRows, chosen: Candidate, *, is_asked: bool) -> Iterator[Candidate]:
-    """The lenses without a formula, where they are asked for; and where the paper's lens is not as good in a camera's
-    only view, of a floor, from a start of their own. There another formula puts the camera elsewhere, and leaves
-    nothing that goes together: of a moustache's phi of 313 px it made 186, and places were 10 mm off, 5 sd.
+    """Yield the lenses without a formula where they are asked for. They are also tried, with a start of their own,
+    where the paper's lens is not as good in a camera's only view of a floor. There another formula may put the camera
+    elsewhere and leave no correlated residuals: with a moustache distortion phi came out as 186 instead of 313 px, and
+    places were 10 mm off, 5 sd.
 
-    Not of so few placements that their features are held out one by one: what goes together within each would be
-    predicted, too.
+    None are tried where placements are so few that their features are held out one by one: errors that are correlated
+    within a placement would be predicted, too.
     """
     is_one_view = min(len(seen.sights.of_camera(name)) for name in seen.sights.cameras) == 1
     if seen.splits_placements or not (is_asked or (is_one_view and chosen.form.label != PAPER)):
@@ -203,9 +206,10 @@ def last_resort(seen: InlierRows, chosen: Candidate, *, is_asked: bool) -> Itera
 
 
 def one_power_more(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:
-    """The longest lens of a kind that leaves the choice of its powers, with one more: no data say that it is nothing.
+    """Yield the longest lens of a kind that has powers, with one more: no data say that its coefficient is 0.
 
-    A moustache takes the four of the longest; what they know of a floor was 4 mm off between its lines, 3.8 sd.
+    A moustache distortion takes all four powers of the longest lens; with these, places on a floor were 4 mm off
+    between its lines, 3.8 sd.
     """
     form, options = chosen.form, chosen.form.of(seen.options)
     if form is chosen.of.forms[0] and form.blank.trial_powers and not form.blank.roughness:
@@ -214,8 +218,8 @@ def one_power_more(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:
 
 
 def _goes_together(seen: InlierRows, kind: Kind) -> bool:
-    """Whether residuals of a cell do: by their mean square between cells, and within those of more than one; the x and
-    y of points and each curve apart.
+    """Return whether residuals within a cell are correlated, by the mean square between cells and that within cells of
+    more than one residual; x and y of points and each curve have separate cells.
     """
     points, curves = seen.in_sigmas(kind.estimate)
     left = np.concatenate([points[:, 0], points[:, 1], curves])

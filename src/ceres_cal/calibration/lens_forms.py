@@ -1,7 +1,4 @@
-"""The lenses that are compared.
-
-Which of several lenses is the simplest that is as good as the best.
-"""
+"""The lenses that are compared, and the rule that chooses the simplest of those that are as good as the best."""
 
 from __future__ import annotations
 
@@ -15,24 +12,24 @@ from ceres_cal.base import Array, DegenerateError, Frozen, replace
 from ceres_cal.problem.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
 from ceres_cal.scene.lens import LENSES, Lens, make_lens
 
-TANGENTIAL = "tangential"  # the terms that displace so
+TANGENTIAL = "tangential"  # name of the decentring terms
 PAPER = "radial 2,3"
-"""The lens that wins ties."""
+"""Label of the lens that wins ties."""
 
 
 def papers(options: Options) -> Options:
-    """The options with the paper's lens."""
+    """Return the options with the paper's lens."""
     return replace(options, lens="radial", powers=PAPERS_POWERS, coefficients=None, terms=(), lens_by_camera={})
 
 
 def any_lens(options: Options) -> Options:
-    """The options with the lens that the data ask for; coefficients that they hold belong to a lens of its own."""
+    """Return the options with the lens left to the data; held coefficients are dropped, as they belong to one lens."""
     fixed = {name: value for name, value in options.fixed.items() if name in (*OF_PIXELS, "skew")}
     return replace(options, lens=AUTO, powers=(), coefficients=None, terms=(), fixed=fixed, lens_by_camera={})
 
 
 def candidates(options: Options) -> list[Options]:
-    """Options with every sensible lens of the same kind, fewest coefficients first; the given one is among them."""
+    """Return options with each sensible lens of the same kind, fewest coefficients first, including the given one."""
     lens = options.blank_lens
     if lens.powers:
         powers = sorted({*lens.trial_powers, lens.powers}, key=lambda p: (len(p), p))
@@ -49,7 +46,7 @@ def candidates(options: Options) -> list[Options]:
 
 
 def label_of(options: Options) -> str:
-    """How a lens is called: "radial 2,3", decentred or not, or "brown k1 k2 p1 p2"."""
+    """Return a lens's label: "radial 2,3", decentred or not, or "brown k1 k2 p1 p2"."""
     if powers := options.blank_lens.powers:
         terms = (term for term in options.terms if term != TANGENTIAL)
         return " ".join([options.lens, ",".join(map(str, powers)), *terms])
@@ -57,15 +54,15 @@ def label_of(options: Options) -> str:
 
 
 def coefficients_of(options: Options) -> int:
-    """How many coefficients of the lens are free, but for decentring, of which the usual size is known."""
+    """Return the number of free coefficients of the lens, without those of decentring, whose usual size is known."""
     return len(set(options.blank_lens.names) - set(options.held) - set(options.blank_lens.tangential))
 
 
 def size_of(options: Options) -> int:
-    """How much a lens may follow: its free coefficients, and two more where it is no pinhole without any: its series in
-    the tangent has its first two coefficients chosen.
+    """Return the effective number of coefficients: the free ones, and two more where the lens without coefficients is
+    no pinhole, because its projection determines the first two coefficients of its series in the tangent.
     """
-    projection = 2  # coefficients that a projection of its own is worth
+    projection = 2  # number of coefficients that another projection counts as
     any_phi = 100.0
     blank = make_lens(options.lens, options.blank_lens.powers)
     is_pinhole = np.isclose(blank.distort([[1.0, 0.0, 1.0]], any_phi)[0, 0], any_phi)
@@ -73,16 +70,16 @@ def size_of(options: Options) -> int:
 
 
 def is_usual(label: str) -> bool:
-    """Whether a lens of that label is one that people know: all but the paper's with other powers, or ssl-vision's."""
+    """Return whether a lens is widely known: all but radial ones with powers other than the paper's or ssl-vision's."""
     return not label.startswith("radial ") or label in (PAPER, "radial 3")
 
 
 class Form(Frozen, eq=True):
-    """A lens to be tried: see `Options`.
+    """A lens to be compared, see `Options`.
 
     Attributes:
-        names: of the coefficients that are free. label: how it is called. size: see `size_of`.
-        blank: with every coefficient 0.
+        names: of the free coefficients. label: see `label_of`. size: see `size_of`.
+        blank: the lens with every coefficient 0.
     """
 
     lens: str
@@ -96,21 +93,21 @@ class Form(Frozen, eq=True):
 
     @classmethod
     def among(cls, options: Options) -> Form:
-        """The lens of some options."""
+        """Return the lens of some options."""
         names = tuple(name for name in options.blank_lens.names if name not in options.held)
         chosen = options.lens, options.powers, options.coefficients, options.terms
         return cls(*chosen, names, label_of(options), size_of(options), options.blank_lens)
 
     def of(self, options: Options, **more: Any) -> Options:
-        """The options with this lens, and others of them changed."""
+        """Return the options with this lens and the changes `more`."""
         more |= {"lens": self.lens, "powers": self.powers, "coefficients": self.coefficients, "terms": self.terms}
         return replace(options, **more)
 
 
 @cache
 def forms_of(kind: str) -> tuple[Form, ...]:
-    """Every sensible lens of a kind, with its decentring, the longest first: all others are this one with coefficients
-    at 0.
+    """Return every sensible lens of a kind, with its decentring, the longest first; all others are the longest with
+    coefficients at 0.
     """
     lens = LENSES[kind]
     powers = tuple(sorted({power for trial in lens.trial_powers for power in trial}))
@@ -120,12 +117,12 @@ def forms_of(kind: str) -> tuple[Form, ...]:
 
 
 def kinds() -> Iterator[tuple[Form, ...]]:
-    """The lenses of each kind that has a formula: one without has no shorter ones."""
+    """Yield the lenses of each kind that has a formula; a kind without a formula has no shorter lenses."""
     return (forms_of(kind) for kind, lens in LENSES.items() if not lens.set_at_start)
 
 
 def undecentred() -> list[Form]:
-    """The paper's lens, and one of each other kind with as many coefficients and no decentring."""
+    """Return the paper's lens, and one of each other kind with as many coefficients and no decentring."""
     of_paper = Options(lens="radial", powers=PAPERS_POWERS)
     others = [Options(lens=forms[0].lens) for forms in kinds() if forms[0].lens != of_paper.lens]
     count = len(PAPERS_POWERS)
@@ -137,11 +134,11 @@ def undecentred() -> list[Form]:
 
 
 def without_formula(*, of_one_view: bool) -> Iterator[tuple[Form, ...]]:
-    """The lenses of all other kinds.
+    """Yield the lenses of all kinds without a formula.
 
     Args:
-        of_one_view: a profile along the radius and a decentring alone. One view of a floor tells nothing else from a
-            field of other dimensions, or from a tilt of the sensor, by which places at a height were 76 mm off.
+        of_one_view: whether they only get a profile along the radius and a decentring. In one view of a floor, further
+            terms look like other dimensions of the field or a tilt of the sensor: places at a height were 76 mm off.
     """
     for kind, lens in LENSES.items():
         if lens.set_at_start and of_one_view:
@@ -153,17 +150,18 @@ def without_formula(*, of_one_view: bool) -> Iterator[tuple[Form, ...]]:
             yield (Form.among(Options(lens=kind)),)
 
 
-# How much worse than the best, in standard errors of the difference, is as good: at 1 the paper's lens is missed more
-# often (at 1.5 in 4 of 100 fields), beyond 2 the decentring of real sets.
+# Standard errors of the difference by which a lens may predict worse than the best and still be as good. At 1 the
+# paper's lens is missed more often (at 1.5 in 4 of 100 fields), beyond 2 the decentring of real sets is missed.
 AS_GOOD = 1.75
-# Times the least squared error of lenses of one size, up to which what other programs know is preferred: OpenCV's right
-# camera has 1.005; photographs of fields 1.1 and more, where the map was off by 3 instead of 1 standard deviations.
+# Factor on the least squared error of lenses of one size up to which a lens that other programs know is preferred:
+# OpenCV's right camera has 1.005; photographs of fields have 1.1 or more, and there the map would be off by 3 instead
+# of 1 standard deviations.
 ALIKE = 1.02
 # Standard errors by which a lens without a formula, which few programs know, must predict better: five of eight real
-# sets have 3.1 to 4.7, the others 2.2 and less; those that no formula has 4.5 to 19, of 146 views of a full frame.
+# sets have 3.1 to 4.7, the others at most 2.2; lenses that no formula describes have 4.5 to 19 (146 full-frame views).
 CLEARLY = 2.5
 AS_GOOD_BESIDE_LENGTHS = 0.5
-"""The same where dimensions of targets are solved for: what a lens that is too simple cannot follow, they do."""
+"""`AS_GOOD` where dimensions of targets are solved for: these absorb what a too simple lens cannot follow."""
 
 
 def decide(
@@ -173,18 +171,20 @@ def decide(
     as_good: float = AS_GOOD,
     is_refuted: Callable[[int], bool] = lambda _: False,
 ) -> tuple[int, int]:
-    """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
+    """Return the indices of the best lens and of the simplest that is as good; the paper's comes before all others.
 
-    As good is what exceeds the least error by no more than 1.75 standard errors of their difference, group by group
+    A lens is as good if its error exceeds the least by no more than 1.75 standard errors of their difference by group
     (the one-standard-error rule of Breiman et al. 1984, paired, and wider because the best of many is the luckiest).
 
     Args:
-        sizes: see `forms.size_of`. squares: (G,) squared errors by group of each lens; None where there is no answer.
-        as_good: in place of those 1.75.
-        is_refuted: whether a longer lens refutes one, which then is not as good whatever few groups say.
+        labels: of the lenses. sizes: see `size_of`. squares: (G,) squared errors by group of each lens; None where it
+            cannot be used.
+        as_good: number of standard errors in place of 1.75.
+        is_refuted: whether a longer lens refutes the lens of this index, which then is not as good, whatever few groups
+            say.
 
     Raises:
-        DegenerateError: no lens has one.
+        DegenerateError: no lens can be used.
     """
     known = {i: one for i, one in enumerate(squares) if one is not None}
     if not known:
@@ -199,11 +199,11 @@ def decide(
 
 
 def pseudo_bma(squares: Sequence[Array]) -> Array:
-    """(L,) probability that each lens is the one that predicts best: likelihoods, averaged over draws of groups.
+    """Return the (L,) probability of each lens that it predicts best: likelihoods, averaged over draws of groups.
 
-    Pseudo-BMA+ of Yao, Vehtari, Simpson and Gelman (Bayesian Analysis 13, 2018, section 3.4), but that the draws are
-    balanced half samples, twice each (McCarthy, Review of the International Statistical Institute 37, 1969): nothing
-    in them is left to chance.
+    This is Pseudo-BMA+ of Yao, Vehtari, Simpson and Gelman (Bayesian Analysis 13, 2018, section 3.4), except that the
+    draws are balanced half samples, counted twice (McCarthy, Review of the International Statistical Institute 37,
+    1969), so that nothing in them is random.
 
     Args:
         squares: (G,) squared errors of each lens by group.
@@ -216,7 +216,7 @@ def pseudo_bma(squares: Sequence[Array]) -> Array:
 
 @cache
 def _half_samples(groups: int) -> Array:
-    """(D, G) 1 of the groups that are in a draw, else 0: each in half of them, each two in a quarter."""
+    """(D, G) 1 for groups that are in a draw, else 0: each group is in half of the draws, each pair in a quarter."""
     signs = np.ones((1, 1))
     while len(signs) <= groups:
         signs = np.block([[signs, signs], [signs, -signs]])  # Sylvester's Hadamard matrix
@@ -224,17 +224,17 @@ def _half_samples(groups: int) -> Array:
 
 
 def surprise(squares: Array, counts: Array) -> Array:
-    """(G,) squares that grow by their logarithm where a group is off by more than the noise: a line that lies aside, or
-    a feature whose label is wrong, must not decide.
+    """Return (G,) squares that grow logarithmically where a group is off by more than the noise, so that a line off its
+    nominal position or a feature with a wrong label does not decide.
 
     Args:
-        squares: (G,) of each group's counts (G,) of residuals, in standard deviations.
+        squares: (G,) sum of squares of each group's residuals, in standard deviations. counts: (G,) of residuals.
     """
     return np.asarray(counts * np.log1p(squares / counts))
 
 
 def standard_errors(squares: Array, others: Array) -> float:
-    """By how many standard errors of the difference squared errors by group exceed others; 0 of the same."""
+    """Return by how many standard errors of the difference squared errors by group exceed others; 0 if equal."""
     more, count = squares - others, len(squares)
     total = float(more.sum())
     apart = more - total / count

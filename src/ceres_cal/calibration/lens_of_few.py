@@ -1,7 +1,7 @@
-"""Lenses of observations too few to compare them by what they predict: by what each leaves, with as many coefficients.
+"""Choose a lens by too few observations to compare predictions: by what lenses of equally many coefficients leave.
 
-Six corners of a wide picture, with the paper's lens alone, knew its principal point to 3 px and had it 5.5 standard
-deviations off.
+From six corners of a wide picture, the paper's lens alone gave a principal point with a standard deviation of 3 px that
+was 5.5 standard deviations off.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _STRONG = 3.0
 def likeliest_of_few(
     observations: Observations, options: Options, near: Estimate, failed: Collection[str] = ()
 ) -> tuple[Form, Estimate] | None:
-    """The kind that is far likelier than the paper's lens, and the estimate with it; None where none is.
+    """Return the kind that is far likelier than the paper's lens, and the estimate with it; None where none is.
 
     Args:
-        failed: labels of those with which all of the observations made no calibration.
+        failed: labels of lenses with which all of the observations could not be calibrated.
     """
     each = {form: end for form, end in _with_each_kind(observations, options, near).items() if form.label not in failed}
     least = min((end.cost for end in each.values()), default=np.inf)
@@ -38,8 +38,8 @@ def likeliest_of_few(
 
 
 def others_of_few(observations: Observations, label: str, options: Options, near: Estimate) -> OtherLenses:
-    """What they, of one camera, say with the other kinds, each as probable as what it leaves beside the lens of that
-    label; options are those of all cameras.
+    """Return the estimates of one camera with the other kinds, weighted by what each leaves beside the lens of that
+    label. The options are those of all cameras.
     """
     (camera,) = observations.cameras
     options = replace(options.of_camera(camera), priors=observations.about_shown(options.priors))
@@ -55,8 +55,8 @@ def others_of_few(observations: Observations, label: str, options: Options, near
 
 
 def _with_each_kind(observations: Observations, options: Options, near: Estimate) -> dict[Form, Solution]:
-    """The paper's lens and one of each other kind, solved for; none of many observations, whose lenses could not be
-    compared for another reason.
+    """Solve with the paper's lens and with one of each other kind. The result is empty for many observations, whose
+    lenses could not be compared for another reason.
     """
     few = 1_000
     if observations.rows > few:
@@ -69,6 +69,6 @@ def _with_each_kind(observations: Observations, options: Options, near: Estimate
         there = seen_through(near, own, profiles)
         return found(solve(problem_of(sights, own, there), there, is_near=False))
 
-    # quiet: a lens that cannot be solved for says nothing
+    # quiet: a lens that cannot be solved for is no alternative
     ends = {form: attempt(partial(solved, form)) for form in undecentred()}
     return {form: end for form, end in ends.items() if not isinstance(end, CalibrationError)}

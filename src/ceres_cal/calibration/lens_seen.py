@@ -1,4 +1,4 @@
-"""What a solve saw: each kind of lens near its best, and what follows for each of its lenses."""
+"""The inliers of a solve, each kind of lens near its minimum over them, and what follows for each of its lenses."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.closed_forms import LensProfile, edge_over
 from ceres_cal.start.initialise import initialise
 
-# Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.01
-# the paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could
-# swell, halves of real sets took a lens too simple.
+# Probability of the excess of a lens's squares over a longer one's below which the lens is refuted. At 0.01 the paper's
+# lens is missed more often, and seams in a carpet become decentring; at 0.001, with a scatter that one group could
+# increase, too simple a lens was chosen for halves of real sets.
 _REFUTED = 0.003
-_UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
+_UNSEEN_GROUPS = 10.0  # groups that scatter like the noise, added to those seen: the scatter of a dozen varies
 
 
 class Kind(Frozen):
-    """A kind of lens near its best, and what follows for each of its lenses.
+    """A kind of lens near its minimum, and what follows for each of its lenses.
 
     Attributes:
-        forms: the longest first. normals: None where it gives no answer, and `failed` says why. sigma_px: of a typical
-            observation. reach_px: how far from its principal point each camera's observations reach.
+        forms: its lenses, longest first. normals: None where the kind cannot be used, see `failed`. sigma_px: noise of
+            a typical observation. reach_px: camera -> distance from the principal point that observations reach.
         smoothness: of a lens without a formula, see `Problem`.
     """
 
@@ -59,21 +59,21 @@ class Kind(Frozen):
 
     @property
     def may_fall(self) -> float:
-        """The share of its least squares by which these may fall yet: a solve in a valley falls by little at a step."""
+        """Share of the least squares by which the cost may still fall: a solve in a valley takes small steps."""
         return 0.0 if self.normals is None else float(self.normals.squares.sum()) / self.normals.least - 1.0
 
     @property
     def least(self) -> float:
-        """The least squares of its longest lens."""
+        """Least sum of squares with its longest lens, by the normal equations."""
         return np.inf if self.normals is None else self.normals.least
 
     def candidates(self, *, first: bool) -> list[Candidate]:
-        """The longest lens of the kind and the paper's, or all others, with their errors of prediction."""
+        """Return the longest lens of the kind and the paper's, or all others, with their errors of prediction."""
         return [one for one in self._every if first == (one.form is self.forms[0] or one.form.label == PAPER)]
 
     @cached_property
     def _every(self) -> list[Candidate]:
-        """All of its lenses, which together take hardly longer than one."""
+        """All of its lenses; computing them together takes hardly longer than one."""
         if self.normals is None:
             return [Candidate(form, self, failed=self.failed) for form in self.forms]
         counts, (squares, steps) = self.normals.counts, self.normals.held_out([*map(self.to_nothing, self.forms)])
@@ -82,26 +82,26 @@ class Kind(Frozen):
         return [Candidate(form, self, own, rms, at, self.normals.squares_at(at)) for form, own, rms, at in each]
 
     def slopes(self, lenses: OtherLenses) -> Sequence[Array]:
-        """How what pixels show moves with its numbers, see `shown_slopes`."""
+        """Return the derivatives of the places that pixels show by its numbers, see `shown_slopes`."""
         return () if self.normals is None else shown_slopes(self.estimate, self.normals.keys, lenses)
 
     def to_nothing(self, form: Form) -> dict[Key, float]:
-        """How far from where they stand the coefficients that one of its lenses does not have are 0."""
+        """Return the steps that set the coefficients to 0 which one of its lenses does not have."""
         return {key: step for key, step in self._to_nothing.items() if key.quantity not in form.names}
 
     @cached_property
     def _to_nothing(self) -> dict[Key, float]:
-        """The same of all coefficients of its longest lens."""
+        """The steps that set all coefficients of its longest lens to 0."""
         names, every = set(self.forms[0].names), self.normals.keys if self.normals else ()
         keys = [key for key in every if key.kind == "camera" and key.quantity in names]
         return dict(zip(keys, (-values_of(self.estimate, keys)).tolist(), strict=True))
 
     @cached_property
     def noise(self) -> float:
-        """Mean square of what it leaves, over the stated noise: 1 at most, for a first solve with another lens may have
-        left more.
+        """Mean square of its residuals over the stated noise; at most 1, because a first solve with another lens may
+        have left more.
         """
-        no_noise = 1e-12  # mean square that rounding leaves of exact observations, or less
+        no_noise = 1e-12  # mean square: rounding leaves at most this of exact observations
         if self.normals is None:
             return 1.0
         spare = float(self.normals.counts.sum() - len(self.normals.keys))
@@ -109,8 +109,8 @@ class Kind(Frozen):
 
     @cached_property
     def scatter(self) -> float:
-        """Mean of the variances of its coefficients as groups scatter, over those by the stated noise; at least what
-        noise alone makes of it, and the nearer to that the fewer groups there are.
+        """Mean of the variances of its coefficients by the scatter of groups, over those by the stated noise; at least
+        the noise's own share, and closer to that the fewer groups there are.
         """
         if self.normals is None:
             return 1.0
@@ -124,8 +124,8 @@ class Candidate(Frozen):
     """A lens and its errors of prediction.
 
     Attributes:
-        squares: (G,) of each group, in standard deviations; None where it gives no answer, and `failed` says why.
-        rms_px: of all. step: from the kind's estimate to where this lens is at its best. least: all squares there.
+        squares: (G,) squared error of predicting each group, in variances; None where it cannot be used, see `failed`.
+        rms_px: of all predictions. step: from the kind's estimate to this lens's minimum. least: sum of squares there.
     """
 
     form: Form
@@ -137,19 +137,19 @@ class Candidate(Frozen):
     failed: str = ""
 
     def refutes(self, other: Candidate) -> bool:
-        """Whether the other lens, which has fewer numbers, leaves more than it may by chance."""
+        """Return whether the other lens, which has fewer coefficients, leaves more than it may by chance."""
         more = self.form.size - other.form.size
         if more <= 0 or self.squares is None:
             return False
         left, known = other.least - self.least, len(self.squares) + _UNSEEN_GROUPS
-        if left <= more * self.of.noise:  # of noise alone every other one leaves as much, which takes no tail
+        if left <= more * self.of.noise:  # noise alone leaves as much every other time: no tail needed
             return False
-        # Seldom does it leave more than the noise alone explains, which takes less to know.
+        # First by the noise alone, which is cheaper to compute and seldom exceeded.
         by_noise = upper_tail(left / self.of.noise, more, known) < _REFUTED
         return by_noise and upper_tail(left / self.of.scatter, more, known) < _REFUTED
 
     def may_win(self, best: Candidate | None) -> bool:
-        """Whether it is the longest of a kind whose shorter ones may be as good as the best."""
+        """Return whether it is the longest of a kind whose shorter ones may be as good as the best."""
         if self.form is not self.of.forms[0] or self.of.normals is None:
             return False
         if best is None or best.squares is None or self.squares is None:
@@ -157,13 +157,13 @@ class Candidate(Frozen):
         return standard_errors(self.squares, best.squares) <= AS_GOOD
 
     def beats(self, other: Candidate, least: float) -> bool:
-        """Whether it predicts better by so many standard errors."""
+        """Return whether it predicts better by more than `least` standard errors."""
         if self.squares is None or other.squares is None or self.fault:
             return False
         return standard_errors(other.squares, self.squares) > least
 
     def extends(self, other: Candidate, as_good: float) -> bool:
-        """Whether it is the other lens with more coefficients and predicts as well: no data say that these are 0."""
+        """Return whether it is the other lens with more coefficients, and as good: no data say that these are 0."""
         if self.form.lens != other.form.lens or self.squares is None or other.squares is None:
             return False
         is_longer = {*self.form.names} > {*other.form.names}
@@ -171,10 +171,10 @@ class Candidate(Frozen):
 
     @cached_property
     def estimate(self) -> Estimate:
-        """Near its best.
+        """The estimate with this lens, near its minimum.
 
         Raises:
-            InputError: there is no camera there.
+            InputError: there is no valid camera there.
         """
         there = moved(self.of.estimate, self.of.normals.keys if self.of.normals else (), self.step)
         blank = self.form.blank
@@ -186,10 +186,10 @@ class Candidate(Frozen):
         return replace(there, cameras=cameras)
 
     def spread(self, stated: Information, slopes: Sequence[Array]) -> LensSpread | None:
-        """How all numbers vary with it; None where it gives no answer.
+        """Return how all numbers vary with this lens; None where it cannot be used.
 
         Args:
-            stated: what is known besides. slopes: of its kind.
+            stated: prior information. slopes: see `Kind.slopes`.
         """
         if self.of.normals is None:
             return None
@@ -199,8 +199,8 @@ class Candidate(Frozen):
 
     @property
     def is_near(self) -> bool:
-        """Whether normal equations have it at its best, but for placements: of boards, where its kind was nearly so.
-        Over a floor they lead along a valley, and ten standard deviations off it.
+        """Whether normal equations give its minimum, except for placements. They do for boards, where its kind was near
+        its own minimum. Over a floor they lead along a valley, and ten standard deviations off it.
         """
         kind = self.of.normals
         if kind is None or any(key.kind != "camera" for key in kind.keys):
@@ -209,7 +209,7 @@ class Candidate(Frozen):
 
     @cached_property
     def fault(self) -> str:
-        """Why it cannot be used, "" where it can."""
+        """Why it cannot be used, else ""."""
         there = attempt(lambda: self.estimate)  # reads: "..." beside that lens, why it failed
         if isinstance(there, CalibrationError):
             return str(there)
@@ -221,23 +221,23 @@ class Candidate(Frozen):
 
 
 MOST_ROUNDS = 8  # of a robust solve
-_PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
-# Share of its squares by which a kind may be off its best, else it is solved for finely: it is up to .06, and three
-# times them in a valley of phi over a field, which falls by less than the precision at each step. A lens without k3
-# seemed to leave 6 variances more there, not 110.
+_PRECISION = 1e-2  # relative change of the cost from which on normal equations locate the minimum
+# Share of its squares by which a kind may be above its minimum; otherwise it is solved finely. The share is up to 0.06,
+# and 3 in a valley of phi over a field, where the cost falls by less than the precision at each step: there a lens
+# without k3 seemed to leave 6 variances more instead of 110.
 _FAR = 0.1
-# Share of a cost: of a placement's, for from one that is taken for less, whatever the solve does is rejected; and of
-# all, where the next step is of a thousandth of a standard deviation.
+# Relative precision of a cost: of a placement's, because with a coarser one every step of the solve is rejected; and of
+# the whole, where the next step is a thousandth of a standard deviation.
 _AT_BEST = 1e-6
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
-# Variances by which a kind was off its best, and by which one of its lenses is off that. So far a solve moved lenses
-# of 24 simulated sets of boards by less than a tenth of a standard deviation, at three times as many by a third.
+# Variances by which a kind was above its minimum, plus those by which one of its lenses is above that. Up to this, a
+# solve moved lenses of 24 simulated sets of boards by less than a tenth of a standard deviation, at 3 times by a third.
 _NEAR = 4.0
-_KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
+_KEPT = 1.5  # times the squares that normal equations predict: a lens that leaves more is not the one compared
 
 
 def found(solution: Solution) -> Solution:
-    """A solve that came to an end; DegenerateError of one that did not."""
+    """Return a solve that converged; raise DegenerateError for one that failed."""
     if solution.failed:
         raise DegenerateError(f"cannot be solved for: {solution.termination}")
     return solution
@@ -248,14 +248,14 @@ def _at_best(problem: Problem, estimate: Estimate) -> Estimate:
 
 
 def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
-    """What each camera's lens does, as far as it was observed; over its picture where all it showed was taken out."""
+    """Return each camera's lens as far as it was observed; over its picture where all observations were rejected."""
     seen = {name: sights.of_camera(name).about(estimate.cameras[name]).reach_px for name in sights.cameras}
     every = estimate.cameras.items()
     return {name: LensProfile.of(camera, seen.get(name, camera.corner_radius)) for name, camera in every}
 
 
 def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, LensProfile]) -> Estimate:
-    """The estimate with the lens of the options, as near to its own as it comes; DegenerateError: it shows nothing."""
+    """Return the estimate with the options' lens, fitted to its own; DegenerateError: its own lens shows nothing."""
     cameras = dict(estimate.cameras)
     for name, profile in profiles.items():
         if not len(profile.angles):
@@ -271,7 +271,7 @@ class InlierRows(Frozen):
     """The inliers of a solve.
 
     Attributes:
-        every: sights of all the observations, of targets as they are `built`.
+        every: sights of all the observations, with targets as `built`.
     """
 
     end: RobustSolution
@@ -288,7 +288,7 @@ class InlierRows(Frozen):
         return profiles_of(self.end.estimate, self.sights)
 
     def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
-        """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
+        """Return a kind near its minimum, with each group's normal equations; `is_solved`: it is that of the solve."""
         options = forms[0].of(self.options, max_iterations=_MOST_STEPS)
         start = self.end.estimate
 
@@ -298,7 +298,7 @@ class InlierRows(Frozen):
                 estimate = seen_through(estimate, options, self._profiles)
                 solution = solve(problem, estimate, precision=_PRECISION, is_near=False)
                 if solution.failed:
-                    self._shown(estimate)  # where that is why, its own words are said
+                    self._shown(estimate)  # raises a more specific message where that is the reason
                 estimate = found(solution).estimate
             kind = self._near_best(forms, problem, estimate)
             return kind if not kind.may_fall > _FAR else self._near_best(forms, problem, _at_best(problem, estimate))
@@ -306,7 +306,7 @@ class InlierRows(Frozen):
         return _or_failed(near_best, forms, start)
 
     def solved(self, forms: tuple[Form, ...], near: Estimate | None) -> Kind:
-        """A kind whose roughness the data tell, by all rounds of a robust solve near an estimate or from nothing."""
+        """Return a kind whose roughness is estimated, by a full robust solve near an estimate or from a new start."""
         options = forms[0].of(self.options)
 
         def near_best() -> Kind:
@@ -321,7 +321,7 @@ class InlierRows(Frozen):
         return _or_failed(near_best, forms, self.end.estimate)
 
     def holding(self, options: Options) -> InlierRows:
-        """The same with what other options hold of cameras."""
+        """Return a copy that holds the numbers of cameras that other options hold."""
         held = {name: getattr(options, name) for name in ("fixed", "free_principal_point")}
         now = replace(self.options, **held)
         return self if now == self.options else replace(self, options=now)
@@ -332,19 +332,19 @@ class InlierRows(Frozen):
         return any(key.placement for key in self.sights.keys) and not _placed(self.sights).any()
 
     def in_sigmas(self, estimate: Estimate, scales: tuple[float, float] | None = None) -> tuple[Array, Array]:
-        """(N, 2), (M,) residuals of points and curve observations, in standard deviations, by these scales of the noise
-        or those of the solve.
+        """Return (N, 2), (M,) residuals of points and curve observations, in standard deviations by these noise scales
+        or by those of the solve.
 
         Raises:
-            DegenerateError: something is not seen.
+            DegenerateError: an observation cannot be shown.
         """
         there, sights, scales = self._shown(estimate), self.sights, scales or self.end.problem.weighting.scales
         points = there.points[sights.point_rows] / (scales[0] * sights.sigma_px[:, None])
         return points, there.curves[sights.curve_rows] / (scales[1] * sights.curve_sigma_px)
 
-    @or_none  # quiet: the lens does not reach what was promised, and gives no answer
+    @or_none  # quiet: the lens leaves more than was predicted, and is not used
     def reached(self, candidate: Candidate) -> Estimate | None:
-        """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
+        """The estimate where a lens, solved if needed, leaves no more than a longer one predicts; else None."""
         points, curves = self.in_sigmas(candidate.estimate)
         if np.sum(points**2) + curves @ curves <= self._kept(candidate):
             return candidate.estimate
@@ -361,11 +361,11 @@ class InlierRows(Frozen):
         there: Estimate | None = None,
         held: Key | None = None,
     ) -> Solution:
-        """Where a lens is at its best, solved for from where the normal equations have it.
+        """Solve with a lens, starting at its minimum by the normal equations.
 
         Args:
-            as_promised: whether what leaves more than these promise is no answer.
-            there: from where else. held: what stays as it is there.
+            as_promised: whether leaving more than these predict is a failure.
+            there: another start. held: a number that keeps its value there.
 
         Raises:
             CalibrationError: it cannot be solved for.
@@ -381,11 +381,11 @@ class InlierRows(Frozen):
         return solution
 
     def _kept(self, candidate: Candidate) -> float:
-        """Squares up to which a lens is the one that was compared: exact observations leave less than noise would."""
+        """Largest squares of a lens that counts as the one compared; exact observations leave less than noise."""
         return _KEPT * max(candidate.least, self.sights.equations)
 
     def _problem(self, options: Options, estimate: Estimate, smoothness: Mapping[str, tuple[float, ...]]) -> Problem:
-        """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""
+        """Return the problem without a loss, so that inliers that a kind misses do not weigh less with that kind."""
         weighting, feet = replace(self.end.problem.weighting, loss="trivial"), self.end.residuals.feet
         problem = problem_of(self.sights, options, estimate)
         return replace(problem, weighting=weighting, feet=feet, smoothness=smoothness)
@@ -402,13 +402,13 @@ class InlierRows(Frozen):
 
     @cached_property
     def _sigma_px(self) -> float:
-        """Of a typical observation."""
+        """Noise of a typical observation, px (harmonic mean)."""
         sights, (points, curves) = self.sights, self.end.problem.weighting.scales
         inverse = 2.0 * np.sum(1.0 / (points * sights.sigma_px)) + np.sum(1.0 / (curves * sights.curve_sigma_px))
         return sights.equations / float(inverse)
 
     def _shown(self, estimate: Estimate) -> Residuals:
-        """The residuals there; DegenerateError where something is not seen."""
+        """Return the residuals there; raise DegenerateError where an observation cannot be shown."""
         there = residuals(self.sights, estimate, self.end.residuals.feet)
         known = np.isfinite(there.points[self.sights.point_rows]), np.isfinite(there.curves[self.sights.curve_rows])
         if not (known[0].all() and known[1].all()):
@@ -417,7 +417,7 @@ class InlierRows(Frozen):
 
 
 def _or_failed(near_best: Callable[[], Kind], forms: tuple[Form, ...], start: Estimate) -> Kind:
-    """A kind near its best, or why it failed."""
+    """Return a kind near its minimum, or with the reason why it failed."""
     found = attempt(near_best)  # reads: "..." beside that lens, why it failed
     return Kind(forms, start, failed=str(found)) if isinstance(found, CalibrationError) else found
 
@@ -429,21 +429,19 @@ def _placed(sights: Sights) -> Mask:
     return placed & (np.count_nonzero(placed) >= fewest_placements)
 
 
-# With fewer nothing tells lenses apart. Seven corners were 3.3 times as far off as stated with the paper's lens alone,
-# 1.1 times with the lenses that they were compared with.
+# Fewer groups do not distinguish lenses. Estimates from seven corners were 3.3 times as far off as stated with the
+# paper's lens alone, and 1.1 times with the lenses that they were compared with.
 _FEWEST_GROUPS = 6
 
 
 def _groups_of(sights: Sights) -> Sights:
-    """A sight of each group: a placement, or, of what stays where it is, a feature; half of a line where these are
-    few.
-    """
+    """Return a sight for each group: a placement, or a feature of a fixed target; half a line where these are few."""
     placed = _placed(sights)
     groups = sights.by_feature(placed)
     return groups if len(groups) >= _FEWEST_GROUPS else sights.by_feature(placed, halved=True)
 
 
 def require_groups(sights: Sights) -> None:
-    """Raise DegenerateError where there is too little to hold out."""
+    """Raise DegenerateError where there are too few groups to hold out."""
     if len(_groups_of(sights)) < _FEWEST_GROUPS:
         raise DegenerateError(TOO_FEW)

@@ -22,10 +22,10 @@ _T = TypeVar("_T")
 
 
 class LensDecisions(Frozen):
-    """What was chosen for each camera.
+    """The lens that was chosen for each camera.
 
     Attributes:
-        sights: of everything. asked: options, whose lens was open. first: a start with the paper's lens.
+        sights: of all observations. asked: options that leave the lens open. first: a start with the paper's lens.
         each: camera -> its lens.
     """
 
@@ -36,14 +36,14 @@ class LensDecisions(Frozen):
 
     @cached_property
     def options(self) -> Options:
-        """Those that were asked, with these lenses."""
+        """The options that were asked for, with the chosen lenses."""
         each = self.each.items()
         views = {name: len(self.sights.of_camera(name)) for name in self.each}
         return self.asked.with_lenses({name: one.options.with_first_power(views[name]) for name, one in each})
 
     @cached_property
     def start(self) -> Start:
-        """Of everything: cameras as each was compared, and put together by what they saw in common."""
+        """The start of everything: each camera as it was compared, combined through what they observed in common."""
         own = {name: one.start for name, one in self.each.items()}
         if len(own) == 1:
             return next(iter(own.values()))
@@ -57,32 +57,32 @@ class LensDecisions(Frozen):
 
     @property
     def built(self) -> Construction:
-        """How targets seemed to be built when lenses were compared."""
+        """Targets as built, as estimated when lenses were compared."""
         return next((one.built for one in self.each.values() if one.built.every), AS_DRAWN)
 
     @property
     def far_better(self) -> set[str]:
-        """Cameras of which a lens without a formula leaves far less than any other."""
+        """Cameras for which a lens without a formula leaves far smaller residuals than any other."""
         return {name for name, one in self.each.items() if one.among is not None and one.among.is_far_better}
 
     @property
     def labels(self) -> list[str]:
-        """What the lenses are called."""
+        """Labels of the lenses."""
         return [one.choice.chosen for one in self.each.values()]
 
     @property
     def caveats(self) -> list[str]:
-        """What speaks against the lenses that were taken."""
+        """Warnings about the lenses that were taken."""
         several = len(self.each) > 1
         said = {name: one.choice.caveat for name, one in self.each.items()}
         return [f"camera {name!r}: {words}" if several else words for name, words in said.items() if words]
 
     def first_solved(self, solved: Callable[[LensDecisions], _T]) -> tuple[_T, LensDecisions]:
-        """What is solved with them, or with others in place of those with which all of the observations make no
-        calibration; and with which.
+        """Return the solution with these lenses, and the lenses. A lens with which all of the observations cannot be
+        calibrated is replaced by another one.
 
         Raises:
-            CalibrationError: none make one.
+            CalibrationError: no lens makes a calibration.
         """
         try:
             return solved(self), self
@@ -98,8 +98,8 @@ class LensDecisions(Frozen):
     def anew(
         self, cameras: Collection[str], near: Estimate, built: Construction, by_most: Collection[str]
     ) -> LensDecisions:
-        """Chosen once more for some cameras, from another estimate and over targets as they are built; of some of these
-        by most of their observations.
+        """Choose once more for some cameras, from another estimate and with targets as built; for the cameras in
+        `by_most` by most of their observations.
         """
         start = replace(self.first, estimate=near, keys=())
         return self._with({
@@ -107,7 +107,7 @@ class LensDecisions(Frozen):
         })  # fmt: skip
 
     def instead(self, taken_out: tuple[Mask, Mask], scales: tuple[float, float]) -> LensDecisions | None:
-        """With other lenses where these explain what is taken out, see `Comparison.instead`; None where none does."""
+        """Return other lenses where these explain what is rejected, see `Comparison.instead`; None where none does."""
         seen, others = self.sights.observations, {}
         for name, one in self.each.items():
             own = np.array([view.camera == name for view in seen.views])
@@ -120,8 +120,8 @@ class LensDecisions(Frozen):
         return self._with(others) if others else None
 
     def others(self, posterior: Posterior, end: Estimate, options: Options) -> OtherLenses:
-        """What other lenses would say of cameras whose stations stand, where they see no floor, as at the end, and of
-        which these options hold numbers.
+        """Return the estimates of all cameras with other lenses, weighted by their probabilities. Stations that see no
+        floor stand as at `end`, and numbers that the options hold are held.
         """
         floors = {key.station for key in self.sights.keys if key.placement is None}
         ends = {name: _part(end, self.sights, name) for name in self.each}
@@ -133,10 +133,10 @@ class LensDecisions(Frozen):
 
 
 def choose_lenses(sights: Sights, options: Options, start: Start) -> LensDecisions:
-    """The lens that the observations of each camera ask for.
+    """Choose each camera's lens by its observations.
 
     Args:
-        options: their lens is not looked at. start: of everything, with the paper's lens.
+        options: their lens is ignored. start: of everything, with the paper's lens.
     """
     each = {name: _chosen(sights, options, start, name, AS_DRAWN) for name in sights.observations.cameras}
     return LensDecisions(sights, options, start, each)
@@ -151,7 +151,7 @@ def _chosen(
 
 
 def start_of(start: Start, sights: Sights, camera: str) -> Start:
-    """The part of a start that is about one camera, by its own sights as far as these are posed."""
+    """Return the part of a start that is about one camera, with the poses of its own sights where these are known."""
     if len(start.estimate.cameras) == 1:
         return start
     posed = [i for i, key in enumerate(start.keys) if key.camera == camera and key.placement is not None]
@@ -161,7 +161,7 @@ def start_of(start: Start, sights: Sights, camera: str) -> Start:
 
 
 def _part(of: Estimate, sights: Sights, camera: str) -> Estimate:
-    """What is about one camera, and what it sees."""
+    """Return the part of an estimate that is about one camera and what it sees."""
     if len(of.cameras) == 1:
         return of
     names = list(dict.fromkeys(key.placement for key in sights.of_camera(camera).keys if key.placement is not None))

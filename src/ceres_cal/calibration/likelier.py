@@ -1,9 +1,9 @@
-"""Of two calibrations of the same observations the likelier one, with the other as far as it is probable.
+"""Take the likelier of two calibrations of the same observations, with the other as a component by its probability.
 
-A lens that was chosen while little was stated may be all that contradicts what is stated: with one coefficient, wide
-lenses called right heights wrong by ten standard deviations. So where something is contradicted the lens is chosen once
-more, with all as stated. That a statement is wrong has the odds of a feature that does not belong, and a coefficient
-more has its price (Schwarz, Annals of Statistics 6, 1978).
+A lens that was chosen while statements had little weight may be the only reason why a statement seems wrong: with one
+coefficient, right heights of wide lenses seemed wrong by ten standard deviations. So where a statement is contradicted,
+the lens is chosen once more with everything as stated. The odds that a statement is wrong are those of a whole feature
+being an outlier, and each further coefficient has its price (Schwarz, Annals of Statistics 6, 1978).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from ceres_cal.robust.stated import DOUBTED, log_odds_wrong, may_be_wrong
 def likelier(
     one: Calibration, other: Calibration, probability: float, observations: Observations, let_go: Collection[Key] = ()
 ) -> Calibration:
-    """The likelier of two calibrations, the other in what is known of it.
+    """Return the likelier of two calibrations, with the other as a component of its posterior.
 
     Args:
-        probability: of the other. let_go: what that does not take as it was stated.
+        probability: of the other. let_go: statements that the other does not accept.
     """
     if probability > 0.5:
         one, other, probability = other, one, 1.0 - probability
@@ -46,15 +46,15 @@ def likelier(
 
 
 def with_lens_that_agrees(short: Calibration, agreeing: Calibration, observations: Observations) -> Calibration:
-    """The likelier of a calibration that contradicts what is stated and of one with another lens that agrees with it,
-    with a warning where what is stated may be wrong all the same.
+    """Return the likelier of a calibration that contradicts statements and one with another lens that agrees with them,
+    with a warning where the statements may be wrong nevertheless.
     """
     log_odds = _misfit(agreeing.fit, short.fit) + sum(log_odds_wrong(one.sigmas) for one in short.conflicts)
     log_odds += 0.5 * np.log(observations.rows) * (_size_of(agreeing) - _size_of(short))
     wrong = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -700.0, 700.0))))
     if wrong < DOUBTED or agreeing.posterior is None:
         return agreeing
-    # What is in doubt already is stated no more.
+    # A statement that is in doubt is no longer part of what is stated.
     stated = {key[1:]: key for key in agreeing.posterior.stated.keys}
     named = {stated[one.number]: one for one in short.conflicts if one.number in stated}
     found = likelier(agreeing, short, wrong, observations, named)
@@ -66,7 +66,7 @@ def with_lens_that_agrees(short: Calibration, agreeing: Calibration, observation
 
 
 def _misfit(one: Fit, other: Fit) -> float:
-    """Logarithm of how much likelier the observations are by another fit, at the noise that it has."""
+    """Return the logarithm of how much likelier the observations are by the other fit, at the noise of that fit."""
     tiny = np.finfo(float).tiny
     each = (
         (2 * one.points, one.points_rms_px, 2 * other.points, other.points_rms_px),
@@ -78,5 +78,5 @@ def _misfit(one: Fit, other: Fit) -> float:
 
 
 def _size_of(found: Calibration) -> int:
-    """How many coefficients its lenses have."""
+    """Return the number of coefficients of its lenses, see `size_of`."""
     return sum(size_of(found.options.of_camera(name)) for name in found.cameras)

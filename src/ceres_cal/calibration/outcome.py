@@ -1,6 +1,6 @@
-"""What came out of a solve, as a calibration that is not assessed yet.
+"""Turn the result of a solve into a calibration without a posterior.
 
-Warnings of what the observations leave open: phi that they do not tell, or that rests on what is usual.
+Also the warnings about what observations leave open: phi that they do not determine, or that rests on usual cameras.
 """
 
 from __future__ import annotations
@@ -36,10 +36,12 @@ _UNKNOWN = (
     "camera {!r}: its views are too frontal to determine phi (95 %: {}). Heights are correlated with phi: places above "
     "the floor depend on it, places on the floor do not. Add boards tilted by 20 degrees, or a prior on height_m"
 )
-# Sizes that move a pixel of the image's corner by half the diagonal: a lens in which so many are one standard deviation
-# is none. Where as many equations as numbers leave a coefficient to rounding it is thousands of times that.
+# Natural sizes (each moves a pixel of the image's corner by half the diagonal): a lens with a coefficient whose
+# standard deviation is this many is undetermined. Where there are only as many equations as numbers, rounding leaves a
+# coefficient thousands of times that.
 _LOST = 1e3
-# Times the standard deviation of phi without what is usual of cameras: what rests on it is said.
+# Factor on the standard deviation of phi without the prior of usual cameras, above which a remark says that phi rests
+# on it.
 _RESTING = 1.5
 _USUAL = (
     "camera {!r}: phi and the numbers correlated with it are determined only with what is usual of cameras (a usual "
@@ -66,8 +68,8 @@ _MIRRORED = (
 
 
 def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
-    """Raise DegenerateError where coefficients of a lens may be anything at all."""
-    # Where a valley of phi is open, so may be all that goes with it: along it, or by the quadratic picture.
+    """Raise DegenerateError where the observations leave coefficients of a lens arbitrary."""
+    # Where a valley of phi is open, so may be what is correlated with phi: along the valley, or in the quadratic model.
     known = np.minimum(posterior.spread.sd, posterior.sd)
     for name, camera in estimate.cameras.items():
         keys = [key for key in posterior.keys if key[:2] == ("camera", name) and key.quantity in camera.lens.names]
@@ -84,7 +86,7 @@ def require_lens_told(estimate: Estimate, posterior: Posterior) -> None:
 
 
 def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
-    """Warnings of cameras whose phi the observations leave open."""
+    """Yield warnings about cameras whose phi the observations leave open."""
     if not posterior.followed:
         return
     from ceres_cal.posterior.uncertainty import Uncertainty
@@ -97,14 +99,14 @@ def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
 
 
 def remarks_of(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
-    """What was made of the observations, which costs no trust."""
+    """Yield remarks: how the observations were treated, without loss of trust."""
     yield from _resting_phi(end, problem, posterior)
     yield from _noisier_cameras(problem.observations.noise)
     yield from _worlds_apart(problem.observations)
 
 
 def _resting_phi(end: RobustSolution, problem: Problem, posterior: Posterior) -> Iterator[str]:
-    """Words about cameras whose phi rests on what is usual, beside how well the posterior knows it."""
+    """Yield remarks on cameras whose phi rests on usual cameras, with phi's standard deviation without that prior."""
     estimate, reduced = end.estimate, end.reduced
     usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
     if reduced is None or not usual:
@@ -122,15 +124,15 @@ def _resting_phi(end: RobustSolution, problem: Problem, posterior: Posterior) ->
 
 
 def unusual_pixels(end: RobustSolution, problem: Problem, alone: Mapping[str, tuple[float, float]]) -> Iterator[str]:
-    """Words about cameras whose pixels come out far from square, where only targets of the world tell so: a length that
-    is not the target's looks the same. A board that is turned from view to view would contradict it. And about those
-    whose pixels are square by what is usual of cameras alone.
+    """Yield warnings about cameras whose pixels are far from square where only targets of the world show that: a wrong
+    length of the target looks the same. A board that is turned from view to view would contradict a wrong aspect. Also
+    warn of cameras whose pixels are square only by the prior of usual cameras.
 
     Args:
         alone: see `aspects_alone`.
     """
-    unusual = 0.007  # of fy / fx: of the public cameras tried it is up to 0.006 off
-    surely = 2.5  # standard deviations: 2.9 to 9.5 of pictures stretched by 5 to 7 %, 1.9 at most of thirty others
+    unusual = 0.007  # of fy / fx: the public cameras tried differ from 1 by up to 0.006
+    surely = 2.5  # standard deviations: pictures stretched by 5 to 7 % have 2.9 to 9.5, thirty others at most 1.9
     turned = {view.camera for view in problem.observations.views if view.placement is not None}
     for name, camera in end.estimate.cameras.items():
         free = problem.layout.free.get(name, ())
@@ -145,8 +147,8 @@ def unusual_pixels(end: RobustSolution, problem: Problem, alone: Mapping[str, tu
 
 
 def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -> dict[str, tuple[float, float]]:
-    """Camera -> fy / fx by the observations alone, to first order, and its standard deviation; of cameras that show the
-    world alone, and whose pixels are square by what is usual.
+    """Camera -> fy / fx by the observations alone, to first order, and its standard deviation; for cameras that show
+    only the world, and whose pixels are square by the prior of usual cameras.
     """
     found = dict[str, tuple[float, float]]()
     turned = {view.camera for view in problem.observations.views if view.placement is not None}
@@ -156,7 +158,7 @@ def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -
             continue
         own, off = prior.information.given(keys), prior.offsets(end.estimate)[prior.information.columns(keys)]
         known = end.reduced.shared.less(own), posterior.information.less(own)
-        # What errors that go together, or other lenses, widen beyond what is usual cannot be told without it.
+        # Where correlated errors or other lenses widen it beyond the usual prior, that cannot be subtracted from it.
         sds = [sd for one in known if np.isfinite(sd := float(one.spread.sd[one.columns(keys)][0]))]
         if sds:
             camera = keys[0].owner
@@ -166,10 +168,10 @@ def aspects_alone(end: RobustSolution, problem: Problem, posterior: Posterior) -
 
 
 def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator[str]:
-    """Words about flat targets that some views show from the other side than most, which nobody sees through, and about
-    cameras that see every checkerboard from behind, which no printed one shows: the picture of a plane that is mirrored
-    fits as well as the true one. The latter not where some camera sees a floor, which `require_possible` found to be
-    seen from above: then its pictures are as they should be, and the rows of the boards are counted upwards.
+    """Yield warnings about opaque flat targets that some views show from the other side than most, and about cameras
+    that see every printed checkerboard from behind: the mirrored picture of a plane fits as well as the true one. There
+    is no warning of the second kind where a camera sees a floor, which `require_possible` found to be seen from above:
+    then the pictures are right, and the rows of the boards are counted upwards.
     """
     yield from _seen_from_both_sides(estimate, observations)
     if any(view.placement is None and not observations.targets[view.target].movable for view in observations.views):
@@ -183,7 +185,7 @@ def seen_from_behind(estimate: Estimate, observations: Observations) -> Iterator
 
 
 def _seen_from_both_sides(estimate: Estimate, observations: Observations) -> Iterator[str]:
-    """Of placements that one camera sees alone: where others see it, too, a mirrored list does not fit."""
+    """Check placements that one camera alone sees; where others see them, too, a mirrored list does not fit."""
     seen = Counter(one.placement for one in observations.shown_views)
     alone = {placement for placement in estimate.placements if seen[placement] == 1}
     for name, target in observations.targets.items():
@@ -199,13 +201,13 @@ def _seen_from_both_sides(estimate: Estimate, observations: Observations) -> Ite
 
 
 def _heights_of_cameras(estimate: Estimate, views: Sequence[View]) -> Array:
-    """(V,) m, of the camera of each view in the frame of its target."""
+    """(V,) m, height of each view's camera above its target's plane, in the target's frame."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in views]
     return np.asarray(inverted(estimate.pose_stack(keys))[:, 2, 3])
 
 
 def _worlds_apart(observations: Observations) -> Iterator[str]:
-    """Words about stations that nothing ties to the field, or to each other."""
+    """Yield remarks on stations that nothing connects to the field or to each other."""
     alone = sorted(anchored_stations(observations))
     if len(alone) + any(view.placement is None for view in observations.shown_views) > 1:
         names = ", ".join(map(repr, alone))
@@ -216,7 +218,7 @@ def _worlds_apart(observations: Observations) -> Iterator[str]:
 
 
 def _noisier_cameras(noise: Mapping[str, float]) -> Iterator[str]:
-    """Words about cameras, or what they see, that scatter otherwise than the others, beside what is stated of them."""
+    """Yield remarks on cameras, or what they see, whose noise differs from that of the others beside what is stated."""
     if noise:
         each = ", ".join(f"{name!r} {two_digits(factor)}" for name, factor in noise.items())
         yield (
@@ -232,7 +234,7 @@ def _share_text(share: float) -> str:
 def came_out(
     phi_from: Mapping[str, str], problem: Problem, end: RobustSolution, explanations: Sequence[Explanation] = ()
 ) -> Calibration:
-    """What came out, not assessed."""
+    """Return the calibration of a solve, without a posterior."""
     observations = problem.observations
     out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
     far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
@@ -254,7 +256,7 @@ def came_out(
 
 
 def of_closed_form(start: Start, problem: Problem) -> Calibration:
-    """The paper's own method alone: nothing is minimised."""
+    """Return the calibration by the paper's own method alone: nothing is minimised."""
     from ceres_cal.start.baseline import four_point_baseline
 
     estimate = four_point_baseline(problem.sights, start.estimate)
@@ -266,7 +268,7 @@ def of_closed_form(start: Start, problem: Problem) -> Calibration:
 
 
 def of_all(calibration: Calibration, settled: BulkSolution) -> Calibration:
-    """What came out of all observations, where a part of them decided."""
+    """Return the calibration with the final solve of all observations, where a subset determined outliers and lens."""
     observations, used, scales = settled.observations, settled.used, calibration.fit.scales
     points, curves = used.sums
     sigmas = [own / scale for own, scale in zip(used.sigmas, scales, strict=True)]
@@ -309,14 +311,14 @@ def _fit(end: RobustSolution, layout: Layout) -> Fit:
 
 
 def _rms(values: Array) -> float:
-    """Root mean square; 0 of nothing."""
+    """Root mean square; 0 for an empty array."""
     return float(np.sqrt(values @ values / max(len(values), 1)))
 
 
 def _rejected(
     observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
 ) -> tuple[Rejection, ...]:
-    """The rows of points and of curve observations that did not take part, and how far off they are."""
+    """Return the rows of points and curve observations that did not take part, with how far off they are or why."""
     groups = [one for one in explanations if one.is_taken]
     entries, views, copies = [], observations.views, observations.copies
     for kind, out, far, column, copy_of, first in (

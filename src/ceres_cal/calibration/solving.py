@@ -1,4 +1,4 @@
-"""From a start to a calibration with a named lens: solve, reject, compete, solve for targets as built, assess."""
+"""Calibrate from a start with a named lens: solve, reject, compare explanations, solve for targets as built, assess."""
 
 from __future__ import annotations
 
@@ -62,16 +62,16 @@ if TYPE_CHECKING:
 
 
 class Task(Frozen):
-    """How a problem is solved, and who is told of it.
+    """How a problem is solved, and who is informed.
 
     Attributes:
-        progress: called at every iteration. settle: where the observations are a part, what solves for all of them
-            from the end of the part, see `Bulk.settled`.
-        tested: whether what was stated is held against everything else. knows: whether it is asked what does not belong
-            as a whole, and then what is known of the numbers; bends: and how that bends. chosen: whether the data chose
-            the lens: what one that is too simple leaves looks like a principal point that moves.
-        before: of a calibration that is taken up again, the layout of everything that is known by a posterior, also
-            where the solve holds it. scales: noise scales of points and curves that were seen before it.
+        progress: called at each iteration. settle: where the observations are a subset, solves for all of them from the
+            end of the subset, see `Bulk.settled`.
+        tested: whether each statement is tested against everything else. knows: whether groups are tested for being
+            outliers as a whole, and the posterior is made; bends: whether the posterior includes curvature. chosen:
+            whether the data chose the lens: what too simple a lens leaves looks like a moving principal point.
+        before: in a refit, the layout of all numbers that a posterior knows, including those that the solve holds.
+            scales: noise scales of points and curves from an earlier calibration.
     """
 
     progress: SolveProgress | None = None
@@ -86,12 +86,12 @@ class Task(Frozen):
 
 
 class TaskSolution(Frozen):
-    """A solution of a task, and what explains the observations that it does not fit.
+    """The solution of a task, and what explains the observations that it does not fit.
 
     Attributes:
         explanations: what else groups of observations may be. as_built: how targets were built.
         beside: effects of the table that were solved for. others: further minima.
-        unsteady: what moves single views. digest: of the observations, which remember it, while it is worked out.
+        unsteady: displacements of single views. digest: of the observations, which cache it; computed in a thread.
     """
 
     task: Task
@@ -107,7 +107,7 @@ class TaskSolution(Frozen):
 
     @cached_property
     def leaving_alike(self) -> tuple[str, ...]:
-        """Cameras whose lens leaves the same in one place of all views; one with a formula, in views of placements."""
+        """Cameras whose lens leaves similar residuals in one place of all views; of placements if it has a formula."""
         return tuple(filter(self._leaves_alike, self.end.estimate.cameras))
 
     def _leaves_alike(self, camera: str) -> bool:
@@ -126,25 +126,25 @@ class TaskSolution(Frozen):
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Of the noise of points and curves."""
+        """Noise scales of points and curves."""
         return self.end.problem.weighting.scales
 
     @property
     def came_out(self) -> Calibration:
-        """The calibration, not assessed."""
+        """The calibration, without a posterior."""
         if self.digest is not None:
             self.digest.result()
         return came_out(self.start.phi_from, self.problem, self.end, self.explanations)
 
     @property
     def effects(self) -> tuple[EffectEstimate, ...]:
-        """What was solved for beside the problem."""
+        """Effects that were solved for beside the problem."""
         moving = self.unsteady.estimates(self.problem.observations) if self.unsteady else ()
         return (*moving, *(self.beside.estimates if self.beside else ()))
 
     @property
     def shifts_at(self) -> ShiftsAt | None:
-        """By which numbers scatter besides."""
+        """Returns further contributions to the covariance, as shifts of numbers; None where there are none."""
         beside, anywhere = self.beside, [shifts_as_drawn(self.as_built, self.end)]
         if self.unsteady is not None:
             anywhere.append((self.unsteady.keys, [*self.unsteady.shifts]))
@@ -161,7 +161,7 @@ class TaskSolution(Frozen):
 
     @property
     def as_stated(self) -> TaskSolution:
-        """The answer with everything as it was stated, solved for from where it counted little."""
+        """The solution with everything as it was stated, starting where statements had little weight."""
         if self.task.stated is None:
             return self
         (observations, options), here = self.task.stated, self.end.estimate
@@ -177,7 +177,7 @@ class TaskSolution(Frozen):
         problem = replace(self.problem, sights=sights, layout=layout, options=options, priors=(*every, *others))
         part, elsewhere = taking_part(problem, self.explanations), [as_held(one, options) for one in self.start.others]
         start, is_near = as_held(here, options), layout.size == self.problem.layout.size
-        if not is_near:  # it was moved to what is held: without that another minimum may have been the least
+        if not is_near:  # the start was moved to held numbers; another minimum may have been the least without them
             start, _ = least_of_few(part, start, elsewhere, is_whole=part is problem)
         solver = partial(solve_robustly, usual=self.task.scales, progress=self.task.progress, is_near=is_near)
         end = solve_held(solver, part, start, self.as_built)
@@ -189,7 +189,7 @@ class TaskSolution(Frozen):
 
     @property
     def at_least(self) -> TaskSolution:
-        """At the least of few minima."""
+        """The solution in the least of few minima."""
         end = self.end
         is_whole = end.problem.sights.equations == self.problem.sights.equations
         least, others = least_of_few(end.problem, end.estimate, self.start.others, is_whole=is_whole)
@@ -198,7 +198,7 @@ class TaskSolution(Frozen):
         return replace(self, end=end, others=others)
 
     def doubted_as(self, before: TaskSolution) -> TaskSolution:
-        """With the less probable of two explanations as far off as it was before all was stated."""
+        """Return a copy in which the less probable of two explanations is as far off as before all was stated."""
         if before.task.stated is None:
             return self
         there, here, keys = before.end.estimate, self.end.estimate, self.end.information.shared.keys
@@ -210,7 +210,7 @@ class TaskSolution(Frozen):
         return replace(self, explanations=tuple(doubted))
 
     def without(self, conflicts: Conflicts) -> TaskSolution:
-        """The answer without what was stated and everything else contradicts."""
+        """Return the solution without the statements that everything else contradicts."""
         if conflicts.answer is None:
             return self
         problem = replace(self.problem, priors=conflicts.answer.problem.priors)
@@ -219,7 +219,7 @@ class TaskSolution(Frozen):
 
 
 def solved_from(task: Task, start: Start, problem: Problem) -> Calibration:
-    """Solve and explain what is left, set aside what was stated and is contradicted, assess, from a start.
+    """Solve from a start, explain what is left, set aside contradicted statements, and assess.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -228,8 +228,8 @@ def solved_from(task: Task, start: Start, problem: Problem) -> Calibration:
 
 
 def explained(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
-    """Solve and explain what is left; see `solved_from`."""
-    long_to_digest = 20_000  # observations: fewer take less than a thread, and what makes one
+    """Solve and explain the residuals; see `solved_from`."""
+    long_to_digest = 20_000  # observations: fewer take less time than a thread and what it needs
     takes_long = problem.observations.rows > long_to_digest
     digest = meanwhile(lambda: problem.observations.digest) if takes_long and task.settle is None else None
     seen, may_move = _solved(task, start, problem, built), task.chosen and not task.settle
@@ -242,7 +242,7 @@ def explained(task: Task, start: Start, problem: Problem, built: Construction) -
 
 
 def known_of(seen: TaskSolution) -> Calibration:
-    """Set aside what was stated and is contradicted, and assess; see `solved_from`."""
+    """Set aside contradicted statements, and assess; see `solved_from`."""
     task, conflicts = seen.task, Conflicts()
     before, seen = seen, seen.as_stated
     near = before.end if task.stated else None
@@ -286,18 +286,19 @@ def known_of(seen: TaskSolution) -> Calibration:
 
 
 def _made_steady(first: TaskSolution, problem: Problem) -> TaskSolution | None:
-    """With what displaces single views taken off, and again as it is found then; None where nothing does.
+    """Subtract displacements of single views and solve again as in the first solve; None where there are none.
 
-    It is looked for before groups are asked whether they belong, which it displaces, and after them, for of few views
-    it is hidden by how their target is built. The lens stays as long as it was: one that grew beside what was taken off
-    predicted other views of a stabilised camera worse by a seventh, and a rolling shutter's halves took a minute each.
-    At rest the predictions follow the noise: halves differ by 1.7 of what is stated where they do by 1.4 after twice.
+    They are sought before groups are tested for being outliers, because they displace groups, and again afterwards,
+    because in few views the target as built hides them. The lens keeps its length: a lens that grew beside them
+    predicted other views of a stabilised camera worse by a seventh, and halves with a rolling shutter took a minute
+    each. After convergence predictions follow the noise: halves differ by 1.7 of what is stated, after two rounds by
+    1.4.
     """
     twice = 2
     task, seen, unsteady = first.task, first, None
     for _ in range(twice):
         unsteady = find_unsteady(seen.problem, seen.end, unsteady)
-        if unsteady is None:  # or what seemed to move was what the lens or the target left
+        if unsteady is None:  # what seemed to move was due to the lens or the target
             return None
         start = replace(seen.end.estimate, structure=first.start.estimate.structure)
         named = first.problem.options
@@ -311,7 +312,7 @@ def _made_steady(first: TaskSolution, problem: Problem) -> TaskSolution | None:
 
 
 def _solved(task: Task, start: Start, problem: Problem, built: Construction) -> TaskSolution:
-    """Solve, reject, solve: nothing else is explained yet, and targets are drawn as they seemed to be built."""
+    """Solve, reject outliers, solve again. Residuals are not yet explained; targets are as `built`."""
     problem = replace(problem, sights=built.held(problem.sights))
     end = solve_robustly(problem, start.estimate, task.scales, task.progress, is_near=start.is_near)
     seen = TaskSolution(task, problem, start, end)
@@ -322,13 +323,13 @@ def _solved(task: Task, start: Start, problem: Problem, built: Construction) -> 
 
 
 def _explained(first: TaskSolution, drawn: Sights, built: Construction) -> TaskSolution:
-    """Let explanations compete; solve for targets as built, where they are drawn otherwise, and for effects."""
+    """Compare explanations of groups; solve for targets as built, where they differ from drawings, and for effects."""
     task = first.task
 
     def solved(others: Problem, some: Subproblem) -> RobustSolution:
         return solve_robustly(others, _start_of(others, some, first), task.scales)
 
-    # These solves begin with lenses that are about as smooth as the data say. What is held is judged without that.
+    # These solves start with lenses about as smooth as the data say. Explanations are judged without held smoothness.
     smooth = replace(first.problem, smoothness=first.end.problem.smoothness)
     end, explanations = compete(smooth, first.end, solved) if task.knows else (first.end, ())
     seen = replace(first, problem=replace(smooth, sights=drawn), end=end, explanations=explanations)
@@ -340,7 +341,7 @@ def _explained(first: TaskSolution, drawn: Sights, built: Construction) -> TaskS
 
 
 def _of_targets(seen: TaskSolution, solved: Solver, built: Construction) -> TaskSolution:
-    """With targets as they were built, beside the effects that have a prior, at the least of few minima."""
+    """Solve for targets as built, beside effects that have a prior, in the least of few minima."""
     problem, end, explanations, as_built, beside = seen.problem, seen.end, seen.explanations, seen.as_built, seen.beside
     is_asked, views = problem.options.as_built == "estimate", seen.unsteady.of_views if seen.unsteady else None
     if is_asked:
@@ -356,7 +357,7 @@ def _of_targets(seen: TaskSolution, solved: Solver, built: Construction) -> Task
 
 
 def _known(seen: TaskSolution, conflicts: Conflicts) -> tuple[TaskSolution, Posterior]:
-    """What is known of every number, with what the lens hides and whatever else may be."""
+    """Return the posterior of every number, widened by what the lens hides, with all other possibilities included."""
     end, posterior = _assess(seen)
     is_new = seen.task.before is None
     if is_new:
@@ -368,9 +369,9 @@ def _known(seen: TaskSolution, conflicts: Conflicts) -> tuple[TaskSolution, Post
 
 
 def _assess(seen: TaskSolution) -> tuple[RobustSolution, Posterior]:
-    """What is known of every number, by the observations that took part at the noise that they show.
+    """Return the posterior by the observations that took part, at their estimated noise, and the solution.
 
-    Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
+    Where the observations leave phi so open that the least cost is at no valid lens, the estimate is another one.
     """
     end, before = seen.end, seen.task.before
     known = end.problem if before is None else replace(end.problem, layout=before)
@@ -388,7 +389,7 @@ def _assess(seen: TaskSolution) -> tuple[RobustSolution, Posterior]:
 
 
 def _start_of(others: Problem, some: Subproblem, first: TaskSolution) -> Estimate:
-    """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
+    """Return a start independent of the other observations; in a refit and for the world it is the first start."""
     alike = set(others.sights.keys) == set(some.problem.sights.keys)
     if first.task.before is not None or not alike or all(key.placement is None for key in others.sights.keys):
         return first.start.estimate  # that of the world was found with what does not belong among the rest
@@ -396,10 +397,10 @@ def _start_of(others: Problem, some: Subproblem, first: TaskSolution) -> Estimat
 
 
 def _as_long_as_asked(seen: TaskSolution) -> TaskSolution:
-    """With the lenses that the residuals ask for where nothing is stated of their powers.
+    """Solve with the lenses that the residuals require, where the options leave the powers open.
 
-    A lens without a formula has all of its terms where residuals of different views agree from place to place. How
-    large their numbers are the data say in any case (`effects/smoothness.py`): they cost time.
+    A lens without a formula gets all of its terms where residuals of different views agree from place to place. The
+    sizes of their numbers are estimated in any case (`effects/smoothness.py`), but they cost time.
     """
     each = {name: seen.problem.options.of_camera(name) for name in seen.problem.layout.free}
     if all(one.powers for one in each.values()):
@@ -425,25 +426,25 @@ def _as_long_as_asked(seen: TaskSolution) -> TaskSolution:
 
 
 def _named(problem: Problem) -> Problem:
-    """The same with the powers of its lenses stated."""
+    """Return the problem with the powers of its lenses stated."""
     each = {name: problem.options.of_camera(name) for name in problem.layout.free}
     named = {name: replace(one, powers=one.blank_lens.powers or one.powers) for name, one in each.items()}
     return replace(problem, options=problem.options.with_lenses(named))
 
 
 def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
-    """The estimate with the lenses of the options, each of which holds its own."""
+    """Return the estimate with the lenses of the options, which contain its own."""
     cameras = dict(estimate.cameras)
     for name, camera in cameras.items():
         one = options.of_camera(name)
         lens = make_lens(one.lens, one.blank_lens.powers, camera.lens.coefficients, one.terms)
-        # Its own span is set, and nothing else is asked for.
+        # This only sets the lens's own span.
         cameras[name] = replace(camera, lens=lens.spanning(0.0, camera.phi, 1.0, camera.image_size))
     return replace(estimate, cameras=cameras)
 
 
 def _shows_all(end: RobustSolution) -> bool:
-    """Whether no lens folds inside what was observed."""
+    """Return whether no lens folds inside the observed part of the image."""
     sights = end.problem.sights
     cameras = end.estimate.cameras.items()
     return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)

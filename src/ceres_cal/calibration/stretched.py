@@ -1,8 +1,8 @@
-"""Pictures that were stretched one way: what a camera whose pixels are square by what is usual alone may be instead.
+"""Pictures stretched in one direction: an alternative for a camera whose pixels are square only by the usual prior.
 
-A view of a field tells fy / fx to a hundredth, beside its tilt and middle; that pixels are square is known to .0005 of
-cameras, but some pictures were stretched. From 1 the solve does not come to another aspect: what is usual holds it
-there up to some 13 standard deviations. So the calibration with any aspect is made as well, where that is likely.
+A view of a field determines fy / fx to a hundredth, beside tilt and principal point. Pixels of cameras are square to
+.0005, but some pictures were stretched. A solve that starts at 1 does not reach another aspect: the usual prior holds
+it there up to some 13 standard deviations. So a calibration with a free aspect is made as well, where that is likely.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from ceres_cal.calibration.likelier import likelier
 from ceres_cal.observations import Observations
 from ceres_cal.problem.priors import USUAL_ASPECT
 
-# Of pictures, the share that was stretched one way, and the standard deviation of by how much: a guess, for nobody has
-# counted them. At a share of .05 one of twelve square views was known four times worse, at .01 more stretched ones were
-# trusted.
+# Share of pictures that were stretched in one direction, and the standard deviation of the stretch: a guess, because
+# nobody has counted them. At a share of .05 one of twelve square views was known four times worse; at .01 more
+# stretched ones were trusted.
 _STRETCHED, _BY = 0.03, 0.05
-# The same by what the solve with square pixels says, from which on another is made: that is to first order, and said
-# .994 +- .003 of a picture stretched to .975.
+# The probability of stretching by the solve with square pixels from which on another solve is made. It is low because
+# that solve says it only to first order: .994 +- .003 for a picture stretched to .975.
 _WORTH_A_SOLVE = 0.01
 
 
 def beside_stretched(
     square: Calibration, observations: Observations, with_any_aspect: Callable[[], Calibration]
 ) -> Calibration:
-    """The likelier one of a calibration with square pixels and of that with any, the other in what is known of it as
-    far as it is probable.
+    """Return the likelier of a calibration with square pixels and one with any aspect, with the other as a component of
+    its posterior by its probability.
     """
     if _probability(square.aspects_alone) < _WORTH_A_SOLVE or square.posterior is None:
         return square
@@ -42,14 +42,14 @@ def beside_stretched(
 
 
 def _told(any_: Calibration, camera: str) -> tuple[float, float]:
-    """The aspect of a camera and its standard deviation, where nothing is known of it beforehand."""
+    """Return the aspect of a camera and its standard deviation, where no prior on it exists."""
     told = any_.uncertainty.verdict("camera", camera, "aspect")
     return told.value, told.sd
 
 
 def _probability(alone: Mapping[str, tuple[float, float]]) -> float:
-    """That pictures were stretched, by what the observations alone say: those of one camera, or all in the same way, as
-    one kind of camera and of converter would have it.
+    """Return the probability that pictures were stretched, by what the observations alone say: those of one camera, or
+    all in the same way, as with one type of camera and converter.
     """
     told = np.array([[value, sd] for value, sd in alone.values() if np.isfinite(sd) and sd > 0.0])
     if not len(told):
@@ -61,13 +61,13 @@ def _probability(alone: Mapping[str, tuple[float, float]]) -> float:
 
 
 def _of_one(value: float, variance: float) -> float:
-    """The same of one aspect, by how much likelier it is in a picture stretched by any; 0 where that is more than
-    pictures are stretched by, as of lines that wander by pixels (1.19 +- .03 of a cropped photograph).
+    """Return this probability for one aspect, by its likelihood with a random stretch; 0 where it is farther from 1
+    than pictures are stretched, as from lines that wander by pixels (1.19 +- .03 in a cropped photograph).
 
     Args:
-        variance: by which it differs from 1 where pixels are square, of what is usual and of the observations.
+        variance: of the aspect's difference from 1 with square pixels, by the usual prior and the observations.
     """
-    farthest = 2.0  # standard deviations of by how much
+    farthest = 2.0  # standard deviations of the stretch
     if abs(value - 1.0) > farthest * _BY:
         return 0.0
     stretched = variance + _BY**2
