@@ -1,4 +1,4 @@
-"""Observations out of images, with OpenCV."""
+"""Observations from images, by OpenCV."""
 
 from ceres_cal.base.frozen import names_of
 

@@ -1,6 +1,6 @@
-"""Kalibr's AprilGrids in images: tags found by OpenCV, their corners measured as the saddles that they are.
+"""Kalibr's AprilGrids in images: OpenCV finds the tags, and their corners are measured as saddles.
 
-At each corner of a tag a small dark square meets it, so that the picture there is a chessboard's.
+A small dark square touches each corner of a tag, so the picture there looks like a chessboard's corner.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ _CORNERS = ((0, 0), (0, 1), (1, 1), (1, 0))  # row and column within a tag, in O
 
 
 def measured_april_grid(image: Image, levels: Image8, board: Target) -> Array | str:
-    """Corners (2 rows, 2 columns, 2) px, NaN where one was not seen, or why there are none."""
-    border_bits = (2, 1)  # of dark cells around a tag's code: Kalibr's own, and others' grids
+    """Return the corners (2 rows, 2 columns, 2) px, NaN where one was not seen, or the reason why there are none."""
+    border_bits = (2, 1)  # width of the dark border around a tag's code, in cells: Kalibr's own, and other makers'
     columns, rows = board.spec["columns"], board.spec["rows"]
     found = max((_tags(levels, bits, columns * rows) for bits in border_bits), key=len)
     if len(found) < 2:
         return f"{len(found)} of {columns * rows} tags found"
     places = board.point_array[:, :2].reshape(2 * rows, 2 * columns, 2)
-    # Which corner of a tag is its first differs between libraries: the others' places tell.
+    # Libraries differ in which corner of a tag is the first. The right choice is the one that fits the board's
+    # geometry.
     grids = [_grid(found, columns, rows, first) for first in range(4)]
     grid = min(grids, key=lambda one: _misfit(one, places))
     return measure_saddles(image, grid).grid
 
 
 def _tags(image: Image8, border_bits: int, count: int) -> dict[int, Array]:
-    """Corners (4, 2) px of each tag by its number."""
+    """Return the corners (4, 2) px of each tag, by the tag's number."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -42,7 +43,9 @@ def _tags(image: Image8, border_bits: int, count: int) -> dict[int, Array]:
 
 
 def _grid(found: dict[int, Array], columns: int, rows: int, first: int) -> Array:
-    """The corners as a grid from the top left, where a tag's top left corner is OpenCV's `first`."""
+    """Arrange the corners as a grid from the top left; `first` is the index of a tag's top left corner in OpenCV's
+    order.
+    """
     grid = np.full((2 * rows, 2 * columns, 2), np.nan)
     for number, seen in found.items():
         column, row = number % columns, rows - 1 - number // columns

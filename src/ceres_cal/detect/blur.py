@@ -1,4 +1,4 @@
-"""By how much a photograph is blurred, and smeared where the camera moved, across the lines in each direction."""
+"""Blur of a photograph, and smear where the camera moved, across the lines in each direction."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from ceres_cal.detect.profiles import (
     fit_shape,
 )
 
-_WINDOWS = 150  # that tell a blur
-# Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
-# windows that count as much as no direction having any.
+_WINDOWS = 150  # number of windows from which a blur is estimated
+# Lines are grouped into 4 sectors of direction, because the blur differs between directions where the camera moved. A
+# sector needs 12 windows for a blur of its own. _ALIKE is the weight, in windows, of the assumption that blur does not
+# depend on direction.
 _SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
 
-# Of what coma draws lines aside, what is left, of all of them alike: with 0.4 errors are 0.8 of what is stated, at most
-# 1.5 of 40 pictures.
+# Share of the displacement by coma that may remain after its correction, common to all lines. With 0.4 errors are 0.8
+# of the stated standard deviation, and at most 1.5 of it among 40 pictures.
 _OF_COMA = 0.4
 
 
@@ -33,9 +34,10 @@ class Blur(Rows):
     """What makes the lines wider at N places.
 
     Attributes:
-        blur_px: (N,) standard deviation of a Gaussian, lens and pixel together. smear_px: (N,) how far beside it a
-            camera that moved, or coma, smears them. stretch: the paint's width over what the target says. lean: (N,) of
-            the smear, to which end it holds more.
+        blur_px: (N,) standard deviation of a Gaussian that stands for lens and pixel together.
+        smear_px: (N,) length of the additional smear, by camera motion or coma.
+        stretch: ratio of the paint's width to the width that the target states.
+        lean: (N,) asymmetry of the smear, from -1 to 1: the end that has more of the light.
     """
 
     blur_px: Array
@@ -45,18 +47,20 @@ class Blur(Rows):
 
     @property
     def usual_px(self) -> float:
-        """Standard deviation of all that."""
+        """Root mean square over all places of the standard deviation of blur and smear together, px."""
         return float(np.sqrt(np.mean(self.blur_px**2 + self.smear_px**2 / 12.0)))
 
     def fitted(self, windows: Windows, course: Course) -> Profiles:
-        """What fits the windows of these places best."""
+        """Fit the profile model to the windows of these places."""
         reach_px, edges = 1.5, self.stretch * course.edges
         return fit_profiles(windows, edges, self.blur_px, reach_px, self.smear_px, self.lean)
 
     def smeared(self, rows: Indices) -> EdgeShape:
-        """What these places look like if what is beyond a lens's blur is a smear."""
-        in_focus_px = 1.0  # of a lens: what is blurred more in every direction is smeared
-        as_smeared = 2.5  # of the Gaussian that suits a smeared line best: the smear that it is
+        """Return the shape of these places under the assumption that all blur beyond the lens's own is smear."""
+        # px, the largest blur of a lens in focus: a larger blur in every direction is taken for smear
+        in_focus_px = 1.0
+        # length of a smear over the standard deviation of the Gaussian that fits the smeared line best
+        as_smeared = 2.5
         lens = min(float(np.min(self.blur_px)), in_focus_px)
         here = median(self.blur_px[rows])
         smear = as_smeared * np.sqrt(max(here**2 - lens**2, 0.0))
@@ -64,16 +68,16 @@ class Blur(Rows):
 
 
 def no_blur(count: int) -> Blur:
-    """Of so many places, before any is known."""
+    """Return the blur of so many places before it has been estimated: 0 everywhere."""
     return Blur(np.zeros(count), np.zeros(count), 1.0, np.zeros(count))
 
 
 def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Blur:
-    """What all windows of a direction share, and what lies between directions.
+    """Estimate the blur that windows of one direction share, and interpolate between directions.
 
     Args:
-        bright: (N,) how much brighter than its surroundings each place is. before: as Gaussians alone have it, where a
-            smear is to be told from them; `no_blur` where they are to be told.
+        bright: (N,) how much brighter than its surroundings each place is, grey levels.
+        before: the result with Gaussians alone, from which a smear is estimated; `no_blur` to estimate the Gaussians.
     """
     angle = np.mod(np.arctan2(course.normals[:, 1], course.normals[:, 0]), np.pi)
     rows = np.flatnonzero(windows.inside)
@@ -96,18 +100,22 @@ def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Bl
 def with_coma(
     windows: Windows, course: Course, blur: Blur, fits: Profiles, size: tuple[int, int]
 ) -> tuple[Blur, float] | None:
-    """The same of a lens with coma, whose light is drawn out ever farther towards the picture's rim, and the share of
-    what that draws lines aside that may remain, 1 where it is not told to which side; None of others.
+    """Return the blur of a lens with coma, and the share of the displacement by coma that may remain; None without
+    coma.
 
-    It leans outwards, or inwards: windows must say which, since what is only blurred more at the rim suits either as
-    well. Then two shapes are tried, that grow with the radius or its square: what is drawn out along the radius alone,
-    as by lateral colour, and coma's own, of which lines in all directions have the third moment of a shift along it.
+    Coma smears light more and more towards the picture's rim. The share is 1 where the direction of the asymmetry
+    cannot be determined. The smear leans outwards or inwards, and the windows must show which, since a blur that merely
+    grows towards the rim fits either way equally well. Then two shapes are tried, each growing with the radius or its
+    square: a smear along the radius alone, as by lateral colour, and coma's own, for which lines in all directions have
+    the third moment of a shift along the radius.
 
     Args:
-        fits: by an even blur. size: of the picture, height and width.
+        fits: fits with a symmetric blur.
+        size: height and width of the picture, px.
     """
-    # Standard deviations, in the dark up to 2.6 and of coma from 6.7; of half the diagonal; windows that tell whether
-    # it is worth while, and the length that is.
+    # surely: standard deviations; dark pictures without coma reach 2.6, coma starts at 6.7. outer: share of half the
+    # diagonal. few: number of windows for a first estimate of the smear's length; below least_px coma is not worth
+    # modelling.
     surely, outer, few, least_px = 4.5, 0.2, 50, 1.6
     across, radius = from_middle(course, size)
     rows = _some(np.flatnonzero(np.isfinite(fits.offset_px) & (np.abs(across) > outer)))
@@ -126,24 +134,26 @@ def with_coma(
 
 
 def from_middle(course: Course, size: tuple[int, int]) -> tuple[Array, Array]:
-    """(N,) how far from the picture's middle places are along their normals, and in all, in half diagonals."""
+    """Return (N,) the distance of places from the picture's middle along their normals, and (N,) in all, in half
+    diagonals.
+    """
     offsets = (course.pixels - 0.5 * (np.array(size[::-1]) - 1.0)) / (0.5 * np.hypot(*size))
     return np.asarray(np.sum(offsets * course.normals, axis=1)), np.asarray(np.linalg.norm(offsets, axis=1))
 
 
 def _sigmas(differences: Array) -> float:
-    """How many of its standard deviations a mean is above 0."""
+    """Return the mean of the differences in units of its standard deviation."""
     return float(np.mean(differences) / max(float(np.std(differences)), 1e-9) * np.sqrt(len(differences)))
 
 
 def _drawn_out(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, Array]:
-    """What is drawn out by as much and to where `along` (N,) says, and the logarithms (R,) of what it leaves."""
+    """Fit a smear of length and direction proportional to `along` (N,); return it and log misfits (R,) of `rows`."""
     drawn, _ = _coma_shape(windows, course, blur, rows, along)
     return drawn, np.log(drawn.take(rows).fitted(windows.take(rows), course.take(rows)).noise)
 
 
 def _coma_shape(windows: Windows, course: Course, blur: Blur, rows: Indices, along: Array) -> tuple[Blur, float]:
-    """The same, and how far the farthest is drawn out, px."""
+    """Fit a smear proportional to `along` (N,) to `rows`; return the blur and the longest smear, px."""
     start = EdgeShape(min(blur.usual_px, 1.0), blur.stretch, 3.0)
     shape = fit_shape(windows.take(rows), course.edges[rows], start, along=along[rows])
     smear = shape.smear_px * np.abs(along)
@@ -151,7 +161,7 @@ def _coma_shape(windows: Windows, course: Course, blur: Blur, rows: Indices, alo
 
 
 def _by_direction(angle: Array, bright: Array, rows: Indices) -> list[Indices]:
-    """Of these rows those that are surely on paint, sorted by direction, of those that have enough; none of one."""
+    """Group the rows that are surely on paint by direction; return groups with enough rows, or none if only one has."""
     sector = np.floor(angle[rows] / np.pi * _SECTORS + 0.5) % _SECTORS
     own = [_brightest(bright, rows[sector == number]) for number in distinct(sector)]
     own = [some for some in own if len(some) >= _FEWEST_IN_SECTOR]
@@ -159,8 +169,8 @@ def _by_direction(angle: Array, bright: Array, rows: Indices) -> list[Indices]:
 
 
 def _between(angle: Array, own: list[Indices], shapes: list[EdgeShape]) -> tuple[Array, Array]:
-    """Blur and smear (N,) at all angles: squared they are a + b cos 2t + c sin 2t, as ellipses and ways are across a
-    line in direction t.
+    """Interpolate blur and smear (N,) to all angles t. Their squares are a + b cos 2t + c sin 2t, as the extent of an
+    ellipse or of a motion is across a line in direction t.
     """
     count = np.array([float(min(len(some), _WINDOWS)) for some in own])
     squares = np.array([(one.blur_px, one.smear_px) for one in shapes]) ** 2
@@ -174,8 +184,9 @@ def _between(angle: Array, own: list[Indices], shapes: list[EdgeShape]) -> tuple
 
 
 def _brightest(bright: Array, rows: Indices) -> Indices:
-    """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction. Where the
-    photograph has no bright place, the brightest fifth: half of a negative quantile would be above all of them.
+    """Return those of the rows that are surely on paint; what a moving camera smears is fainter in one direction. In a
+    photograph without any bright place these are the brightest fifth: half of a negative quantile would exceed all of
+    them.
     """
     fifth = quantile(bright[rows], 0.8)
     return rows[bright[rows] >= min(0.5 * fifth, fifth)]
@@ -191,5 +202,5 @@ def _shape_of(windows: Windows, edges: Array, rows: Indices, start: EdgeShape) -
 
 
 def _some(rows: Indices, most: int = _WINDOWS) -> Indices:
-    """Of many rows as many as tell a blur, evenly."""
+    """Return an evenly spread subset of the rows, `most` at most."""
     return np.asarray(rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)])

@@ -1,4 +1,4 @@
-"""Boards in image files, as observations: corners of chessboards, ChArUco boards and markers, centres of circles.
+"""Observations of boards in image files: corners of chessboards, ChArUco boards and markers, centres of circles.
 
 OpenCV finds the board; its sub-pixel search, `saddles` or `markers` then measures every corner.
 """
@@ -31,24 +31,26 @@ _HINTS = {
     **dict.fromkeys(_CHECKERED, " (count the corners between squares, not the squares)"),
     **dict.fromkeys(("circle-grid", "april-grid", "markers"), ""),
 }
-# Of (width + height)^2, the share that counts as pixels: more than there are from sides of 1 : 14 on, longer than any
-# camera's picture.
+# (width + height)^2 / _LONG counts as the number of pixels of a long image. That exceeds width x height only from sides
+# of 1 : 14 on, longer than any camera's picture.
 _LONG = 16
-_LEAST_SIDE_PX = 8  # three squares of less than 3 px show no corner
+_LEAST_SIDE_PX = 8  # px, the shorter side of an image to search: three squares of less than 3 px show no corner
 _ADAPTIVE = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-# Where a board is looked for first: of 62 real boards as many are found so as at full size, in a fifth of the time; but
-# no smaller than leaves corners to a few pixels. Less than half of the pixels are saved in no time.
+# Number of pixels, and smallest scale, at which a board is searched first. On 62 real boards this finds as many as full
+# size does, in a fifth of the time. A smaller scale would not locate corners to a few pixels. Saving less than half of
+# the pixels saves no time.
 _FAST_PX, _FAST_SCALE = 2e5, 1.0 / 3.0
-_LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
-_MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
-_SAMPLED = 4  # each such row and column tells how bright a picture is
-_SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
-_UNEVEN = 0.45  # natural logarithm: 1.57 times; a skipped square makes 2, perspective on three squares hardly 1.3
-_SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
+_LARGE_PX = 2e6  # pixels; larger images are searched at this size first, which is faster and has less noise and blur
+_MOST_PX = 1.6e7  # pixels, the largest size searched: on noise OpenCV takes minutes, and 50 MB for every megapixel
+_SAMPLED = 4  # every 4th row and column is used to measure the range of a picture's brightness
+_SUBPIX_HALF_WINDOW_PX = 5  # upper limit; a third of the spacing keeps neighbouring corners out of the window
+# log of the ratio of successive steps (1.57 times): a skipped square makes 2, perspective on three squares hardly 1.3
+_UNEVEN = 0.45
+_SMALL_PX = 2e6  # pixels; smaller images are searched at twice their size, too: their squares may be few pixels wide
 
 
 class BoardDetections(Frozen, eq=True):
-    """What `detect_boards` found.
+    """Result of `detect_boards`.
 
     Attributes:
         observations: one view per image that shows the board.
@@ -70,17 +72,17 @@ def detect_boards(
     corner_fit: str = "saddle",
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
-    """Corners of a chessboard, a ChArUco board or markers, or centres of circles, of one camera's images.
+    """Detect corners of a chessboard, a ChArUco board or markers, or centres of circles, in the images of one camera.
 
-    Each image is one view; its frame is the file's stem, its placement too (with as much of the folders as tells
-    equal stems apart) unless the target is the world, as markers on the floor are. Corners are named so that the
-    labelling is never mirrored: a board's x along columns, y along rows and z away from the camera. Which end of a
-    plain chessboard is "0,0" is settled where its picture says so, by columns + rows being odd: then the square between
-    "0,0" and "1,1" is dark; otherwise x goes to the right of the picture rather than to the left. Of one turned by a
-    right angle the name may be the other one, which the placement takes up, but not how a board is bent.
+    Each image is one view; its frame is the file's stem. So is its placement (with as many folders as are needed to
+    distinguish equal stems), unless the target is the world, as markers on the floor are. Corners are named so that the
+    labelling is never mirrored: a board's x is along columns, y along rows and z away from the camera. Which end of a
+    plain chessboard is "0,0" can be seen only if columns + rows is odd: then the square between "0,0" and "1,1" is
+    dark. Otherwise x points to the right of the picture rather than to the left. A board that is turned by a right
+    angle may get the other name; its placement absorbs that, but the shape of a bent board does not.
 
-    `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. What an
-    unflat board and an unmodelled lens add to it is up to ten times that in real sets, and only the solve can tell.
+    `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. A board that
+    is not flat and an unmodelled lens add up to ten times that in real sets, which only the solve can determine.
 
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
@@ -88,12 +90,12 @@ def detect_boards(
         board: a target of kind checkerboard, charuco, circle-grid, april-grid or markers. All but a checkerboard and
             circles may be partly seen.
         camera: name of the camera.
-        station: name of the station, that of the camera by default.
-        corner_fit: of a checkerboard, one of CORNER_FITS: "saddle" fits a blurred saddle to each corner, as of other
-            boards always: about four times more precise on rendered boards (0.005 px against 0.02), and without
-            cornerSubPix's shift towards the middle of its window; boards may reach out of the picture, as long as it
-            tells which corners are seen. "opencv" measures with cornerSubPix, as the peers do, so that results
-            compare; boards are seen whole.
+        station: name of the station; by default that of the camera.
+        corner_fit: one of CORNER_FITS, for a checkerboard. "saddle" fits a blurred saddle to each corner, as is always
+            done for other boards. It is about four times more precise on rendered boards (0.005 px against 0.02), has
+            no shift towards the middle of a window as cornerSubPix has, and measures boards that reach out of the
+            picture, if it shows which corners are seen. "opencv" measures with cornerSubPix, as other calibrators do,
+            so that results compare; boards must be seen whole.
         progress: called after each image.
 
     Raises:
@@ -104,11 +106,11 @@ def detect_boards(
     paths = [Path(path) for path in images]
     find = finder_of(board, corner_fit)
     placements = _placement_names(paths) if board.movable else dict.fromkeys(paths)
-    # OpenCV's marker detectors keep a state that threads would share.
+    # OpenCV's marker detectors keep state, which threads would share.
     each = in_turn if board.kind == "checkerboard" else map
     size, grids, missed = _find_all(paths, find, each, progress)
     refuting = [one for one in missed if NO_PLACE in one[1]]
-    if len(grids) <= len(refuting):  # what few images show of a board that others refute is no such board
+    if len(grids) <= len(refuting):  # a board that more images refute than show is not this board
         missed = [*refuting, *(one for one in missed if one not in refuting)]
         seen = _markers_instead(board, Path(missed[0][0]))
         reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}{seen}"
@@ -130,13 +132,15 @@ def _what(board: Target) -> str:
 Finder = Callable[[Image], Array | str]
 """Image -> measured grid (rows, columns, 2) px, NaN where a corner was not seen, or the reason why there is none."""
 EachImage = Callable[[Callable[[Path], Any], Sequence[Path]], Iterator[Any]]
-"""What a function makes of each image, in their order."""
+"""Function that yields the result of its first argument for each image, in the order of the images."""
 
 
 def _find_all(
     paths: Sequence[Path], find: Finder, each: EachImage, progress: ImageProgress | None
 ) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
-    """The images' (width, height), the grid in each image that shows the board, and (path, reason) of the others."""
+    """Return the images' (width, height), the grid in each image that shows the board, and (path, reason) of the
+    others.
+    """
     size = (0, 0)
     grids: dict[Path, Array] = {}
     missed: list[tuple[str, str]] = []
@@ -162,7 +166,7 @@ def _find_all(
 
 
 def _markers_instead(board: Target, path: Path) -> str:
-    """What to say where a chessboard was not found and markers are."""
+    """Return an addition to the error message for an image that shows markers instead of the chessboard; else ""."""
     if board.kind != "checkerboard":
         return ""
     from ceres_cal.detect.markers import dictionary_shown
@@ -175,7 +179,7 @@ def _markers_instead(board: Target, path: Path) -> str:
 
 
 def finder_of(board: Target, corner_fit: str = "saddle") -> Finder:
-    """What finds a board in an image; InputError for no board, too small a one, or unknown markers."""
+    """Return a function that finds a board in an image; InputError for no board, too small a one or unknown markers."""
     if board.kind == "circle-grid":
         from ceres_cal.detect.circles import measured_circles
 
@@ -206,7 +210,7 @@ def _charuco_finder(board: Target, grid: Grid) -> Finder:
     from ceres_cal.scene.targets.charuco_boards import opencv_board
 
     detector = cv2.aruco.CharucoDetector(opencv_board(board.spec))
-    margin = 0.5 * (1.0 - board.spec["marker_m"] / grid.spacing_m)  # white around a marker, in squares
+    margin = 0.5 * (1.0 - board.spec["marker_m"] / grid.spacing_m)  # width of the white rim around a marker, in squares
     # The disc around a corner must end before the markers on both sides of it begin.
     reach = min(REACH, float(np.sqrt(2.0)) * margin)
 
@@ -241,15 +245,17 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
 
 
 def _is_upright(grid: Array) -> bool:
-    """Whether x goes to the right and y down rather than the other way: of boards that look alike when they are turned,
-    one that is not as flat as drawn is the same in all views only where all name its corners alike.
+    """Whether x points to the right and y down rather than the other way. It matters for boards that look alike when
+    turned: the shape of a board that is not flat is the same in all views only if all of them name its corners alike.
     """
     along_row, along_column = (np.mean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))
     return bool(along_row[0] + along_column[1] > 0.0)
 
 
 def _as_whole(image: Image, seen: Array | None) -> list[tuple[Array, Saddles]]:
-    """What was found, and its corners as they are measured, where it is a whole board; nothing where it is none."""
+    """Return the grid that was found and its measured corners, in a list that is empty if the grid is not a whole
+    board.
+    """
     if seen is None or not _is_even(seen):
         return []
     measured = measure_saddles(image, right_handed(seen))
@@ -257,7 +263,7 @@ def _as_whole(image: Image, seen: Array | None) -> list[tuple[Array, Saddles]]:
 
 
 def _subpixel(image: Image8, grid: Array) -> Array:
-    """OpenCV's sub-pixel corners, in a window that holds no other corner."""
+    """Refine corners by OpenCV's sub-pixel search, in a window that holds no other corner."""
     half = int(np.clip(np.min(steps_px(grid)) / 3.0, 2, _SUBPIX_HALF_WINDOW_PX))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     corners = grid.reshape(-1, 1, 2).astype(np.float32)
@@ -266,37 +272,39 @@ def _subpixel(image: Image8, grid: Array) -> Array:
 
 
 def right_handed(grid: Array) -> Array:
-    """A whole grid (rows, columns, 2) px, its columns in reverse where rows x columns made a mirrored board of it."""
+    """Return a whole grid (rows, columns, 2) px, its columns reversed if rows x columns made it a mirrored board."""
     along_row, along_column = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
     turn = along_row[..., 0] * along_column[..., 1] - along_row[..., 1] * along_column[..., 0]
     return grid[:, ::-1] if np.sum(turn) < 0.0 else grid
 
 
 def _found_fast(image: Image8, columns: int, rows: int) -> Array | None:
-    """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's fast finder in a smaller picture, else in the
-    whole one: most boards that are seen whole.
+    """Locate the corners roughly, (rows, columns, 2) px, by OpenCV's fast finder in a reduced picture, then in the
+    whole one. It finds most boards that are seen whole.
     """
     scale = max(float(np.sqrt(_FAST_PX / image.size)), _FAST_SCALE) if image.size > 2.0 * _FAST_PX else 1.0
     if scale * min(image.shape) < _LEAST_SIDE_PX:
         return None
     scaled = _resized(image, scale)
-    # The check takes as long as the search where there is a board; where there is none, large pictures take seconds.
+    # Where there is a board the check takes as long as the search; where there is none, the search of a large picture
+    # takes seconds.
     flags = _ADAPTIVE | (cv2.CALIB_CB_FAST_CHECK if scaled.size > 2.0 * _FAST_PX else 0)
     shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=flags)
-    if not shown and scaled.size < image.size <= _LARGE_PX:  # a tenth of the time of the thorough search
+    if not shown and scaled.size < image.size <= _LARGE_PX:  # takes a tenth of the time of the thorough search
         scaled = image
         shown, corners = cv2.findChessboardCorners(image, (columns, rows), flags=_ADAPTIVE | cv2.CALIB_CB_FAST_CHECK)
     return _places_in(image, scaled, corners).reshape(rows, columns, 2) if shown else None
 
 
 def _found_thoroughly(image: Image8, columns: int, rows: int) -> tuple[Array | None, Array | None]:
-    """The same by OpenCV's newer detector at several scales: boards that are blurred, far away or in the dark, too; and
-    where no whole one is found corners of neighbouring squares, (h, w, 2) px, right-handed: three each way or more.
+    """Locate the corners by OpenCV's newer detector at several scales, which also finds boards that are blurred, far
+    away or dark. Where no whole board is found, return None and the corners of neighbouring squares, (h, w, 2) px,
+    right-handed, three or more each way, if there are any.
     """
-    squares, levels = None, _stretched(image[::_SAMPLED, ::_SAMPLED], image)  # it is blind where it is dark
+    squares, levels = None, _stretched(image[::_SAMPLED, ::_SAMPLED], image)  # the detector fails on dark pictures
     for scale in _scales(image.shape):
         scaled = _resized(levels, scale)
-        # Some squares are looked for first: where there are none, there is no board either.
+        # Any three by three squares are looked for first: without them there is no board either.
         shown, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled, (3, 3), cv2.CALIB_CB_LARGER)
         if not shown:
             continue
@@ -310,14 +318,16 @@ def _found_thoroughly(image: Image8, columns: int, rows: int) -> tuple[Array | N
 
 
 def _is_even(grid: Array) -> bool:
-    """Whether no square was skipped: then steps along a line change a little from one to the next."""
+    """Whether no square was skipped. If so, successive steps along a line differ little."""
     steps = [np.maximum(np.linalg.norm(np.diff(grid, axis=axis), axis=-1), 1e-9) for axis in (0, 1)]
     ratios = [np.abs(np.diff(np.log(step), axis=axis)) for axis, step in enumerate(steps)]
     return max(float(np.max(ratio, initial=0.0)) for ratio in ratios) < _UNEVEN
 
 
 def _resized(image: Image8, scale: float) -> Image8:
-    """Smaller, of means over about as many pixels as become one: OpenCV's own take four times as long; or larger."""
+    """Return the image at another scale. For a smaller one the mean over about as many pixels as become one is sampled,
+    which takes a quarter of the time of OpenCV's own area means.
+    """
     if scale == 1.0:
         return image
     around, how = (2 * int(0.5 / scale) + 1, cv2.INTER_LINEAR) if scale < 1.0 else (1, cv2.INTER_CUBIC)
@@ -326,14 +336,14 @@ def _resized(image: Image8, scale: float) -> Image8:
 
 
 def _places_in(image: Image8, scaled: Image8, corners: AnyArray) -> Array:
-    """Corners of the image where OpenCV has them in a scaled one, (N, 2) px."""
+    """Convert corners that OpenCV found in a scaled image to pixels of the image, (N, 2) px."""
     ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
     return np.asarray((corners.reshape(-1, 2).astype(float) + 0.5) * ratio - 0.5)
 
 
 def _scales(shape: tuple[int, ...]) -> list[float]:
     height, width = shape
-    # OpenCV turns the picture by 45 degrees, into a square that a long one hardly fills.
+    # OpenCV turns the picture by 45 degrees, into a square that a long picture hardly fills.
     pixels = max(height * width, (height + width) ** 2 // _LONG)
     first = [(_LARGE_PX / pixels) ** 0.5] if pixels > _LARGE_PX else []
     last = [2.0] if pixels <= _SMALL_PX else []
@@ -342,12 +352,12 @@ def _scales(shape: tuple[int, ...]) -> list[float]:
 
 
 def _placing(found: Array | str) -> Array | str:
-    """What was found, or why it cannot place a board."""
+    """Return the grid that was found, or the reason why it cannot place a board."""
     return found if isinstance(found, str) else _enough(found)
 
 
 def _enough(grid: Array) -> Array | str:
-    """The grid, or why its corners cannot place a board: too few, or all but one in one row or column."""
+    """Return the grid, or why its corners cannot place a board: too few, or all but one in one row or column."""
     row, column = np.nonzero(~np.isnan(grid[..., 0]))
     if len(row) < MIN_CORNERS:
         return f"only {len(row)} corners, {MIN_CORNERS} are needed"
@@ -357,12 +367,14 @@ def _enough(grid: Array) -> Array | str:
 
 
 def _as_8_bit(image: Image) -> Image8:
-    """What OpenCV's detectors take; deeper images are stretched, but for half a percent at either end."""
+    """Return the image as OpenCV's detectors take it; deeper images are stretched, with half a percent clipped at
+    either end.
+    """
     return image.astype(np.uint8, copy=False) if image.dtype == np.uint8 else _stretched(image, image)
 
 
 def _stretched(sample: Image, image: Image) -> Image8:
-    """From black to white, but for half a percent at either end of a sample."""
+    """Stretch an image from black to white, with half a percent of a sample clipped at either end."""
     low, high = np.percentile(sample, [0.5, 99.5])
     stretched: Array = (image - low) * (255.0 / max(float(high - low), 1e-12))
     return np.clip(stretched, 0.0, 255.0).astype(np.uint8)
@@ -372,7 +384,7 @@ def _stretched(sample: Image, image: Image) -> Image8:
 
 
 def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
-    """Name by path: the stem, and of equal stems as many folders as tell them apart."""
+    """Return the name of each path: its stem, with as many folders as are needed to distinguish equal stems."""
     if not paths:
         raise InputError("no images were given: name at least one file")
     if len(set(paths)) < len(paths):

@@ -1,8 +1,8 @@
-"""Grids of circles in images: OpenCV finds them, and what it measures is brought to the circles' centres.
+"""Grids of circles in images: OpenCV finds them, and its ellipse middles are corrected to the circles' centres.
 
 The middle of an ellipse is not the image of its circle's centre: perspective moves it towards the nearer side, by some
-hundredths of a pixel to some tenths where circles are large and tilted. The homography of the whole grid says by how
-much.
+hundredths of a pixel, or by some tenths where circles are large and tilted. The homography of the whole grid says by
+how much.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from ceres_cal.scene.targets import Target
 
 
 def measured_circles(image: Image8, board: Target) -> Array | str:
-    """Centres (rows, columns, 2) px, or why there are none."""
+    """Return the centres (rows, columns, 2) px, or the reason why there are none."""
     columns, rows, asymmetric = (board.spec[name] for name in ("columns", "rows", "asymmetric"))
     layout = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    for how in (layout, layout | cv2.CALIB_CB_CLUSTERING):  # the second sees tilted boards, and clutter as well
+    # the second way also finds tilted boards, and boards in clutter
+    for how in (layout, layout | cv2.CALIB_CB_CLUSTERING):
         shown, seen = cv2.findCirclesGrid(image, (columns, rows), flags=how)
         if shown:
             grid = np.asarray(seen.reshape(rows, columns, 2), dtype=float)
             if _is_mirrored(grid):
-                if asymmetric:  # which turned over is another grid
+                if asymmetric:  # an asymmetric grid turned over is another grid
                     return f"a grid of {columns} x {rows} circles, but seen mirrored"
                 grid = grid[:, ::-1]
             return _centres(grid, board.point_array[:, :2], 0.5 * board.spec["diameter_m"])
@@ -36,7 +37,7 @@ def _is_mirrored(grid: Array) -> bool:
 
 
 def _centres(grid: Array, places: Array, radius_m: float) -> Array:
-    """The images of the circles' centres, from the middles of their ellipses (rows, columns, 2) px."""
+    """Return the images of the circles' centres, given the middles of their ellipses (rows, columns, 2) px."""
     middles = grid.reshape(-1, 2)
     homography, _ = cv2.findHomography(places, middles)
     if homography is None:

@@ -1,4 +1,4 @@
-"""Where a camera should see the painted curves of a target: places along them, at even distances in the image."""
+"""Predicted images of a target's painted curves: places along them, evenly spaced in the image."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ceres_cal.scene import Arc, Camera, Target, along_curve, along_track, curve
 
 
 class Course(Rows):
-    """N places on painted curves as the camera should see them, curve after curve and in order along each.
+    """N places on painted curves as the camera should see them, curve by curve and in order along each.
 
     Attributes:
         curve: (N,) index among the target's curves. s: (N,) the curves' parameter.
-        pixels: (N, 2). normals: (N, 2) of length 1, towards the curve's left. curvature: (N,) 1/px, positive towards
-            the normal. width_px: (N,) of the paint, along the normal.
+        pixels: (N, 2) px. normals: (N, 2) of length 1, towards the curve's left. curvature: (N,) 1/px, positive towards
+            the normal. width_px: (N,) width of the paint along the normal.
     """
 
     curve: Indices32
@@ -28,23 +28,24 @@ class Course(Rows):
 
     @property
     def edges(self) -> Array:
-        """(N, 2) px along the normal from the paint's middle to its edges."""
+        """(N, 2) distances of the paint's two edges from its middle along the normal, px."""
         return np.column_stack([-0.5 * self.width_px, 0.5 * self.width_px])
 
 
 def predict(
     target: Target, camera: Camera, curves: Collection[str], spacing_px: float, margin_px: float = 0.0
 ) -> Course:
-    """Places about every `spacing_px` on the painted curves of these names that fall into the image.
+    """Return places about every `spacing_px` on those painted curves with these names that fall into the image.
 
     Args:
-        camera: its cam_from_world is cam_from_target. margin_px: how far inside the image they must lie.
+        camera: camera whose cam_from_world is cam_from_target.
+        margin_px: how far inside the image the places must lie.
     """
     widest_px = 100.0
     painted = [i for i, (name, curve) in enumerate(target.curves.items()) if name in curves and curve.width_m > 0.0]
     number, s = _places(target, camera, np.array(painted, dtype=np.int32), spacing_px, margin_px)
     course = course_at(target, camera, number, s)
-    # Where the lens folds over, paint may have one edge only; and what is wider no search is meant for.
+    # Where the lens folds over, only one edge of the paint may be visible. The search is not made for wider paint.
     whole = np.isfinite(course.curvature + dots(course.pixels, course.normals))
     return course.take(whole & (course.width_px < widest_px))
 
@@ -52,7 +53,9 @@ def predict(
 def _places(
     target: Target, camera: Camera, curves: Indices32, spacing_px: float, margin_px: float
 ) -> tuple[Indices32, Array]:
-    """Curve (N,) and parameter (N,) of the places; what is projected is projected at once, which spares most of it."""
+    """Return curve (N,) and parameter (N,) of the places. All of them are projected in one call, which saves most of
+    the time.
+    """
     s, places = (one[curves] for one in target.evenly)
     x, y = camera.project(places.reshape(-1, 3)).T.reshape(2, *s.shape)
     size = np.array(camera.image_size)
@@ -74,12 +77,12 @@ def _places(
 
 
 def _ends(target: Target) -> Array:
-    """(C, 2) parameters of where the target's curves begin and end."""
+    """(C, 2) parameters where the target's curves begin and end."""
     return np.array([curve.parameter_range for curve in target.curves.values()]).reshape(-1, 2)
 
 
 def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Course:
-    """The course through places that are given by curve (N,) and parameter (N,)."""
+    """Return the course through places that are given by curve (N,) and parameter (N,)."""
     span = np.diff(_ends(target)[number])[:, 0]
     steps = np.array([-2e-3, 0.0, 2e-3, 0.0, 0.0])[:, None] * span
     tracks = np.stack([target.tracks[side][number] for side in (0, 0, 0, 1, -1)]).reshape(-1, 3, 3)
@@ -96,7 +99,7 @@ def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Co
 
 
 def clear_px(target: Target, camera: Camera, course: Course, curves: Collection[str]) -> Array:
-    """(N,) px from each place to the middle of the nearest other curve that is painted, or to the own curve's end."""
+    """(N,) px from each place to the middle of the nearest other painted curve, or to the end of its own curve."""
     number, s, pixels = course.curve, course.s, course.pixels
     places = along_track(target.tracks[0][number], target.is_arc[number], s)
     clear = np.full(len(places), np.inf)

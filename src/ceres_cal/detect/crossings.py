@@ -1,4 +1,4 @@
-"""Crossings and corners: where the branches of painted curves that were measured on the way to them meet."""
+"""Crossings and corners: points where measured branches of painted curves meet."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from ceres_cal.detect.lines import Lines
 from ceres_cal.observations import Points
 from ceres_cal.scene import Camera, Target, distance_to_curve, in_image, nearest_on_curve
 
-# Places that scatter as stated, beside those of a branch, which are few: where these scatter more (worn paint ends in
-# one, a shadow in another), so does where it leads. From 0 to 8 nothing changes but the largest errors.
+# Number of places, beside the few of a branch, that are assumed to scatter as stated. A branch whose places scatter
+# more (it ends in worn paint or in a shadow) gets a larger variance. From 0 to 8 only the largest errors change.
 _AS_STATED = 2.0
 
 
 class _Branch(Frozen):
-    """A curve at a point: its normal in the image, how far along it the paint lies, its variance, its places."""
+    """A curve near a point: its normal in the image, the paint's offset along it, its variance, and the rows used."""
 
     normal: Array
     offset_px: float
@@ -25,11 +25,12 @@ class _Branch(Frozen):
 
 
 def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points, Mask]:
-    """Every point of the target in which at least two measured curves meet; and the lines' places (N,) that went into
-    them: who takes both must leave these out, or pixels count twice.
+    """Return every point of the target in which at least two measured curves meet, and a mask (N,) of the lines' places
+    that were used for them. A caller that uses both must leave these places out, or pixels count twice.
 
-    Each branch is a parabola through the offsets of its nearest places from the course: the course itself bends as lens
-    and arc do, but for what a formula of the lens leaves. Straight lines were up to nine standard deviations off.
+    Each branch is a parabola through the offsets of its nearest places from the course. The course itself bends as lens
+    and arc do, except for what the lens model does not describe. With straight lines points were up to nine standard
+    deviations off.
     """
     on_curve_m = 1e-6
     used = np.zeros(len(lines.course), dtype=bool)
@@ -53,8 +54,10 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> tuple[Points
 
 
 def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:
-    reach_px, bent_px = 100.0, 0.5  # how far a branch is followed, and by how much it may bend until there
-    each_way, one_way, fewest = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
+    # how far a branch is followed, and the standard deviation of its bend at that distance
+    reach_px, bent_px = 100.0, 0.5
+    # number of places: on each side of a branch that goes on, of one that ends, and the least
+    each_way, one_way, fewest = 3, 8, 3
     course = lines.course
     foot = nearest_on_curve(target.curves[target.curve_names[curve]], point[None])
     here = course_at(target, camera, np.array([curve], np.int32), foot)
@@ -79,8 +82,10 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
 
 
 def _met(branches: list[_Branch]) -> tuple[Array, float] | None:
-    """Where branches meet, (2,) px from where they should, and its sigma; None where they do not tell it."""
-    most_stretched = 3.0  # of the crossing's longest standard deviation over its shortest
+    """Return the offset (2,) px of the branches' meeting point from its predicted place, and its standard deviation;
+    None where they do not determine it.
+    """
+    most_stretched = 3.0  # largest ratio of the crossing's longest standard deviation to its shortest
     if len(branches) < 2:
         return None
     normals = np.array([branch.normal for branch in branches])

@@ -1,4 +1,4 @@
-"""How large an image says it is, from its header: before a decoder makes room for it."""
+"""Sizes and orientations of images as file headers state them; sizes are read before a decoder allocates memory."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import struct
 
 _COMMENT = rb"(?:\s+|#[^\n]*\n)+"
 _PNM = re.compile(rb"P[1-6]" + _COMMENT + rb"(\d{1,9})" + _COMMENT + rb"(\d{1,9})")
-_JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others are tables
-_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}  # of the bytes in a TIFF, by how it begins
-_ORIENTATION, _TURNED_DEG = 274, {3: 180, 6: 90, 8: 270}  # the tag, and by how much viewers turn clockwise
-_EXIF = b"Exif\0\0"  # before the TIFF with a JPEG's notes
+_JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of frame headers; the excluded ones are tables
+_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}  # byte order of a TIFF, by its first bytes
+# the tag, and the clockwise turn by which viewers show each of its values
+_ORIENTATION, _TURNED_DEG = 274, {3: 180, 6: 90, 8: 270}
+_EXIF = b"Exif\0\0"  # precedes the TIFF that holds a JPEG's metadata
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:
@@ -23,7 +24,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
         return _png(content)
     if content.startswith(b"BM"):
         width, height = _unpack("<HH" if content[14:15] == b"\x0c" else "<ii", content, 18)
-        return width, abs(height)  # negative from the top down
+        return width, abs(height)  # negative for rows stored from the top down
     if content.startswith(b"\xff\xd8\xff"):
         return _jpeg(content)
     if order := _ORDERS.get(content[:4]):
@@ -39,7 +40,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
 
 
 def viewers_turn_deg(content: bytes) -> int:
-    """By how much viewers turn a JPEG or TIFF clockwise, as it notes for them; 0, 90, 180 or 270."""
+    """Return the clockwise turn with which a JPEG or TIFF tells viewers to show it: 0, 90, 180 or 270 degrees."""
     notes = content.partition(_EXIF)[2] if content.startswith(b"\xff\xd8\xff") else content
     try:
         order = _ORDERS.get(notes[:4])
@@ -54,7 +55,9 @@ def _unpack(form: str, content: bytes, at: int) -> tuple[int, int]:
 
 
 def _png(content: bytes) -> tuple[int, int] | None:
-    """Its decoder makes room for whatever length a chunk claims."""
+    """Size from the header; None where a chunk claims more than the file has, for which the decoder would allocate
+    memory.
+    """
     at = 8
     while at + 8 <= len(content):
         (length,) = struct.unpack_from(">I", content, at)
@@ -73,7 +76,7 @@ def _jpeg(content: bytes) -> tuple[int, int] | None:
         if code in _JPEG_SIZES:
             height, width = _unpack(">HH", content, at + 5)
             return width, height
-        at += 1 if code == 0xFF else 2 + length  # headers may begin with more of the mark
+        at += 1 if code == 0xFF else 2 + length  # a header may begin with several bytes 0xFF
 
 
 def _tiff(content: bytes, order: str) -> tuple[int, int]:
@@ -82,7 +85,7 @@ def _tiff(content: bytes, order: str) -> tuple[int, int]:
 
 
 def _tags(content: bytes, order: str, *wanted: int) -> list[int]:
-    """The values of some tags of a TIFF, the largest where one is there again; 0 where it is not."""
+    """Return the values of some tags of a TIFF; the largest where a tag occurs twice, 0 where it does not occur."""
     values = dict.fromkeys(wanted, 0)
     (start,) = struct.unpack_from(order + "I", content, 4)
     (count,) = struct.unpack_from(order + "H", content, start)

@@ -1,4 +1,4 @@
-"""Image files, read and written."""
+"""Reading and writing of image files."""
 
 from __future__ import annotations
 
@@ -24,16 +24,18 @@ from ceres_cal.base import (
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
-# Of the pixels of a colour sensor, those that see blue, green and red.
+# Shares of a colour sensor's pixels that see blue, green and red.
 _OF_MOSAIC = np.array([0.25, 0.5, 0.25], np.float32)
-_AS_SEEN = np.array([0.114, 0.587, 0.299], np.float32)  # by eyes: the light of ITU-R BT.601, in JPEG files and videos
-_AROUND_PX = (301, 101, 31)  # over which what is left out is filled, ever nearer
-_LEAST_PX = 16  # of either side: what is looked at around a corner or across a line is wider
-_PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at a bit each
+# weights of human vision: luma of ITU-R BT.601, in JPEG files and videos
+_AS_SEEN = np.array([0.114, 0.587, 0.299], np.float32)
+_AROUND_PX = (301, 101, 31)  # widths of the windows over which masked pixels are filled, ever nearer
+_LEAST_PX = 16  # least width and height: the windows around a corner or across a line are wider
+_PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at one bit a pixel
 
 
 def read_grey(path: str | Path) -> Image:
-    """An image as (height, width) grey levels of its own depth, its pixels as stored (any noted rotation ignored).
+    """Read an image as (height, width) grey levels of its own depth, with pixels as stored (any noted rotation is
+    ignored).
 
     Raises:
         InputError: the file is missing or no image.
@@ -42,22 +44,24 @@ def read_grey(path: str | Path) -> Image:
 
 
 def read_light(path: str | Path) -> Array32:
-    """An image as (height, width) grey levels in which each pixel of a colour sensor counts alike: see `light`.
+    """Read an image as (height, width) grey levels in which all pixels of a colour sensor have equal weight: see
+    `light`.
 
     Raises:
-        InputError: as of `read_grey`.
+        InputError: see `read_grey`.
     """
     return light(read_colour(path))
 
 
 def light(image: Image) -> Array32:
-    """(height, width) grey levels of an image (height, width) or (height, width, 3) blue, green, red: their mean, green
-    twice.
+    """Return (height, width) grey levels of an image (height, width) or (height, width, 3) blue, green, red: the mean
+    of the colours, with green counted twice.
 
-    A sensor sees red in every other row of pixels and blue in the others. Of a line two pixels wide, most cameras' file
-    has red drawn towards the one and blue towards the other; as human eyes weigh them that leaves up to 0.13 px of a
-    whole line. Weighed as the sensor's pixels are, what is white or grey stays where it is. Most JPEG files and videos
-    keep the colours of two by two pixels only, and draw blue aside by that: then it is what they keep of each pixel.
+    A sensor sees red in every other row of pixels and blue in the others. In most cameras' files, red of a line two
+    pixels wide is displaced towards one row and blue towards the other; with the weights of human vision the whole line
+    is up to 0.13 px off. With the weights of the sensor's pixels, a white or grey line is not displaced. Most JPEG
+    files and videos keep the colours of two by two pixels only, which displaces blue; for these the luma that they keep
+    for each pixel is used.
     """
     if image.ndim == 2:
         return image.astype(np.float32)
@@ -68,16 +72,17 @@ def light(image: Image) -> Array32:
 
 
 def _is_colour_coarse(blue: Array32, seen: Array32) -> bool:
-    """Whether the colours (blue beside what eyes see) of an image lack the detail that its light has."""
-    kernel, coarse = np.array([1.0, -2.0, 1.0], np.float32), 0.2  # 0.03 to 0.13 of JPEG files, else 0.34 and more
-    every = 4  # rows of which one is asked
+    """Whether the colours of an image (blue minus luma) lack the detail that its luma has."""
+    # limit of the ratio: 0.03 to 0.13 for JPEG files, else 0.34 or more
+    kernel, coarse = np.array([1.0, -2.0, 1.0], np.float32), 0.2
+    every = 4  # one row of so many is examined
     fine, colour = (np.abs(cv2.sepFilter2D(one, -1, kernel, kernel)[::every]) for one in (seen, blue - seen))
     clear = fine >= quantile(fine.ravel(), 0.99)
     return bool(np.mean(colour[clear]) < coarse * np.mean(fine[clear]))
 
 
 def read_colour(path: str | Path) -> Image:
-    """An image as (height, width) grey levels or (height, width, 3) blue, green and red; otherwise as `read_grey`."""
+    """Read an image as (height, width) grey levels or (height, width, 3) blue, green, red; otherwise as `read_grey`."""
     return _decoded(path, cv2.IMREAD_ANYCOLOR)
 
 
@@ -92,7 +97,7 @@ def _decoded(path: str | Path, channels: int) -> Image:
             _require_believable(size, len(content), str(path))
             packed = np.frombuffer(content, np.uint8)
             image = cv2.imdecode(packed, flags)
-            if image is None or image.dtype.itemsize > 2:  # of which OpenCV makes no grey
+            if image is None or image.dtype.itemsize > 2:  # OpenCV does not convert these to grey
                 image = _in_levels(cv2.imdecode(packed, flags | cv2.IMREAD_ANYCOLOR), channels, str(path))
     if image is None:
         raise InputError(f"{path}: {_not_an_image(content)}")
@@ -110,7 +115,7 @@ def _not_an_image(content: bytes) -> str:
 
 
 def _in_levels(image: AnyArray | None, channels: int, path: str) -> Image | None:
-    """A picture of floats, or of long numbers, as levels from 0 to 255, in grey where asked."""
+    """Scale a picture of floats, or of long integers, to levels from 0 to 255, in grey where `channels` asks for it."""
     if image is None:
         return None
     if not np.isfinite(image).all():
@@ -120,8 +125,8 @@ def _in_levels(image: AnyArray | None, channels: int, path: str) -> Image | None
 
 
 def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
-    """Raise InputError where a header claims more pixels than there is room for, or than its file can hold, or too few
-    for anything to be seen in them.
+    """Raise InputError where a header claims more pixels than there is memory for or than its file can hold, or too few
+    to show anything.
     """
     if min(size) < _LEAST_PX:
         raise InputError(
@@ -134,7 +139,7 @@ def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
 
 
 def filled(grey: Array32, left_out: Mask) -> Array32:
-    """A photograph (height, width) whose pixels under a mask are as light as what is around them, without a line."""
+    """Fill the masked pixels of a photograph (height, width) with the light around them, so that they show no line."""
     shown, plane = (~left_out).astype(np.float32), grey.copy()
     plane[left_out] = median(grey[~left_out]) if not left_out.all() else 0.0
     for size in _AROUND_PX:
@@ -151,7 +156,7 @@ def negative(grey: Array32) -> Array32:
 
 
 def encoded(image: Image, ending: str, jpeg_quality: int) -> bytes:
-    """The content of an image file: ".png" as it is, ".jpg" in so much quality, 1 to 100.
+    """Encode an image as the content of a file: ".png" without loss, ".jpg" with the given quality, 1 to 100.
 
     Raises:
         InputError: OpenCV cannot write such an image.

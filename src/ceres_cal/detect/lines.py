@@ -1,7 +1,7 @@
-"""Painted lines and arcs in a photograph, measured where a camera says they should be.
+"""Painted lines and arcs in a photograph, measured where a camera model predicts them.
 
-Each place of a `Course` is first looked for along its normal, then measured in the pixels themselves (`profiles`). What
-does not look like paint of that width, or does not go on as its neighbours do, gives no observation.
+Each place of a `Course` is first searched along its normal, then measured in the pixels themselves (`profiles`). A
+place gives no observation if it does not look like paint of the expected width, or does not continue its neighbours.
 """
 
 from __future__ import annotations
@@ -18,52 +18,55 @@ from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Profiles, Windows, cut_windows
 from ceres_cal.detect.sampling import drawn_aside
 
-HALF_WIDTH_PX = 3  # of a window, along the line
+HALF_WIDTH_PX = 3  # half width of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
-_BEYOND_PX = 4.5  # of a window, past the paint's border; farther where the picture is blurred
+_BEYOND_PX = 4.5  # extent of a window past the paint's border; larger where the picture is blurred
 _SEARCH_STEP_PX = 0.5
 _TINY = 1e-9  # grey levels
-_BAND_PX = 3.0  # of background, to either side of the paint, in the search
-_NARROW_PX = 1.0  # the same where other paint may be near
-# Of blur, in standard deviations: the part of a blurred line that is brightest.
+_BAND_PX = 3.0  # width of the background on either side of the paint, in the search
+_NARROW_PX = 1.0  # width of the background in the search where other paint may be near
+# Width of the brightest part of a blurred line, in standard deviations of the blur.
 _AS_WIDE = 2.5
-# Of blur, in standard deviations: how far past the paint's border a blurred line reaches. Where that is more than the
-# usual window it is searched, and measured, as wide as it is, and as smeared.
+# How far a blurred line extends past the paint's border, in standard deviations of the blur. Where this exceeds the
+# usual window, the line is searched and measured again with a larger window and with smear.
 _AS_FAR = 2.5
-# Contrast over noise. Of 3100 line centres two more are taken at half of it, 77 fewer at double, none of them wrong.
+# Least ratio of contrast to noise. Of 3100 line centres, half of this value accepts two more, double 77 fewer, none of
+# them wrong.
 _LEAST_CLARITY = 4.0
-# Share of the usual contrast. Nothing changes from half to double.
+# Least contrast, as a share of the usual one. Nothing changes from half to double.
 _LEAST_CONTRAST = 0.15
-# Least and most share of the contrast nearby: a robot's marker is brighter than paint in shadow. Both ends lie around
-# 1 and cannot be halved; 0.9 as the least loses a tenth of the line centres.
+# Least and largest contrast, as a share of the contrast nearby: a robot's marker is brighter than paint in shadow. Both
+# limits are near 1 and cannot be halved; with 0.9 as the least a tenth of the line centres is lost.
 _OF_NEARBY = 0.45, 1.7
-# Times the usual misfit: something else is in the window, or runs along the line, where it is as large a share of the
-# contrast, too. Of line centres 5 % go at half of the former, 1 % come at double.
+# Largest misfit of a window, and of the windows nearby, in units of the usual one. A larger misfit means that something
+# else is in the window or runs along the line; along the line only where it is as large relative to the contrast, too.
+# Half of the former loses 5 % of the line centres, double adds 1 %.
 _NOISY, _NOISY_NEARBY = 3.0, 2.0
-_NEARBY = 4  # places to each side that a place is compared with
-# Off its neighbours: standard deviations, and at least so much. Of line centres 1 % go at half of it, 0.2 % come at
-# double.
+_NEARBY = 4  # number of places to each side that a place is compared with
+# Largest distance from the neighbours, in standard deviations, but at least so many px. Half of it loses 1 % of the
+# line centres, double adds 0.2 %.
 _FAR, _FAR_PX = 5.0, 0.25
-# Times the spread of its neighbours. Of line centres 0.2 % go at half of it and come at double.
+# Largest distance from the neighbours, in units of their own spread. Half of it loses 0.2 % of the line centres, double
+# adds 0.2 %.
 _WANDERING = 4.0
-# Places between those whose scatter is looked at: on a line that is nearly level, errors follow its place in the pixel
-# and are alike over less. And what may be found of it, px.
+# Step between the places of which the scatter is measured: on a nearly level line errors depend on its position in the
+# pixel, so they are alike over shorter distances. And the candidates for additional scatter, px.
 _APART = 3
 _SCATTER_PX = np.concatenate([[0.0], np.geomspace(0.002, 1.0, 60)])
 
 
 class Lines(Rows):
-    """What was measured of a course.
+    """What was measured at the places of a course.
 
     Attributes:
-        course: the places looked at.
+        course: the places that were examined.
         found: (N,) where paint was measured.
-        offset_px: (N,) how far along the normal from the course's place the paint's middle lies; NaN where not found.
-        sigma_px: (N,) standard deviation of it.
-        blur_px: standard deviation of the picture's blur, lens, pixel and motion together.
-        stretch: the paint's width over what the target says, as far as the blur lets it be seen.
-        coma_px: standard deviation of how far coma may still draw all of them outwards, growing with the square of the
-            radius, at half a diagonal from the picture's middle; 0 where none was seen.
+        offset_px: (N,) offset along the normal of the paint's middle from the course's place; NaN where not found.
+        sigma_px: (N,) standard deviation of offset_px.
+        blur_px: standard deviation of the picture's blur by lens, pixel and motion together.
+        stretch: ratio of the paint's width to the target's, as far as the blur allows it to be measured.
+        coma_px: standard deviation of the displacement by coma that may remain at half a diagonal from the picture's
+            middle; it is outwards everywhere and grows with the square of the radius. 0 where no coma was seen.
     """
 
     course: Course
@@ -81,14 +84,14 @@ class Lines(Rows):
 
     @property
     def pixels(self) -> Array:
-        """(N, 2) the paint's middle, NaN where it was not found."""
+        """(N, 2) px of the paint's middle, NaN where it was not found."""
         return np.asarray(self.course.pixels + self.offset_px[:, None] * self.course.normals)
 
     def edge(self, side: int) -> Array:
-        """(N, 2) the paint's left (side 1) or right (-1) edge, NaN where it was not found.
+        """(N, 2) px of the paint's left (side 1) or right (-1) edge, NaN where it was not found.
 
-        Both come from one fit: with the width known, each is as much worse than the middle as two of them together
-        are as good, and that is how to weigh them (sigma times the square root of 2).
+        Both edges come from one fit with the width known. To weigh two edges together as much as the one middle, each
+        has the middle's sigma times the square root of 2.
         """
         away = self.offset_px + 0.5 * side * self.stretch * self.course.width_px
         return np.asarray(self.course.pixels + away[:, None] * self.course.normals)
@@ -97,12 +100,12 @@ class Lines(Rows):
 def search(
     grey: Array32, course: Course, reach_px: float, spare_px: float = 0.0, blur_px: Array | float = 0.0
 ) -> tuple[Array, Array]:
-    """Where along the normals there is most likely paint: offsets (N,) px, and how much brighter it is, grey levels.
+    """Return where paint is most likely along the normals: offsets (N,) px, and how much brighter it is, grey levels.
 
     Args:
-        reach_px: how far to look to either side. spare_px: of two lines the one nearer than by this is taken, even
-            where the other is twice as bright.
-        blur_px: standard deviation of what makes lines wider, (N,) or one.
+        reach_px: how far to search to either side.
+        spare_px: a line nearer by this distance is preferred to another even if the other is twice as bright.
+        blur_px: standard deviation of what makes lines wider, (N,) or one for all.
     """
     steps, response = _responses(grey, course, reach_px, blur_px, _BAND_PX)
     best = np.argmax(_preferred(response, steps / spare_px) if spare_px > 0.0 else response, axis=1)
@@ -110,8 +113,8 @@ def search(
 
 
 def peaks(grey: Array32, course: Course, reach_px: float) -> tuple[Array, Array]:
-    """Everywhere along the normals where there may be paint, however near to other paint: offsets (S,) px, and how much
-    brighter than both sides each of them is (N, S), 0 where it is no peak.
+    """Return every place along the normals where there may be paint, however near to other paint: offsets (S,) px, and
+    how much brighter than both sides each of them is (N, S), 0 where it is no peak.
     """
     steps, response = _responses(grey, course, reach_px, 0.0, _NARROW_PX)
     return steps, np.where(_is_peak(response), np.maximum(response, 0.0), 0.0)
@@ -126,7 +129,7 @@ def _responses(
     beyond = int(np.ceil((np.max(half_px) + band_px + 1.0) / _SEARCH_STEP_PX)) + 1
     steps = np.arange(-count - beyond, count + beyond + 1.0) * _SEARCH_STEP_PX
     light = _along_normals(grey, course, steps, (-2.0, 0.0, 2.0))
-    # Between steps, not of them: a mean must lie as far to one side of its place as to the other.
+    # Sums of means between steps, so that a mean extends as far to one side of its place as to the other.
     total = np.cumsum(np.pad(0.5 * (light[:, 1:] + light[:, :-1]), ((0, 0), (1, 0))), axis=1)
     own, rows = sliding_window_view(total, 2 * count + 1, axis=1), np.arange(len(total))
 
@@ -140,8 +143,8 @@ def _responses(
 
 
 def _preferred(response: Array, away: Array) -> Array:
-    """(N, S) how much a step (S,) is to be taken for the line: a peak that is near. Brighter than paint usually is no
-    more paint: a boundary line beside the field's own is wider.
+    """(N, S) preference for each step (S,) as the line's place: a peak that is near. Brightness beyond that of usual
+    paint hardly counts: a boundary line beside the field's own line may be wider.
     """
     bright, usual = np.maximum(response, 0.0), max(median(np.max(response, axis=1)), _TINY)
     return np.asarray(_is_peak(response) * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2))
@@ -153,7 +156,7 @@ def _is_peak(response: Array) -> Mask:
 
 
 def _along_normals(grey: Array32, course: Course, steps: Array, shifts_px: Sequence[float]) -> Array:
-    """(N, S) light at steps (S,) px along the normals, the mean of places shifted so along the line."""
+    """(N, S) light at steps (S,) px along the normals, averaged over places shifted along the line by `shifts_px`."""
     nx, ny = course.normals.T[..., None]
     x, y = course.pixels[:, 0, None] + steps * nx, course.pixels[:, 1, None] + steps * ny
     shape = len(shifts_px), *x.shape
@@ -172,12 +175,13 @@ def measure(
     """Measure the paint at the places of a course whose windows hold no other paint.
 
     Args:
-        reach_px: how far the course may be off. clear_px: (N,) or one, from each place to other paint (see
-            `courses.clear_px`). is_even: that no coma is looked for.
+        reach_px: how far the course may be off.
+        clear_px: (N,) or one, px from each place to other paint (see `courses.clear_px`).
+        is_even: whether the search for coma is skipped.
     """
     clear, blur, beyond = np.broadcast_to(clear_px, len(course)), no_blur(len(course)), _BEYOND_PX
     for _ in range(2):
-        # How far a window may reach from its place: other paint, as blurred as its own, must be farther away.
+        # A window is used only if other paint, as blurred as its own, is farther away than the window reaches.
         alone = clear > 1.2 * (course.width_px + beyond) + HALF_WIDTH_PX + beyond - _BEYOND_PX
         course, clear, blur = course.take(alone), clear[alone], blur.take(alone)
         if not len(course):
@@ -198,7 +202,7 @@ def measure(
         coma_px = remains * float(abs(out @ by) / (out @ out))
         blur, fits = (coma[0], leaning) if remains < 1.0 else (blur, fits)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
-    # What is blurred along a line as well is drawn to the inside of its bend.
+    # Blur along a line moves it towards the inside of its bend.
     offset = rough + fits.offset_px - 0.5 * blur.usual_px**2 * course.curvature
     found = _is_paint(course, fits, contrast, medians(windows.values))
     found = _goes_on(course, found, offset, fits.sigma_px)
@@ -211,16 +215,17 @@ def measure(
 
 
 def _windows(grey: Array32, course: Course, rough_px: Array, beyond_px: float) -> Windows:
-    """Windows about where the paint is, roughly, (N,) px along the normals, that reach so far past its border."""
+    """Cut windows around the rough places (N,) px along the normals that reach `beyond_px` past the paint's border."""
     places = course.pixels + rough_px[:, None] * course.normals
     usual_length = quantile(0.5 * course.width_px + beyond_px, 0.9)
     return cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
 
 
 def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) -> Mask:
-    """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it.
+    """Whether the window shows a bright line: darker on both sides, with the usual contrast, and nothing else in it.
 
-    By as much as nearby, or by as large a share of the light `around` (N,): sun changes paint and carpet alike.
+    The contrast is compared with that nearby, absolutely or relative to the light `around` (N,): sun changes paint and
+    carpet alike.
     """
     fitted = np.isfinite(fits.offset_px)
     if not np.any(fitted):
@@ -251,16 +256,16 @@ def _neighbours(values: Array, curve: Indices32) -> Array:
 
 
 def _medians(values: Array, curve: Indices32) -> Array:
-    """(N,) the median of each place's neighbours, its own value where there are none."""
+    """(N,) the median of each place and its neighbours; its own value where there are no neighbours."""
     return medians_known(np.column_stack([_neighbours(values, curve), values]))
 
 
 def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
-    """Of the places found, those that lie where their neighbours say; a place without any is not believed."""
+    """Whether a found place agrees with its neighbours; a place without neighbours is rejected."""
     around = _neighbours(np.where(found, offset, np.nan), course.curve)
     alone = np.count_nonzero(np.isfinite(around), axis=1) < 2
     middle = medians_known(around)
-    # Paint that wanders is still paint: what its neighbours do among themselves, it may do too.
+    # A wavy line is still paint: a place may deviate as much as its neighbours do among themselves.
     wander = medians_known(np.abs(around - middle[:, None])) / 0.6745
     near = np.abs(offset - middle) < np.maximum(np.maximum(_FAR * sigma, _FAR_PX), _WANDERING * wander)
     return np.asarray(found & near & ~alone)
@@ -275,10 +280,11 @@ def _threes(course: Course, found: Mask) -> Indices:
 
 
 def _as_scattered(three: Indices, offset: Array, sigma: Array) -> Array:
-    """(N,) the standard deviations, px, as what the offsets of three places on a curve tell of their scatter.
+    """(N,) the standard deviations, px, enlarged to the scatter of the offsets of three places on a curve.
 
-    Carpet, wear and compression are not white noise, which is all that a window knows; what a window in good light
-    knows best suffers from them no less, so it is added. Places that scatter by less may err alike: none is smaller.
+    Carpet, wear and compression are not white noise, which is all that a window's own sigma contains. Windows in good
+    light suffer from them no less, so the same amount is added to all. Sigmas are never reduced: places that scatter by
+    less may have a common error.
     """
     if len(three) < 20:
         return sigma

@@ -1,7 +1,7 @@
-"""ArUco and AprilTag markers in images: OpenCV finds them, their corners are where their measured sides cross.
+"""ArUco and AprilTag markers in images: OpenCV finds them, and corners are intersections of their measured sides.
 
 Corners of a dark square are no saddles: blur rounds them off inwards. So the light's step is measured across each side
-(`profiles`), and a line, which a lens may bend a little, goes through it. In rendered pictures (sides of 45 to 96 px,
+(`profiles`), and a line, which a lens may bend a little, is fitted to it. In rendered pictures (sides of 45 to 96 px,
 blur of 0.4 to 1.5 px, noise of 2 grey levels) corners are off by 0.02 to 0.03 px, rms per coordinate; OpenCV's by 0.17
 to 0.32 px with its best refinement.
 """
@@ -17,19 +17,19 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.charuco_boards import dictionary_of
 from ceres_cal.scene.targets.marker_targets import CORNERS
 
-_FAR = 4.0  # medians beyond which a place on a side shows something else
+_FAR = 4.0  # multiple of the median deviation beyond which a place on a side shows something else
 _FEWEST_PLACES = 5
 _DICTIONARIES = (
     *(tuple(f"DICT_{bits}_{count}" for count in (50, 100, 250, 1000)) for bits in ("4X4", "5X5", "6X6", "7X7")),
     ("DICT_ARUCO_ORIGINAL",),
     ("DICT_APRILTAG_36h11",),
 )
-"""What boards are printed with; the smaller ones of a row are the first markers of its last one."""
+"""Dictionaries that boards are printed with; the smaller ones of a row are the first markers of its last one."""
 
 
 def dictionary_shown(levels: Image8) -> str:
-    """The dictionary, the smallest, that has most of the markers in an image; "" where few or none are seen."""
-    few = 3  # what lies beside a chessboard, or its squares, now and then looks like one
+    """Return the smallest dictionary that has most of the markers in an image; "" where few or none are seen."""
+    few = 3  # objects beside a chessboard, or its squares, occasionally look like a marker
     best = ""
     for names in _DICTIONARIES:
         _, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(names[-1])).detectMarkers(levels)
@@ -40,7 +40,7 @@ def dictionary_shown(levels: Image8) -> str:
 
 
 def markers_finder(target: Target) -> cv2.aruco.ArucoDetector:
-    """What finds the markers of a target; InputError where the dictionary does not have them."""
+    """Return a detector for the markers of a target; InputError where the dictionary does not have them."""
     name = target.spec["dictionary"]
     dictionary = dictionary_of(name)
     most = len(dictionary.bytesList) - 1
@@ -52,7 +52,7 @@ def markers_finder(target: Target) -> cv2.aruco.ArucoDetector:
 
 
 def measured_markers(image: Image, levels: Image8, target: Target, finder: cv2.aruco.ArucoDetector) -> Array | str:
-    """Corners (M markers, 4, 2) px, NaN where a marker was not seen, or was seen twice; or why there are none."""
+    """Return corners (M markers, 4, 2) px, NaN where a marker was not seen or was seen twice; or why there are none."""
     corners, numbers, _ = finder.detectMarkers(levels)
     seen = [] if numbers is None else [str(number) for number in numbers.ravel().tolist()]
     wanted = list(target.spec["markers"])
@@ -74,13 +74,13 @@ def measured_markers(image: Image, levels: Image8, target: Target, finder: cv2.a
 
 
 def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
-    """(4, 3) how far each side lies outside the quad's, px, as a polynomial of the place along it from -1 to 1; None
-    where one is not seen, or its cells are too small.
+    """(4, 3) offset of each side to the outside of the quad's, px, as a polynomial of the place along it from -1 to 1;
+    None where a side is not seen, or the cells are too small.
     """
-    cell = 0.5  # of a cell of the marker: how far a window reaches, for its border is one cell wide, or two
-    least_half_length_px = 1.5  # of a window; sides of smaller cells cannot be measured
+    cell = 0.5  # half length of a window, as a share of a cell: the marker's border is one or two cells wide
+    least_half_length_px = 1.5  # least half length of a window; with smaller cells sides cannot be measured
     half_width_px, most_half_length_px = 1, 5.0
-    every_px, most_places = 2.0, 24  # along a side
+    every_px, most_places = 2.0, 24  # distance and largest number of places along a side
     ends = 0.12  # share of a side at either end where the corner's rounding is
     along = np.roll(quad, -1, axis=0) - quad
     lengths = np.linalg.norm(along, axis=1)
@@ -106,8 +106,8 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
 
 
 def _side(place: Array, offset_px: Array, sigma_px: Array, length_px: float) -> Array | None:
-    """(3,) the polynomial through most of the offsets (N,) of a side; None where too few were measured."""
-    sag = 0.003  # of a side: standard deviation of how far a lens bends it, beforehand
+    """(3,) coefficients of the polynomial through most of a side's offsets (N,); None where too few were measured."""
+    sag = 0.003  # prior standard deviation of a side's bend by the lens, as a share of its length
     terms = np.column_stack([np.ones_like(place), place, 1.0 - place**2])
     used = np.isfinite(offset_px)
     solution = np.zeros(3)
@@ -123,7 +123,7 @@ def _side(place: Array, offset_px: Array, sigma_px: Array, length_px: float) -> 
 
 
 def _crossings(quad: Array, sides: Array) -> Array:
-    """(4, 2) where neighbouring sides of the quad cross, each as far outside as its polynomial says at its ends."""
+    """(4, 2) px where neighbouring sides of the quad cross, each moved outwards by its polynomial's end values."""
     along = np.roll(quad, -1, axis=0) - quad
     along /= np.linalg.norm(along, axis=1)[:, None]
     outward = np.column_stack([along[:, 1], -along[:, 0]])

@@ -1,8 +1,8 @@
-"""One picture of what stands still, from several of a camera that does: robots and people are elsewhere in each.
+"""One picture of what stands still, from several pictures of a fixed camera in which robots and people move.
 
-A picture that is blurred, or that was taken after the camera was moved, is left out: its gradients tell by how far it
-lies aside of a reference (Lucas and Kanade, IJCAI 1981), in one robust linear fit with an affine motion, a gain and an
-offset.
+A picture that is blurred, or that was taken after the camera was moved, is left out. Its displacement from a reference
+is estimated from image gradients (Lucas and Kanade, IJCAI 1981), in one robust linear fit with an affine motion, a gain
+and an offset.
 """
 
 from __future__ import annotations
@@ -16,24 +16,26 @@ from ceres_cal.base import Array, Array32, Frozen, Image, InputError, most_bytes
 from ceres_cal.detect.images import light
 
 MOST_PICTURES = 25
-"""That one is made of: of video frames and photographs, evenly."""
-# How far a picture may lie aside, px.
+"""Number of pictures that one is made from, taken evenly from video frames and photographs."""
+# Largest displacement of a picture that is used, px.
 _MOVED_PX = 0.2
 # Share of the usual sharpness below which a picture is blurred. Noise is smoothed away before.
 _BLURRED = 0.5
-_BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # to a side; pixels that count of each, and so that it does
-_CLEAR = 4.0  # times the median gradient, which is noise and texture
-_ROUNDS, _BEND = 8, 2.0  # of the fit, and of what agrees; standard deviations from which on a level counts less
-_BAND, _EVERY = 64, 31  # rows worked on at once; pixels apart that tell the noise
-_NEAR = 3.0  # times the noise
+_BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # blocks to a side; pixels used of each; fewest pixels of a block that counts
+_CLEAR = 4.0  # limit of a clear gradient, in units of the median gradient, which is noise and texture
+# iterations of the fit, and of the choice of pictures; deviation (sigma) beyond which a level is down-weighted
+_ROUNDS, _BEND = 8, 2.0
+_BAND, _EVERY = 64, 31  # rows processed at once; step between the pixels from which noise is estimated
+_NEAR = 3.0  # largest deviation from the median, in standard deviations of the noise
 
 
 class MedianPicture(Frozen):
-    """One picture of several.
+    """One picture made from several.
 
     Attributes:
-        picture: (height, width) grey levels, 0 to `white`. used: names of those that took part. left_out: name and
-            reason of the others.
+        picture: (height, width) grey levels, 0 to `white`.
+        used: names of the pictures that took part.
+        left_out: name and reason of the others.
     """
 
     picture: Array32
@@ -43,12 +45,13 @@ class MedianPicture(Frozen):
 
 
 def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
-    """What the pictures show that stands still: each pixel's median, made finer by the mean of what is near it.
+    """Combine pictures into one of what stands still: each pixel's median, refined by the mean of the levels near it.
 
-    They are read one by one and kept in grey; of a camera that was moved in between those count that most agree with.
+    Pictures are read one by one and kept in grey. If the camera was moved in between, the largest group that agrees is
+    used.
 
     Args:
-        pictures: with their names, as (height, width) or (height, width, 3); MOST_PICTURES at most.
+        pictures: at most MOST_PICTURES, with their names, as (height, width) or (height, width, 3).
 
     Raises:
         InputError: there is none, no two show the same, they differ in size or depth, or are too many to be held at
@@ -58,7 +61,7 @@ def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
     sharpness = [float(np.mean(np.asarray(cv2.Laplacian(_smooth(one), cv2.CV_32F)) ** 2)) for one in greys]
     left_out = {n: "blurred" for n, one in enumerate(sharpness) if one < _BLURRED * np.median(sharpness)}
     sharp = [n for n in range(len(names)) if n not in left_out]
-    half = (len(sharp) + 1) // 2  # the camera may have been moved half way
+    half = (len(sharp) + 1) // 2  # the camera may have been moved half-way
     chosen = _agreeing(greys, sharp, sharp)
     if len(chosen) < half:
         chosen = max((chosen, *(_agreeing(greys, sharp, some) for some in (sharp[:half], sharp[half:]))), key=len)
@@ -77,7 +80,7 @@ def merged(pictures: Iterable[tuple[str, Image]]) -> MedianPicture:
 
 
 def _agreeing(greys: Sequence[Image], every: Sequence[int], some: Sequence[int]) -> list[int]:
-    """Those of the pictures that lie where what some of them show together does."""
+    """Return the pictures that are not displaced from the median of those of `some` that agree with each other."""
     kept = list(some)
     for _ in range(_ROUNDS):
         reference = _Reference.of(_middle([greys[n] for n in kept]))
@@ -117,9 +120,11 @@ class _Reference(Frozen):
     """A picture at its clearest pixels.
 
     Attributes:
-        pixels: (N,) their numbers. block: (N,) which part of the picture each is in. grey: (N,) its level, smoothed.
-        columns: (N, 8) by how much a level changes with a motion (x, y, and both by x and y), a gain and an offset.
-        reach: (2,) half the picture's size, the unit of x and y.
+        pixels: (N,) flat indices of the pixels.
+        block: (N,) number of the picture's block that each pixel is in.
+        grey: (N,) smoothed grey level.
+        columns: (N, 8) derivatives of a level by a motion (x, y, and both by x and y, in half the picture's size), a
+            gain and an offset.
     """
 
     pixels: Array
@@ -145,7 +150,7 @@ class _Reference(Frozen):
         return cls(chosen, block[chosen], level, columns)
 
     def moved_px(self, grey: Image) -> float:
-        """How far another picture lies aside, root mean square; infinity where it shows something else."""
+        """Root mean square displacement of another picture, px; infinity where it shows something else."""
         seen = _smooth(grey).ravel()[self.pixels].astype(float)
         alike = self._alike(seen)
         if 2 * sum(alike.values()) <= len(alike):
@@ -161,8 +166,8 @@ class _Reference(Frozen):
         return float(np.sqrt(moves[:2] @ moves[:2] + moves[2:] @ moves[2:] / 3.0))
 
     def _alike(self, seen: Array) -> dict[int, bool]:
-        """Whether each part of the picture that shows anything shows the same."""
-        alike = 0.6  # correlation of a block that shows the same; most must, as people hide some
+        """Whether each block of the picture that shows anything shows the same as the reference."""
+        alike = 0.6  # least correlation of a block that shows the same; most blocks must, as people hide some
         return {
             int(number): bool(np.corrcoef(self.grey[own], seen[own])[0, 1] > alike)
             for number, own in ((number, self.block == number) for number in np.unique(self.block))
@@ -171,7 +176,7 @@ class _Reference(Frozen):
 
 
 def _middle(greys: Sequence[Image]) -> Array32:
-    """Each pixel's median, made finer: the mean of the levels that are near it, (height, width)."""
+    """(height, width) median of each pixel, refined: the mean of those levels that are near the median."""
     some = np.stack([grey.ravel()[::_EVERY] for grey in greys]).astype(np.float32)
     noise = 1.4826 * float(np.median(np.abs(some - np.median(some, axis=0))))
     picture = np.empty(greys[0].shape, dtype=np.float32)
@@ -181,5 +186,6 @@ def _middle(greys: Sequence[Image]) -> Array32:
         near = np.abs(band - median) <= max(_NEAR * noise, 1.0)
         count = np.count_nonzero(near, axis=0)
         mean = np.sum(band, axis=0, where=near) / np.maximum(count, 1)
-        picture[row : row + _BAND] = np.where(count > 0, mean, median)  # of two that differ there is no level near
+        # two levels that differ have none near their median
+        picture[row : row + _BAND] = np.where(count > 0, mean, median)
     return picture

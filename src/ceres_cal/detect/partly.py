@@ -1,8 +1,8 @@
-"""Chessboards that are partly out of the picture: the squares that are seen, and which of the board's they are.
+"""Chessboards that are partly outside the picture: which squares are seen, and which of the board's squares they are.
 
-A few squares anywhere are found by OpenCV, and corners are added around them where the picture has a saddle as strong
-as the next one. On each side of what was found the board then either ends in the picture, or is cut off by its border;
-where that leaves one place on the board for the corners, they are named.
+OpenCV finds a few squares anywhere, and corners are added around them where the picture has a saddle as strong as the
+neighbouring one. On each side of what was found the board either ends in the picture or is cut off by the picture's
+border. If only one position on the board is consistent with this, the corners are named.
 """
 
 from __future__ import annotations
@@ -15,24 +15,27 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Image, Mask, medians_known
 from ceres_cal.detect.saddles import Saddles, fit_saddles, is_begun_dark, measure_saddles, steps_px
 
-# Of the contrast, root mean square: where the board ends dark squares meet the margin, which no saddle describes.
+# Largest root mean square misfit of a saddle, as a share of its contrast: where the board ends dark squares meet the
+# margin, which no saddle describes.
 _MISFIT = 0.25
-# Of the contrast of the corner next to it.
+# Least contrast of a new corner, as a share of that of the known corner next to it.
 _AS_STRONG = 0.75
-_BORDER_PX = 3.0  # nearer to it a corner has too few pixels on one side
-_CLEAR = 0.2  # of the corners' distance, from the border: less may be the error of where a corner is foreseen
-# Of the steps of the next line within. Of 82 real boards those of outer lines are 0.79 and more, with blur of 5 px or
-# noise of 12 grey levels 0.66; those beyond them 0.57 at most, and 0.56.
+_BORDER_PX = 3.0  # px from the picture's border; nearer to it a corner has too few pixels on one side
+_CLEAR = 0.2  # share of the corners' spacing, from the border: a predicted corner may be off by less
+# Limit of the contrast steps along a line of corners, as a share of those of the next line inside. On 82 real boards
+# the outermost lines have 0.79 or more, with blur of 5 px or noise of 12 grey levels 0.66; lines beyond the board's end
+# have 0.57 at most, with blur or noise 0.56.
 _ENDED = 0.7
-_QUARTERS = np.array([-0.35, -0.2, 0.2, 0.35])  # of a square, from its corner: a corner is foreseen to a tenth
+# offsets from a corner, in squares: a corner is predicted to a tenth of a square
+_QUARTERS = np.array([-0.35, -0.2, 0.2, 0.35])
 NO_PLACE = "no place on it"
 
 
 def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array | str:
-    """Corners (rows, columns, 2) px, NaN where one is not seen, or why there are none.
+    """Return corners (rows, columns, 2) px, NaN where one is not seen, or the reason why there are none.
 
     Args:
-        seed: (h, w, 2) px, right-handed: some neighbouring corners of the board, about where they are.
+        seed: (h, w, 2) px, right-handed: approximate positions of some neighbouring corners of the board.
     """
     grown = _grown(image, seed, max(columns, rows))
     if np.isnan(steps_px(grown.grid)).all():
@@ -47,8 +50,8 @@ def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array |
 
 
 def is_whole(image: Image, seen: Saddles) -> bool:
-    """Whether a board ends with the outer lines of its corners, neither before them nor beyond, as far as the picture
-    shows. OpenCV finds a board in a larger one, and lays a larger one over the margin of a smaller.
+    """Whether the board ends exactly with the outer lines of the corners, as far as the picture shows. OpenCV finds a
+    board within a larger one, and extends a smaller board over its margin.
     """
     steps = _steps_across(image, _foreseen(_padded(_clean(seen, image.shape).grid)))
     sides = (np.rot90(steps, turns)[:3] for turns in range(4))
@@ -56,15 +59,18 @@ def is_whole(image: Image, seen: Saddles) -> bool:
 
 
 def _excess(line: Array, within: Array) -> float:
-    """By how much the steps of a line exceed what they are where the board ends, judged by those of the next one."""
+    """Sum over a line by which its contrast steps exceed the limit for a board's end, given those of the next line
+    inside.
+    """
     return -float(np.nansum(line * np.sign(within) + _ENDED * np.abs(within)))
 
 
 def _steps_across(image: Image, grid: Array) -> Array:
-    """(rows, columns) half the step between dark and bright about each corner; NaN where it is not all in the picture.
-    Where a board ends three of the four quarters are alike, or two are: it is half of what it is within.
+    """(rows, columns) half the step between dark and bright around each corner; NaN where not all of it is in the
+    picture. Where a board ends, two or three of the four quarters around a corner are alike, so the step is half of
+    that inside.
     """
-    # Beyond the ends they go on as at the ends.
+    # Outside the grid the steps of its outermost lines are used.
     rows, columns = ([0, *range(size - 2), size - 3] for size in grid.shape[:2])
     u, v = (np.gradient(grid[1:-1, 1:-1], axis=axis)[rows][:, columns, None, None] for axis in (1, 0))
     places = grid[..., None, None, :] + _QUARTERS[:, None] * u + _QUARTERS[:, None, None] * v
@@ -78,7 +84,9 @@ def _steps_across(image: Image, grid: Array) -> Array:
 
 
 def _grown(image: Image, seed: Array, most: int) -> Saddles:
-    """All corners that the seed leads to, at most so many each way; measured once more when all are there."""
+    """Return all corners that are reached from the seed, at most `most` each way; all are measured once more at the
+    end.
+    """
     known = _trimmed(_clean(measure_saddles(image, seed), image.shape))
     for _ in range(2 * most):
         wider = Saddles(*map(_padded, vars(known).values()))
@@ -93,13 +101,13 @@ def _grown(image: Image, seed: Array, most: int) -> Saddles:
 
 
 def _clean(saddles: Saddles, shape: tuple[int, ...]) -> Saddles:
-    """Without what is no saddle, or too near to the border to be measured."""
+    """Leave out corners that are no saddle, or too near to the picture's border to be measured."""
     with np.errstate(invalid="ignore"):
         return saddles.without(~(_inside(saddles.grid, shape, _BORDER_PX) & (saddles.misfit < _MISFIT)))
 
 
 def _padded(values: Array) -> Array:
-    """With one more line on every side, of unknown corners."""
+    """Add one line of unknown corners on every side."""
     rows, columns, *rest = values.shape
     wider = np.full((rows + 2, columns + 2, *rest), np.nan)
     wider[1:-1, 1:-1] = values
@@ -134,7 +142,7 @@ def _shifted(values: Array, axis: int, by: int) -> Array:
 
 
 def _strong(contrast: Array, known: Array) -> Mask:
-    """Whether a corner's contrast is about that of a known one beside it, of the other sign."""
+    """Whether a corner's contrast is similar to that of a known corner beside it, with the opposite sign."""
     beside = np.array([-_shifted(known, axis, step) for axis in (0, 1) for step in (1, -1)])
     with np.errstate(invalid="ignore"):
         share = contrast / beside
@@ -151,8 +159,8 @@ def _inside(grid: Array, shape: tuple[int, ...], border_px: float) -> Mask:
 
 
 def _places(seen: Saddles, shape: tuple[int, ...], columns: int, rows: int) -> Iterator[tuple[tuple[int, ...], Array]]:
-    """Every place on the board that the corners can have: lines missing to the left, right, top and bottom of the
-    picture's grid, and the board's grid.
+    """Yield every position on the board that the corners can have: the number of lines missing to the left, right, top
+    and bottom of the picture's grid, and the board's grid.
     """
     ends = _ends(seen.grid, shape)
     height, width = seen.contrast.shape
@@ -165,14 +173,14 @@ def _places(seen: Saddles, shape: tuple[int, ...], columns: int, rows: int) -> I
             around = ((top, missing[3]), (left, missing[1]))
             grid = np.rot90(np.pad(seen.grid, (*around, (0, 0)), constant_values=np.nan), turns)
             contrast = np.rot90(np.pad(seen.contrast, around, constant_values=np.nan), turns)
-            # A quarter turn puts a bright square where a dark one was.
+            # A quarter turn puts a bright square in place of a dark one.
             if (columns + rows) % 2 == 0 or is_begun_dark(contrast if turns % 2 == 0 else -contrast):
                 yield missing, grid
 
 
 def _ends(grid: Array, shape: tuple[int, ...]) -> list[bool]:
-    """Whether the next line of corners to the left, right, top and bottom would be well in the picture: there is none,
-    so the board ends.
+    """Whether the board ends to the left, right, top and bottom: the next line of corners would be well inside the
+    picture, but is not there.
     """
     clear_px = _CLEAR * float(medians_known(steps_px(grid)))
     clear = _inside(_foreseen(_padded(grid)), shape, clear_px)

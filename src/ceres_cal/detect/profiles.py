@@ -1,19 +1,21 @@
-"""Where an edge, or a line of known width, crosses the pixels around a place: a model fitted to raw grey levels.
+"""Position of an edge, or of a line of known width, across the pixels around a place: a model fitted to raw grey
+levels.
 
 The model of a pixel at signed distance t from the place, along the normal, is
 
     I(t) = b + g t + sum_j h_j Phi((t - c - e_j) / s),
 
-a step of height h_j at each of the edges e_j that move together with c (one for an edge, two, half a width to either
+a step of height h_j at each of the edges e_j that move together with c (one for an edge; two, half a width to either
 side, for a painted line), blurred by a Gaussian of standard deviation s that stands for lens and pixel together, on a
-background of any slope that may differ from one side to the other. With g and the heights free, neither blur nor light
-nor slope pulls c aside: all are even about it. Nothing is interpolated, so the noise of the pixels is as the sensor
-made it, and the curvature of the least squares tells the standard deviation of c.
+background of any slope, which may differ between the two sides. With g and the heights free, blur, light and slope do
+not bias c: all are symmetric about it. Nothing is interpolated, so the noise of the pixels is as the sensor made it,
+and the curvature of the least-squares cost gives the standard deviation of c.
 
-A camera that moves while the shutter is open smears that over m along the normal: Phi becomes its mean from t - m / 2
-to t + m / 2. That is even about c, too, and its two ends tell c much better than a Gaussian as wide would. A lens with
-coma smears it, too, but more at one end: the weights 1 + q (1 - 2 u), u from 0 to 1 along the smear, lean to one side
-by q from -1 to 1. Then c is where their mean lies. Only means are seen at one place by lines of every direction.
+A camera that moves while the shutter is open smears the profile over m along the normal: Phi becomes its mean from t -
+m / 2 to t + m / 2. That is symmetric about c, too, and its two ends determine c much better than a Gaussian of the same
+width would. A lens with coma also smears it, but more at one end: the weights 1 + q (1 - 2 u), u from 0 to 1 along the
+smear, are asymmetric by q from -1 to 1. Then c is the mean of the smear, because only the mean is seen at one place by
+lines of every direction.
 """
 
 from __future__ import annotations
@@ -26,11 +28,11 @@ from ceres_cal.kernels import profile_equations
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
 _SHAPE_RANGE = (np.log([LEAST_BLUR_PX, 0.4, LEAST_SMEAR_PX]), np.log([MOST_BLUR_PX, 2.5, MOST_SMEAR_PX]))
-_SHAPE_SIGMA = np.array([1.0, 0.3, 1.0])  # of the logarithms of blur, stretch and smear, beforehand
-_HELD = 0.1  # of that of the stretch, where coma takes its part
+_SHAPE_SIGMA = np.array([1.0, 0.3, 1.0])  # prior standard deviations of the logarithms of blur, stretch and smear
+_HELD = 0.1  # factor on the prior standard deviation of the stretch where coma is fitted
 _MOST_STEP_PX = 0.7
-# Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
-# the pixels alone tell such a step and the line's place hardly apart.
+# Prior standard deviation of how much brighter one side of a line is than the other, grey levels. For a line much
+# narrower than its blur, the pixels alone hardly distinguish such a step from a shift of the line.
 _LEVEL_SIGMA = 5.0
 _TINY = 1e-9
 
@@ -39,9 +41,9 @@ class Windows(Rows):
     """Pixels around N places.
 
     Attributes:
-        values: (N, K) grey levels. distance: (N, K) signed distance along the normal from the curve through the
-            place, px; curves bend. inside: (N,) whether all of the window lies in the image; other rows hold no pixels
-            of any meaning.
+        values: (N, K) grey levels.
+        distance: (N, K) signed distance, px, along the normal from the (bent) curve through the place.
+        inside: (N,) whether all of the window lies in the image; the pixels of other rows have no meaning.
     """
 
     values: Array
@@ -50,13 +52,14 @@ class Windows(Rows):
 
 
 class Profiles(Rows):
-    """What fits the windows of N places best.
+    """Best fits to the windows of N places.
 
     Attributes:
-        offset_px: (N,) c, how far along the normal the middle of the edges lies from the place; NaN where no fit came
-            to rest.
-        sigma_px: (N,) standard deviation of it, from the scatter of the pixels about the model.
-        heights: (N, E) grey levels of each step. noise: (N,) standard deviation of the pixels about the model.
+        offset_px: (N,) c, the offset along the normal of the middle of the edges from the place; NaN where no fit
+            converged.
+        sigma_px: (N,) standard deviation of c, from the scatter of the pixels about the model.
+        heights: (N, E) height of each step, grey levels.
+        noise: (N,) standard deviation of the pixels about the model, grey levels.
     """
 
     offset_px: Array
@@ -66,8 +69,11 @@ class Profiles(Rows):
 
 
 class EdgeShape(Frozen, eq=True):
-    """What a picture makes of edges: blur_px, the Gaussian's standard deviation; stretch, a factor on the edges'
-    distances; smear_px, how far a camera that moved, or coma at the image's corner, smears them, 0 of none.
+    """Shape of edges in a picture.
+
+    Attributes:
+        blur_px: standard deviation of the Gaussian. stretch: factor on the edges' distances.
+        smear_px: length of the smear by a camera that moved, or by coma at the image's corner; 0 without smear.
     """
 
     blur_px: float
@@ -76,24 +82,26 @@ class EdgeShape(Frozen, eq=True):
 
     @property
     def logarithms(self) -> Array:
-        """(2,), or (3,) with a smear."""
+        """(2,) logarithms of blur and stretch, or (3,) with the smear's."""
         return np.log([self.blur_px, self.stretch, self.smear_px][: 3 if self.smear_px > 0.0 else 2])
 
 
 def cut_windows(
     image: Array32, places: Array, normals: Array, curvature: Array, half_length_px: float, half_width_px: int
 ) -> Windows:
-    """The pixels around places on curves.
+    """Cut out the pixels around places on curves.
 
     A window is made of whole rows or columns, whichever cross the curve more squarely, and follows its slope.
 
     Args:
-        places: (N, 2) px. normals: (N, 2) of length 1. curvature: (N,) 1/px, positive where the curve bends towards
-            its normal.
-        half_length_px: across the curve. half_width_px: along it.
+        places: (N, 2) px.
+        normals: (N, 2) of length 1.
+        curvature: (N,) 1/px, positive where the curve bends towards its normal.
+        half_length_px: half length of a window across the curve.
+        half_width_px: half width along it.
     """
     height, width = image.shape
-    level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])  # the curve is rather level: columns cross it
+    level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])  # the curve is rather horizontal: columns cross it
     along, across = np.where(level, places.T, places.T[::-1])
     n_along, n_across = np.where(level, normals.T, normals.T[::-1])
     u = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1)  # (N, U)
@@ -123,10 +131,14 @@ def fit_profiles(
     """Fit the model to every window.
 
     Args:
-        edges: (N, E) px: where the steps are, relative to c. blur_px: (N,) or one, the Gaussian's standard deviation.
-        reach_px: a c farther from the place than this is none. smear_px: (N,) or one, of what smears. lean: of it.
+        edges: (N, E) px, the positions of the steps relative to c.
+        blur_px: (N,) or one, the Gaussian's standard deviation.
+        reach_px: a fit with c farther from the place than this is rejected.
+        smear_px: (N,) or one, length of the smear.
+        lean: (N,) or one, q, the smear's asymmetry.
     """
-    most_steps, at_rest_px = 6, 1e-4  # Newton's; after one so small the next are below a hundredth of a window's sigma
+    # Newton steps; after one as small as this the next are below a hundredth of a window's sigma
+    most_steps, at_rest_px = 6, 1e-4
     offset = np.zeros(len(windows.values))
     steps = _Steps(edges, *(np.broadcast_to(np.asarray(one, float), offset.shape) for one in (blur_px, smear_px, lean)))
     normal, right = steps.equations(windows, offset, None)
@@ -149,14 +161,14 @@ def fit_profiles(
         if not len(moving):
             break
     misfit = np.maximum(variance, 0.0) * (windows.values.shape[1] / (windows.values.shape[1] - len(level)))
-    noise = np.sqrt(misfit + 1.0 / 12.0)  # what rounding to whole levels hides
+    noise = np.sqrt(misfit + 1.0 / 12.0)  # variance of rounding to whole levels
     sigma = noise * np.sqrt(np.maximum(np.linalg.inv(held + _ridge(held))[:, -1, -1], 0.0))
     good = windows.inside & (np.abs(step) < 0.05) & (np.abs(offset) <= reach_px) & np.isfinite(sigma) & (sigma > 0.0)
     return Profiles(np.where(good, offset, np.nan), np.where(good, sigma, np.inf), heights, noise)
 
 
 def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Array:
-    """(N,) squared residuals of any solution of the normal equations, or of none of them."""
+    """(N,) sum of squared residuals for any vector, even one that does not solve the normal equations."""
     explained = np.matmul(normal, solution[:, :, None])[:, :, 0]
     return np.asarray(squares - np.sum(solution * (2.0 * right - explained), axis=1))
 
@@ -164,15 +176,15 @@ def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Arr
 def fit_shape(
     windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8, along: Array | None = None
 ) -> EdgeShape:
-    """What all windows share: the blur, the factor on the edges' distances that suits them best, and the smear.
+    """Estimate what all windows share: the blur, the factor on the edges' distances, and the smear.
 
-    Each is pulled towards where it starts, by as much as one window in good light would outweigh: of a line that is
-    narrower than its blur no picture tells the width.
+    Each has a prior at its starting value, with the weight of less than one window in good light: no picture determines
+    the width of a line that is narrower than its blur.
 
     Args:
-        start: where to start; without a smear none is looked for.
-        along: (N,) of coma, -1 to 1: how long each window's smear is beside that of the shape, and which way it leans;
-            the edges' distances are held then, as what leans may be wide.
+        start: starting values; without a smear none is fitted.
+        along: (N,) -1 to 1, for coma: length of each window's smear relative to the shape's, and the sign of its
+            asymmetry. The edges' distances are then held, since an asymmetric smear can be taken for width.
     """
     begin, sigma = start.logarithms, _SHAPE_SIGMA * (1.0, 1.0 if along is None else _HELD, 1.0)
     ones = np.ones(len(windows.values))
@@ -210,7 +222,7 @@ def fit_shape(
 
 
 class _Steps(Rows):
-    """Steps at `edges` (N, E) beside each c, blurred by `blur` (N,), smeared over `smear` (N,) px that `lean` (N,)."""
+    """Steps at `edges` (N, E) beside each c, with `blur` (N,) px and a `smear` (N,) px of asymmetry `lean` (N,)."""
 
     edges: Array
     blur: Array
@@ -220,8 +232,8 @@ class _Steps(Rows):
     def equations(
         self, windows: Windows, offset: Array, heights: Array | None, *, free: int = 0
     ) -> tuple[Array, Array]:
-        """Normal equations (N, P, P) and (N, P) of the model: by b, g, each height; with heights by c too; and by as
-        many as are `free` of the logarithms of blur, the edges' stretch and smear.
+        """Return the normal equations (N, P, P) and (N, P) of the model. Unknowns are b, g and each height; if heights
+        are given also c, and the first `free` of the logarithms of blur, the edges' stretch and smear.
         """
         count, edges = self.edges.shape
         smear = np.maximum(self.smear, LEAST_SMEAR_PX) if np.any(self.smear) else self.smear
@@ -234,7 +246,7 @@ class _Steps(Rows):
 
 
 def _ridge(normal: Array) -> Array:
-    """Next to nothing on each diagonal, so that a window without any contrast has a solution."""
+    """Negligible diagonal terms with which a window without any contrast has a solution."""
     size = normal.shape[1]
     scale = np.maximum(np.einsum("npp->np", normal), _TINY)
     return np.asarray(np.eye(size) * (1e-9 * scale + _TINY)[:, :, None])

@@ -1,6 +1,8 @@
-"""From a start that is far off: which shift, turn and scale of what a camera should see lies best on the bright lines.
+"""Registration with a poor initial estimate: the shift, turn and scale by which predicted curves best match bright
+lines.
 
-A photograph is reduced to how near each pixel is to something thin and bright; thousands of shifts are tried on that.
+A photograph is reduced to a map of how near each pixel is to something thin and bright; thousands of shifts are tried
+on this map.
 """
 
 from __future__ import annotations
@@ -19,17 +21,17 @@ _TURNS_DEG = np.arange(-7.5, 7.6, 1.25)
 
 
 class Nearness(Frozen):
-    """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, REDUCED times smaller."""
+    """(H, W) nearness of a photograph's pixels to bright lines, from 1 on them to 0 far away, REDUCED times smaller."""
 
     plane: Array32
 
     @property
     def length_px(self) -> float:
-        """The length of the lines, with what is near to their ends."""
+        """Length of the lines, including what is near to their ends, px."""
         return float(np.sum(self.plane) * REDUCED**2 / (np.sqrt(2.0 * np.pi) * _NEAR_PX))
 
     def score(self, pixels: Array) -> float:
-        """Mean nearness of places (N, 2) px; those outside the image count as far off."""
+        """Mean nearness of places (N, 2) px; those outside the image count as far away."""
         return float(np.mean(self.at(pixels[:, 0], pixels[:, 1])))
 
     def at(self, x: Array, y: Array) -> Array:
@@ -42,8 +44,8 @@ class Nearness(Frozen):
 
 
 def nearness(grey: Array32, width_px: float) -> Nearness:
-    """How near each pixel is to something brighter than its surroundings and about `width_px` wide, or less."""
-    speck_px = 25  # fewer connected pixels are no line
+    """Return how near each pixel is to something at most about `width_px` wide and brighter than its surroundings."""
+    speck_px = 25  # fewer connected pixels than this are no line
     soft = cv2.GaussianBlur(grey, (0, 0), 0.8)
     size = 2 * int(np.ceil(width_px) + 2) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -57,7 +59,7 @@ def nearness(grey: Array32, width_px: float) -> Nearness:
 
 
 def nearness_to(mask: Mask) -> Nearness:
-    """How near each pixel is to those of a mask (height, width)."""
+    """Return how near each pixel is to the pixels of a mask (height, width)."""
     size = mask.shape[1] // REDUCED, mask.shape[0] // REDUCED
     if not np.any(mask):
         return Nearness(np.zeros(size[::-1], np.float32))
@@ -67,8 +69,8 @@ def nearness_to(mask: Mask) -> Nearness:
 
 
 def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_px: float, most: int) -> list[Array]:
-    """The best places (N, 2) px for a course that may be off by `reach_px` and some degrees: each a shift, turn and
-    scale of its pixels about the image's middle, the best first, `most` at most.
+    """Return the best positions (N, 2) px of a course that may be off by `reach_px` and some degrees. Each is a shift,
+    turn and scale of its pixels about the image's middle; the best is first, and there are at most `most`.
     """
     apart_px = 25.0
     scales = (0.92, 1.0, 1.08)

@@ -1,8 +1,8 @@
-"""The paper's concentric rings (section 2) from a photograph: sub-pixel edges along rays from a centre that is found.
+"""The paper's concentric rings (section 2) in a photograph: sub-pixel edges along rays from an estimated centre.
 
-The light's gradient points to or from the centre everywhere on the rings, whatever the lens does along the radius.
-From the centre outwards each ring's edge is followed on all rays at once and smoothed, so that a ray that misses an
-edge (a shadow, a hand) does not shift the count of those beyond it.
+The light's gradient points to or from the centre everywhere on the rings, whatever the lens does along the radius. From
+the centre outwards each ring's edge is followed on all rays at once and smoothed, so that a ray that misses an edge (a
+shadow, a hand) does not miscount the rings farther out.
 """
 
 from __future__ import annotations
@@ -21,36 +21,37 @@ from ceres_cal.scene.targets import rings
 
 TARGET_NAME = "rings"
 RAYS = 360
-_ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS  # (RAYS,) in which they go out from the centre
+_ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS  # (RAYS,) directions of the rays, rad
 _STEP_PX = 0.5
-# Share of the rays on which a ring must be seen (of those that reach it inside the image). Nothing changes from half
-# to double.
+# Least share of the rays that show a ring (among those that reach it inside the image). Nothing changes from half to
+# double.
 _FEWEST_RAYS = 0.25
-_HARMONICS = 3  # of a ring's radius over its angle: what tilt and a centre beside the axis make of it
+_HARMONICS = 3  # of a ring's radius as a function of its angle, for tilt and a centre beside the optical axis
 _HALF_LENGTH_PX, _HALF_WIDTH_PX = 5.0, 2
-# Times the noise. Nothing changes from half to double.
+# Least contrast of an edge, in units of the noise. Nothing changes from half to double.
 _LEAST_CONTRAST = 8.0
-# Times the usual misfit of a window: something else is in it. Half of it takes out 0.5 % of the edges, double none
-# fewer.
+# Largest misfit of a window, in units of the usual one: beyond it something else is in the window. Half of it rejects
+# 0.5 % of the edges, double none fewer.
 _NOISY = 3.0
-# Times the usual distance from the ring's smooth course. Half of it takes out 3 % of the edges, double next to none
-# fewer.
+# Largest distance from the ring's smooth course, in units of the usual one. Half of it rejects 3 % of the edges, double
+# next to none fewer.
 _FAR = 5.0
-# Of the largest radius; rings counted wrongly by one make more of it. Nothing changes from half to double.
+# Largest misfit of a ring, as a share of the largest radius; rings miscounted by one give more. Nothing changes from
+# half to double.
 _MOST_MISFIT = 0.004
 
 
 class RingsDetection(Frozen):
-    """What `detect_rings` found.
+    """Result of `detect_rings`.
 
     Attributes:
-        observations: one view, its edges as curve observations.
-        centre: (2,) px, where the rings' common centre is seen.
-        rings: how many, from the inside out; those beyond are outside the image.
-        polynomial: (3,) the paper's a1, a2, a3 (section 2), r' in units of the first ring's measured radius per its
-            real one: r' = a1 r + a2 r^2 + a3 r^3 px.
-        rms_px: of the rings' radii about that polynomial, in measured pixels.
-        blur_px: standard deviation of the picture's blur, lens and pixel together.
+        observations: one view, with its edges as curve observations.
+        centre: (2,) px, image of the rings' common centre.
+        rings: number of rings found, from the inside out; those beyond are outside the image.
+        polynomial: (3,) the paper's a1, a2, a3 (section 2): r' = a1 r + a2 r^2 + a3 r^3 px, with r' scaled so that the
+            first ring's measured and real radius agree.
+        rms_px: root mean square residual of the rings' radii about that polynomial, in measured pixels.
+        blur_px: standard deviation of the picture's blur by lens and pixel together.
     """
 
     observations: Observations
@@ -64,17 +65,18 @@ class RingsDetection(Frozen):
 def detect_rings(
     image: str | Path, radii_m: Sequence[float], camera: str = "camera", station: str | None = None
 ) -> RingsDetection:
-    """Edges of concentric rings in a photograph that shows them about from the front.
+    """Detect the edges of concentric rings in a photograph that shows them approximately from the front.
 
-    `sigma_px` of each observation is that of its own fit to the pixels, times a factor that makes the scatter from
-    ring to ring's smooth course what it is.
+    `sigma_px` of each observation is that of its own fit to the pixels, times a common factor that is estimated from
+    the scatter about the rings' smooth courses.
 
     Args:
         image: a file of any kind OpenCV reads.
-        radii_m: of the edges between dark and bright, from the inside out; those outside the image need not be seen.
+        radii_m: radii of the edges between dark and bright, from the inside out; those outside the image need not be
+            seen.
 
     Raises:
-        InputError: not an image, no rings in it, or other rings than the radii tell; the message names the file.
+        InputError: not an image, no rings in it, or other rings than the radii describe; the message names the file.
     """
     sheet = rings(radii_m)
     grey = read_grey(image).astype(np.float32)
@@ -87,7 +89,7 @@ def detect_rings(
     frame, size = frame_of(image), (int(grey.shape[1]), int(grey.shape[0]))
     views = (View(frame, camera, station or camera, TARGET_NAME, frame),)
     observations = Observations({TARGET_NAME: sheet}, {camera: size}, views, NO_POINTS, edges)
-    # The first ring's own middle: farther out, tilt makes the gradients miss the centre.
+    # The centre is the first ring's own middle: farther out, tilt makes the gradients miss the centre.
     own = tracks[0].series[[1, 1 + _HARMONICS]]
     return RingsDetection(observations, centre + own, len(tracks), polynomial, rms, blur)
 
@@ -96,7 +98,9 @@ def detect_rings(
 
 
 class _Track(Frozen):
-    """A ring's edge around the centre: its radius over the angle as a Fourier series, and which way it steps."""
+    """A ring's edge around the centre: its radius as a Fourier series of the angle, and whether it gets brighter
+    outwards.
+    """
 
     series: Array
     rises: bool
@@ -106,13 +110,13 @@ class _Track(Frozen):
 
 
 def _waves(angle: Array, harmonics: int = _HARMONICS) -> Array:
-    """(N, 1 + 2 harmonics) 1, cos, cos 2, ..., sin, sin 2, ..."""
+    """(N, 1 + 2 harmonics) columns 1, cos t, cos 2t, ..., sin t, sin 2t, ... for angles t (N,)."""
     orders = np.arange(1, harmonics + 1) * angle[:, None]
     return np.column_stack([np.ones(len(angle)), np.cos(orders), np.sin(orders)])
 
 
 def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
-    """The rings' edges from the inside out, `most` at most, as far as enough rays show them.
+    """Return the rings' edges from the inside out, at most `most`, as far as enough rays show them.
 
     One more than `most` is an error.
     """
@@ -137,7 +141,9 @@ def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
 
 
 def _slopes(grey: Array32, centre: Array) -> tuple[Array, Array]:
-    """(RAYS, N) change of the light along each ray, NaN outside the image, and (RAYS,) how far it stays inside, px."""
+    """(RAYS, N) derivative of the light along each ray, NaN outside the image, and (RAYS,) how far a ray stays inside,
+    px.
+    """
     height, width = grey.shape
     steps = np.arange(0.0, float(np.hypot(height, width)), _STEP_PX)
     x = centre[0] + np.cos(_ANGLES)[:, None] * steps
@@ -153,10 +159,10 @@ def _slopes(grey: Array32, centre: Array) -> tuple[Array, Array]:
 
 
 def _next_edges(slope: Array, inner: Array, limit: float, rises: bool | None) -> tuple[Array, bool]:
-    """(RAYS,) radius of the first edge beyond `inner` on each ray, NaN without one, and whether edges rise.
+    """(RAYS,) radius, px, of the first edge beyond `inner` on each ray, NaN without one, and whether edges rise.
 
     Args:
-        rises: whether light must grow outwards there; None: as most rays have it.
+        rises: whether light must increase outwards there; None for the sign that most rays have.
     """
     if rises is None:
         up, down = (_next_edges(slope, inner, limit, sign)[0] for sign in (True, False))
@@ -171,7 +177,7 @@ def _next_edges(slope: Array, inner: Array, limit: float, rises: bool | None) ->
 
 
 def _smooth(edges: tuple[Array, bool], reach: Array) -> _Track | None:
-    """The smooth course of most of the edges; None where too few rays have one."""
+    """Fit the smooth course of most of the edges; None where too few rays have one."""
     radius, rises = edges
     seen = np.isfinite(radius)
     if np.count_nonzero(seen) < 8:
@@ -179,7 +185,7 @@ def _smooth(edges: tuple[Array, bool], reach: Array) -> _Track | None:
     usual = float(np.median(radius[seen]))
     used = seen & (np.abs(radius - usual) < 0.15 * usual + 2.0)
     waves, series = _waves(_ANGLES), np.zeros(1 + 2 * _HARMONICS)
-    pull = np.diag([0.0] + [1e-2] * (2 * _HARMONICS)) * RAYS  # stretches without an edge must not swing
+    pull = np.diag([0.0] + [1e-2] * (2 * _HARMONICS)) * RAYS  # keeps the series from oscillating where there is no edge
     for limit in (6.0, 3.0, 2.0, 2.0, 2.0):
         if np.count_nonzero(used) < 8:
             return None
@@ -192,7 +198,7 @@ def _smooth(edges: tuple[Array, bool], reach: Array) -> _Track | None:
 
 
 def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], expected: int) -> None:
-    """Raise InputError where a ring is missing whose place would be well inside the image."""
+    """Raise InputError where a ring is missing although its place would be well inside the image."""
     if len(tracks) == expected:
         return
     means = np.array([track.series[0] for track in tracks])
@@ -209,7 +215,7 @@ def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], ex
 
 
 def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[Curves, float]:
-    """The edges as observations of the rings by number, and the usual blur."""
+    """Return the edges as observations of the rings by number, and the usual blur, px."""
     radii = np.array([track.radius(_ANGLES) for track in tracks])
     # A window ends before the next edge begins, and neighbouring windows of a ring do not overlap.
     gap = np.min(np.diff(np.vstack([np.zeros(RAYS), radii, 2.0 * radii[-1] - radii[-2]]), axis=0), axis=1)
@@ -230,7 +236,7 @@ def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[C
 def _measured_ring(
     grey: Array32, centre: Array, track: _Track, angle: Array, half_length_px: float
 ) -> tuple[Array, Array, float]:
-    """Pixels (N, 2), NaN where there is no edge, their sigmas, and the blur."""
+    """Return pixels (N, 2), NaN where there is no edge, their sigmas (N,) px, and the blur, px."""
     radius = track.radius(angle)
     outward = np.column_stack([np.cos(angle), np.sin(angle)])
     places = centre + radius[:, None] * outward
@@ -250,7 +256,7 @@ def _measured_ring(
 
 
 def _usual(ring: Indices32, radius: Array, sigma: Array, angle: Array) -> tuple[Mask, float]:
-    """Which edges lie on the smooth course of their ring, and the factor on sigma that their scatter tells."""
+    """Return which edges lie on their ring's smooth course, and the factor on sigma that explains their scatter."""
     kept, pulls = np.isfinite(radius), [np.zeros(0)]
     for number in range(int(ring.max()) + 1):
         rows = np.flatnonzero(kept & (ring == number))
@@ -277,10 +283,10 @@ def _usual(ring: Indices32, radius: Array, sigma: Array, angle: Array) -> tuple[
 
 
 def _polynomial(edges: Curves, centre: Array, radii_m: Array) -> tuple[Array, float]:
-    """The paper's fit (section 2) to all edges, and its rms in measured pixels.
+    """Fit the paper's polynomial (section 2) to all edges; return it and its rms in measured pixels.
 
-    Tilt, and a centre beside the lens's axis, add what goes round once or twice: it is fitted along with the
-    polynomial, or rings of which the image shows only a part would pull it aside.
+    Tilt, and a centre beside the lens's axis, add first and second harmonics of the angle. These are fitted along with
+    the polynomial; otherwise rings of which the image shows only a part would bias it.
     """
     number, away = edges.feature, edges.pixels - centre
     angle, radius = np.arctan2(*away.T[::-1]), np.linalg.norm(away, axis=1)
@@ -309,8 +315,8 @@ def _polynomial(edges: Curves, centre: Array, radii_m: Array) -> tuple[Array, fl
 
 
 def ring_centre(grey: Array32) -> Array:
-    """Where the gradients' lines meet, (2,) px: by votes on a grid, then by least squares."""
-    clear = 12.0  # from black to white over the noise: rings have been found from 8 on
+    """Return the point (2,) px where the gradients' lines meet: by votes on a grid, then by least squares."""
+    clear = 12.0  # least ratio of black-to-white contrast to noise: rings have been found from 8 on
     soft = cv2.GaussianBlur(grey, (0, 0), 1.5)
     gradient = np.dstack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)]).astype(float)
     strength = np.hypot(gradient[..., 0], gradient[..., 1])

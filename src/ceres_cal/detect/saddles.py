@@ -1,6 +1,7 @@
-"""Where the corners of a chessboard are, to a hundredth of a pixel: a model of the picture fitted around each corner.
+"""Corners of a chessboard, to a hundredth of a pixel: a model of the picture is fitted around each corner.
 
-Around a corner the picture is a saddle: two dark and two bright squares, parted by two edges that cross in the corner,
+Around a corner the picture is a saddle: two dark and two bright squares, separated by two edges that cross in the
+corner,
 
     I(p) = m + g . (p - x) + (a + h . (p - x)) tanh(s d1(p)) tanh(s d2(p)),
 
@@ -10,17 +11,17 @@ bends them) is that of the grid of neighbouring corners. The eleven numbers are 
 a disc around the corner.
 
 The picture is first smoothed a little. That spreads every edge over several pixels, so that its profile, whatever the
-camera made of it (sharpening, motion, sharp edges between two pixels), is symmetric about it and moves nothing. Without
-it the corners of an image sharpened along its rows were off by 0.1 px, with it by 0.01 px.
+camera made of it (sharpening, motion, sharp edges between two pixels), is symmetric and does not bias the corner.
+Without smoothing the corners of an image sharpened along its rows were off by 0.1 px, with it by 0.01 px.
 
-A blurred picture of large squares is shrunk first, by no more than its blur: a disc of 20 px radius sees little else
-there. At a blur of 8 px in squares of 120 px corners are then off by 0.009 px instead of 0.065.
+A blurred picture of large squares is shrunk first, by at most its blur: a disc of 20 px radius shows little but blur
+there. At a blur of 8 px in squares of 120 px, corners are then off by 0.009 px instead of 0.065.
 
-Measured on rendered boards (lens distortion, tilt, blur of 0.7 px, noise of 2 grey levels at a contrast of 160), rms
-per coordinate: 0.005 px, where `cv2.cornerSubPix` gives 0.020 px with its best window and `cv2.findChessboardCornersSB`
-0.04 px. What remains is noise, and averages out: in renderings of a real 13-image set the focal length (700 px) comes
-out right to 0.04 px, and 0.4 to 1.0 px short with `cornerSubPix`, whatever its window. The number does not tell how
-flat the board is.
+Accuracy measured on rendered boards (lens distortion, tilt, blur of 0.7 px, noise of 2 grey levels at a contrast of
+160), rms per coordinate: 0.005 px, where `cv2.cornerSubPix` gives 0.020 px with its best window and
+`cv2.findChessboardCornersSB` 0.04 px. What remains is noise, and averages out: in renderings of a real 13-image set the
+focal length (700 px) is right to 0.04 px, and 0.4 to 1.0 px too short with `cornerSubPix`, whatever its window. These
+figures do not include how flat the board is.
 """
 
 from __future__ import annotations
@@ -32,21 +33,24 @@ from ceres_cal import kernels
 from ceres_cal.base import AnyArray, Array, Frozen, Mask, medians_known
 
 REACH = 0.6
-"""Radius of the disc around a corner as a part of the distance to the next edges: further, they would be in it."""
+"""Radius of the disc around a corner, as a share of the distance to the next edges, which it must not contain."""
 
 _SMOOTHING_PX = 0.7
 _RADIUS_PX = (3.0, 20.0)
-# A corner that moved further, as a part of that distance, followed something else. Nothing changes from 0.33 to 0.67.
+# Largest move of a corner during its fit, as a share of the distance to the next edges: beyond it the fit followed
+# something else. Nothing changes from 0.33 to 0.67.
 _LOST = 0.5
-_ROUGH = 0.6  # of the reach, in the first fit
-_WHOLE = 32.0  # px, by which no picture is shrunk
-# A contrast below this part of the usual one shows something else: a sticker, a finger. Nothing changes from half to
-# double.
+_ROUGH = 0.6  # radius of the disc in the first fit, as a share of the reach
+_WHOLE = 32.0  # px, step of a cut-out's first pixel: no picture is shrunk by so much
+# Least contrast, as a share of the usual one: a lower one shows something else, a sticker or a finger. Nothing changes
+# from half to double.
 _FAINT = 0.2
-_ROUNDING = 1e-6  # of the brightest pixel: in a picture of one grey every contrast is rounding
-_BLUR = 0.8  # sharpness times the standard deviation of a Gaussian blur: tanh then has its slope
+# least contrast, as a share of the brightest pixel: in a picture of one grey every contrast is rounding
+_ROUNDING = 1e-6
+# product of sharpness and standard deviation of a Gaussian blur for which tanh has the slope of the blurred edge
+_BLUR = 0.8
 
-# Places in a row of what the kernel has fitted.
+# Columns of the kernel's fitted parameters.
 _ANGLES, _SHARP, _CONTRAST, _LEFT, _FITTED = slice(2, 4), 4, 8, 11, 14
 
 
@@ -57,7 +61,7 @@ class Saddles(Frozen):
         grid: (rows, columns, 2) px; NaN where no corner was measured.
         contrast: (rows, columns) grey levels, half the step from dark to bright; positive where the square towards the
             next row and column is dark. Neighbours differ in sign.
-        misfit: (rows, columns) root mean square of what the model leaves of the picture, as a part of the contrast.
+        misfit: (rows, columns) root mean square residual of the model, as a share of the contrast.
     """
 
     grid: Array
@@ -65,22 +69,22 @@ class Saddles(Frozen):
     misfit: Array
 
     def without(self, wrong: Mask) -> Saddles:
-        """With some corners (rows, columns) left out."""
+        """Return the corners with those of a mask (rows, columns) left out."""
         return Saddles(*(np.where(wrong.T, np.nan, values.T).T for values in vars(self).values()))
 
 
 def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddles:
-    """The corners of a board near where a detector saw them.
+    """Measure the corners of a board near where a detector saw them.
 
-    A corner is left out (NaN) where the fit walks away from its start, where the contrast has the wrong sign for its
-    place on the board or is far below the others', or where no neighbour tells the direction of its edges: never by how
-    well it suits a camera.
+    A corner is left out (NaN) where the fit moves away from its start, where the contrast has the wrong sign for its
+    place on the board or is far below the others', or where no neighbour gives the direction of its edges. Agreement
+    with a camera is never a criterion.
 
     Args:
         image: (height, width), any depth.
-        grid: (rows, columns, 2) px, right-handed (columns x rows > 0 in the image), good to a few pixels; NaN where
+        grid: (rows, columns, 2) px, right-handed (columns x rows > 0 in the image), accurate to a few pixels; NaN where
             nothing was seen.
-        reach: radius of the disc around a corner as a part of the distance to the next edges.
+        reach: radius of the disc around a corner, as a share of the distance to the next edges.
     """
     fitted = fit_saddles(image, grid, np.ones(grid.shape[:2], dtype=bool), reach)
     rows, columns = np.indices(fitted.contrast.shape)
@@ -90,7 +94,9 @@ def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddl
 
 
 def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH) -> Saddles:
-    """The saddles near the wanted places (rows, columns) of a grid; the others say where edges run."""
+    """Fit saddles near the wanted corners (rows, columns) of a grid; the other corners only give the directions of
+    edges.
+    """
     corner, level = _around(image, grid)
     seen, discs, first = grid - corner, (reach, wanted), (_ROUGH * reach, wanted)
     smooth = _smoothed(level)
@@ -109,7 +115,7 @@ def fit_saddles(image: AnyArray, grid: Array, wanted: Mask, reach: float = REACH
 
 
 def _around(image: AnyArray, grid: Array) -> tuple[Array, AnyArray]:
-    """The part of a picture that discs around a grid can reach, and x and y of its first pixel."""
+    """Return x and y of the first pixel of the part of a picture that discs around a grid can reach, and that part."""
     margin = np.fmax.reduce(steps_px(grid), initial=_RADIUS_PX[1]) + _RADIUS_PX[1]
     known = grid[np.isfinite(grid).all(axis=-1)]
     if not len(known):
@@ -123,7 +129,7 @@ def _around(image: AnyArray, grid: Array) -> tuple[Array, AnyArray]:
 
 
 def steps_px(grid: Array) -> Array:
-    """(K,) px between neighbouring corners, NaN where one is not seen."""
+    """(K,) distances, px, between neighbouring corners, NaN where one of them is not seen."""
     steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1, 2) for axis in (0, 1)])
     return np.asarray(np.linalg.norm(steps, axis=1))
 
@@ -133,21 +139,21 @@ def _smoothed(level: AnyArray) -> AnyArray:
 
 
 def is_begun_dark(contrast: Array) -> bool:
-    """Whether the square between a grid's first corner and the next row and column is dark, by all of its contrasts."""
+    """Whether the square between a grid's first corner and the next row and column is dark, judged by all contrasts."""
     rows, columns = np.indices(contrast.shape)
     return bool(np.nansum(np.where((rows + columns) % 2 == 0, contrast, -contrast)) > 0.0)
 
 
 def _started(fitted: Array, seen: Array, wanted: Mask) -> Array:
-    """What the next fit begins with, (rows, columns, _LEFT): what was not wanted is where it was seen."""
+    """Return the start of the next fit, (rows, columns, _LEFT); unwanted corners stay where they were seen."""
     start = np.where(wanted[..., None], fitted[..., :_LEFT], np.nan)
     start[~wanted, :2] = seen[~wanted]
     return start
 
 
 def _shrink(fitted: Array, distance: Array, reach: float) -> int:
-    """By how much the picture is shrunk for the last fit: as far as its blur allows, where a disc of the most pixels
-    would see but a part of each square, or nothing but blur.
+    """Return the factor by which the picture is shrunk for the last fit. It is as large as the blur allows, and larger
+    than 1 only where a disc of the most pixels would see only a part of each square, or nothing but blur.
     """
     sharp = fitted[..., _SHARP]
     if not np.any(np.isfinite(sharp + distance)):
@@ -162,9 +168,9 @@ def _shrunk(level: AnyArray, factor: int) -> AnyArray:
 
 
 def _fit_grid(smooth: AnyArray, start: Array, edges: _Edges, seen: Array, discs: tuple[float, Mask]) -> Array:
-    """What one fit has found, (rows, columns, _FITTED); NaN where a corner got lost on its way from where it was
-    `seen`. `start`: places, from which it is fitted roughly and where the edges bend is not known yet, or what such a
-    fit has found. `edges`: of the start. `discs`: their reach, and which corners are wanted.
+    """Fit the wanted corners once; return (rows, columns, _FITTED), NaN where one moved too far from where it was
+    `seen`. `start`: places, for a rough fit with straight edges, or the result of such a fit. `edges`: geometry of the
+    edges at the start. `discs`: their reach, and the mask of the wanted corners.
     """
     reach, wanted = discs
     (along_row, row_bend), (along_column, column_bend), distance = edges
@@ -191,7 +197,7 @@ _Edges = tuple[tuple[Array, Array], tuple[Array, Array], Array]
 
 
 def _edges(grid: Array) -> _Edges:
-    """Tangent and curvature of the edge along each row and along each column, and how far (px) the next edges are."""
+    """Tangent and curvature of the edge along each row and along each column, and distance (px) to the next edges."""
     along_row, row_bend, row_step = _line_geometry(grid, axis=1)
     along_column, column_bend, column_step = _line_geometry(grid, axis=0)
     turn = _cross(along_row, along_column)  # sine of the angle between the edges
@@ -207,10 +213,10 @@ def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
     ahead, behind = np.concatenate([steps, gap]), np.concatenate([gap, steps])
     chord = np.where(np.isnan(behind), ahead, np.where(np.isnan(ahead), behind, 0.5 * (ahead + behind)))
     length = np.hypot(chord[..., 0], chord[..., 1])
-    with np.errstate(divide="ignore", invalid="ignore"):  # where two are foreseen at one place
+    with np.errstate(divide="ignore", invalid="ignore"):  # where two corners are predicted at one place
         tangent = chord / length[..., None]
         bend = _cross(tangent, ahead - behind) / length**2
-    # At the ends of a line the next corner's curvature serves; where nothing is known the line is straight.
+    # At the ends of a line the next corner's curvature is used; without any, the line is straight.
     after, before = np.concatenate([bend[1:], gap[..., 0]]), np.concatenate([gap[..., 0], bend[:-1]])
     for other in (after, before, np.zeros_like(bend)):
         bend = np.where(np.isnan(bend), other, bend)

@@ -1,11 +1,11 @@
-"""By how much a sensor's pixels draw lines aside that are thinner than they are, which a picture tells by itself.
+"""Displacement of lines thinner than a sensor's pixels, which is estimated from the picture itself.
 
-A line that lies on the middle of a row of pixels, or between two rows, is drawn there. Elsewhere a sharp lens and a
-colour sensor, of whose pixels most colours are filled in, draw it up to 0.12 px towards one of them, by where it lies
-in the pixel; and at 45 degrees by where it lies between the diagonals that see green. Red and blue are seen in every
-other row only, so what weighs them unlike waves over two pixels. Along a line in such a direction that changes slowly,
-so that many places err together; nearer and farther ones tell it all the same, since lines are straight or round and
-what is drawn of them waves.
+A line on the middle of a row of pixels, or midway between two rows, is imaged in its place. Elsewhere a sharp lens and
+a colour sensor, which interpolates most colours, displace it by up to 0.12 px towards one of them, depending on its
+position within the pixel; at 45 degrees it depends on the position between the diagonals that see green. Red and blue
+are seen in every other row only, so unequal weights of both add a wave over two pixels. Along a line in such a
+direction the displacement changes slowly, so that many places err together. It can be determined from more distant
+places nevertheless, since lines are straight or round and the displacement is periodic.
 """
 
 from __future__ import annotations
@@ -15,33 +15,38 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Indices32, distinct, median
 from ceres_cal.detect.courses import Course
 
-_REMAINS = 0.15  # of the error, what is left once it is taken off
-_AROUND = 10  # places to either side, of which the mean tells where in its pixel a line lies
+_REMAINS = 0.15  # share of the displacement that remains after the correction
+_AROUND = 10  # places to either side, whose mean gives the position of a line within its pixel
 _ROUNDS, _FEWEST = 5, 20
 _CURVATURE = np.array([1.0, -2.0, 1.0])
-# Across level lines, upright ones, and those along either diagonal, which a sensor of colours draws alike.
+# Normals of horizontal lines, of vertical ones, and of those along either diagonal, which a colour sensor displaces
+# alike.
 _ACROSS = np.array([(0.0, 1.0), (1.0, 0.0), (0.5**0.5, 0.5**0.5), (0.5**0.5, -(0.5**0.5))])
-# Directions, 1/px of the longest wave across them, and how many there are, each half as long as the one before.
+# Directions (rows of _ACROSS), frequency (1/px) of the longest wave across them, and number of waves, each half as long
+# as the one before.
 _WAVES = (((0,), 0.5, 3), ((1,), 0.5, 3), ((2, 3), 0.5**0.5, 2))
 
 
 def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px: int) -> tuple[Array, Array]:
-    """(N,) px along the normals by which lines are drawn beside themselves, and its standard deviation (N,).
+    """Estimate (N,) px along the normals by which lines are displaced, and its standard deviation (N,).
 
-    That is as large as a line's middle needs whose places all err alike, since they are taken to err each by itself.
+    The standard deviation is enlarged, so that the middle of a line whose places all have the same error gets the right
+    one although places are treated as independent.
 
     Args:
-        offset_px: (N,) where along the normals they were measured, NaN where they were not. threes: (M, 3) places that
-            follow each other on a curve, all of them measured. half_width_px: of the windows, along the curve.
+        offset_px: (N,) where along the normals the lines were measured, NaN where they were not.
+        threes: (M, 3) places that follow each other on a curve, all of them measured.
+        half_width_px: half width of the windows, along the curve.
     """
     aside: Array = np.zeros(len(course))
     if len(threes) < _FEWEST:
         return aside, aside
-    at_rest_px = 1e-5  # a hundredth of the least standard deviation of a place, and less
-    # Standard deviation of the error's amplitude, beforehand: what is wide has edges that are drawn aside alike.
+    at_rest_px = 1e-5  # tolerance of convergence: a hundredth of the least standard deviation of a place, and less
+    # Prior standard deviation of the displacement's amplitude, smaller for wide lines: their edges are displaced alike.
     prior_px = 0.1 / max(median(course.width_px), 1.0)
     bends = offset_px[threes] @ _CURVATURE
-    for _ in range(_ROUNDS):  # where in the pixel a line lies is where it is drawn but for that
+    # the position of a line within its pixel follows from its measured place without the displacement
+    for _ in range(_ROUNDS):
         turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
         amplitude, sigma = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends, prior_px)
         before, aside = aside, np.nan_to_num(turns.imag @ amplitude)
@@ -53,7 +58,7 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
 
 
 def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
-    """(N, K) how many places of its curve err as a place does: few where the line wanders through the pixels."""
+    """(N, K) number of places on the same curve that share a place's error: few where the line crosses many pixels."""
     measured, alike = np.isfinite(offset_px), np.ones(turns.shape)
     for number in distinct(course.curve):
         every = turns[measured & (course.curve == number)]
@@ -63,7 +68,8 @@ def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
 
 
 def _smooth(curve: Indices32, offset_px: Array) -> Array:
-    """(N,) the mean of the places around on the same curve: one place's own error would explain itself.
+    """(N,) the mean offset of the neighbouring places on the same curve: a single place's own error would explain
+    itself.
 
     Args:
         curve: (N,) ascending.
@@ -77,8 +83,8 @@ def _smooth(curve: Indices32, offset_px: Array) -> Array:
 
 
 def _amplitudes(columns: Array, bends: Array, prior_px: float) -> tuple[Array, Array]:
-    """(K,) of what, times columns (M, K), explains the bends (M,) but for a few; and its standard deviation (K,)."""
-    robust = 2.0  # of the usual residual: Cauchy's scale
+    """(K,) robust least-squares amplitudes of the columns (M, K) that explain the bends (M,), and their sigmas (K,)."""
+    robust = 2.0  # scale of Cauchy's loss, in units of the usual residual
     least_px = 1e-4
     amplitude: Array = np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
@@ -91,7 +97,9 @@ def _amplitudes(columns: Array, bends: Array, prior_px: float) -> tuple[Array, A
 
 
 def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
-    """(N, K) complex: how far round its pixel a line is, the mean over each window, along the normal: of each wave."""
+    """(N, K) complex phase factors of each wave at a line's position within its pixel: mean over each window, along the
+    normal.
+    """
     places, normals = course.pixels + offset_px[:, None] * course.normals, course.normals
     nearest = np.argmax(np.abs(normals @ _ACROSS.T), axis=1)
     level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])

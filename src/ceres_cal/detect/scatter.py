@@ -1,4 +1,4 @@
-"""How well the corners of boards were measured, as the pictures themselves tell it."""
+"""Precision of measured board corners, estimated from the pictures themselves."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from ceres_cal.base.arrays import Array, median
 
 USUAL_PX = 0.1
 _MOST_DEGREES = 6
-_SHARE = 2.0 / 3.0  # of the corners, as many terms as a polynomial may have
-_FEWEST_SPARE = 8  # equations below which a board says nothing
+_SHARE = 2.0 / 3.0  # largest number of terms of the polynomial, as a share of the number of corners
+_FEWEST_SPARE = 8  # least number of degrees of freedom for which a board gives an estimate
 _LEAST_PX = 1e-3
 
 
 def scatter_px(grids: Iterable[Array], places: Array) -> float:
     """Standard deviation (px) of each coordinate of boards' corners about a smooth picture of their board.
 
-    A lens and a bent board move neighbouring corners alike: a homography and a polynomial take that up, of as many
-    degrees as two thirds of the corners can tell. What is left is how precisely corners were measured, and what an
-    unevenly printed board adds; a wrong lens model is not in it.
+    A lens and a bent board displace neighbouring corners alike. A homography and a polynomial absorb that, of the
+    highest degree that two thirds of the corners can determine. The residual is the precision of the corners, together
+    with an unevenly printed board; a wrong lens model is not part of it.
 
     Args:
         grids: each (rows, columns, 2) px, NaN where a corner was not seen.
         places: (rows, columns, 2) where the corners are on the board, in any unit.
 
     Returns:
-        The median over the boards; USUAL_PX where none has corners enough to tell.
+        The median over the boards; USUAL_PX where none has enough corners.
     """
     scatters = [one for grid in grids if (one := _of_board(grid, places)) is not None]
     return max(median(np.array(scatters)), _LEAST_PX) if scatters else USUAL_PX
@@ -46,6 +46,6 @@ def _of_board(grid: Array, board: Array) -> float | None:
     terms = np.column_stack([x**i * y**j for i in range(degrees + 1) for j in range(degrees + 1 - i)])
     solved, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)
     spare = 2 * (len(places) - rank)
-    if degrees < 2 or spare < _FEWEST_SPARE:  # the homography has taken up equations of its own
+    if degrees < 2 or spare < _FEWEST_SPARE:  # the homography has used some of the equations, too
         return None
     return float(np.sqrt(np.sum((pixels - flat - terms @ solved) ** 2) / spare))

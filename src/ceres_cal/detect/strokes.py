@@ -1,7 +1,8 @@
-"""Short straight strokes of paint in a photograph, found without knowing where: thin, and brighter than both sides.
+"""Short straight strokes of paint in a photograph, found without a prediction: thin, and brighter than both sides.
 
-Ridges are found as Steger does (An Unbiased Detector of Curvilinear Structures, 1998): where the second derivative
-across is most negative, at its sub-pixel top. What is connected and straight over a few dozen pixels is a stroke.
+Ridges are found as by Steger (An Unbiased Detector of Curvilinear Structures, 1998): where the second derivative across
+is most negative, at the sub-pixel maximum. Ridge points that are connected and straight over a few dozen pixels form a
+stroke.
 """
 
 from __future__ import annotations
@@ -11,47 +12,51 @@ import numpy as np
 
 from ceres_cal.base import AnyArray, Array, Array32, Indices, Mask, Rows, median, medians
 
-_SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
+_SCALES = (1, 2)  # a photograph is searched at full size for narrow paint, and at half size for wide paint
 _SIGMA_PX = 1.6
-_TILE_PX = 24  # a stroke's length at most
-# Shorter ones have no direction to speak of. Nothing changes from half to double.
+_TILE_PX = 24  # largest length of a stroke
+# Least length of a stroke: shorter ones have no clear direction. Nothing changes from half to double.
 _LEAST_PX = 9.0
-# Rms about the stroke: what bends more is an arc, a letter or noise. Nothing changes from 0.43 to 0.75.
+# Largest rms distance of the points from their stroke: arcs, letters and noise bend more. Nothing changes from 0.43 to
+# 0.75.
 _STRAIGHT_PX = 0.6
-# Times the usual response. At half of it the carpet's texture becomes strokes, and two of nine fields are missed; at
-# double nothing changes.
+# Least response, in units of the usual one. At half of it the carpet's texture becomes strokes, and two of nine fields
+# are missed; at double nothing changes.
 _NOISE = 5.0
-# Pixels around, over which noise is alike; times that noise.
+# Width of the window in which noise is uniform, px; least response, in units of the noise in it.
 _NEARBY_PX, _NOISE_NEARBY = 41, 3.0
-# Of the response, that at twice the scale: 0.125 of a thin line, more of stripes of sun and walls.
+# Largest response at twice the scale, as a share of the response: 0.125 for a thin line, more for stripes of sun and
+# walls.
 _WIDEST = 0.45
-# Width in which a stroke found at another scale is the same one; times as bright a coarser one must be, whose place and
-# direction are known less well: of one in blur and wear a third fewer are kept at 1.0, nothing changes from 1.25 to 2.
+# Distance within which strokes found at two scales are the same, px; and how many times as bright the coarser one must
+# be, because its place and direction are less precise. In a picture with blur and wear a third fewer strokes are kept
+# at 1.0; nothing changes from 1.25 to 2.
 _BESIDE_PX, _COARSER = 11, 1.4
-# Of strokes that run beside each other: cosine of the angle between them, and how far apart they are at least.
+# For strokes that run beside each other: least cosine of the angle between them, and least distance, px.
 _SAME_WAY, _APART_PX = 0.97, 4.0
-# Of a stroke, how much it must be a line of its own where stripes hide the others: at most two run beside it.
+# Least value of `alone` where stripes hide the other strokes: at most two strokes run beside it.
 _OWN = 0.15
-# Of the picture, where nothing is seen of a ridge's other side.
+# Width of the picture's border, px, where a ridge's other side is not seen.
 _BORDER_PX = 3
-# Between pieces of one stroke; of a stroke's length, what is paint: worn lines are dashes.
+# Width of the dilation that joins pieces of one stroke, px; least share of a stroke's length that is paint: worn lines
+# are dashed.
 _GAP_PX, _DENSE = 3, 0.5
 
 
 class Strokes(Rows):
-    """N strokes: their ends (N, 2, 2) px and how bright a ridge each is (N,), in grey levels per px squared."""
+    """N strokes: their ends (N, 2, 2) px, and the strength (N,) of each as a ridge, grey levels per px squared."""
 
     ends: Array
     strength: Array
 
     @property
     def length_px(self) -> Array:
-        """(N,)"""
+        """(N,) length of each stroke."""
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
 
 
 def alone(strokes: Strokes, reach_px: float) -> Array:
-    """(N,) how much a stroke is a line of its own: 1, less where others run beside it, as of striped floors and sun.
+    """(N,) 1 for a stroke without others beside it, less where others run beside it, as on striped floors and in sun.
 
     Args:
         reach_px: how far to either side others count.
@@ -67,26 +72,26 @@ def alone(strokes: Strokes, reach_px: float) -> Array:
 
 
 def drawn(strokes: Strokes, image_size: tuple[int, int]) -> Mask:
-    """(height, width) where strokes are."""
+    """Return a mask (height, width) of the pixels on strokes."""
     mask = np.zeros(image_size[::-1], np.uint8)
     cv2.polylines(mask, list(np.round(strokes.ends).astype(np.int32)), isClosed=False, color=1)
     return mask > 0
 
 
 def find_strokes(grey: Array32) -> Strokes:
-    """Every stroke of a photograph, of paint up to some 12 px wide, each at the scale at which it is brightest."""
+    """Return every stroke of a photograph, of paint up to about 12 px wide, each at the scale where it is brightest."""
     return _of_scales(_reliefs(grey))
 
 
 def _reliefs(grey: Array32) -> list[tuple[Array32, ...]]:
-    """Of a photograph at each scale."""
+    """Return the relief of a photograph at each scale."""
     shares = (1.0 / scale for scale in _SCALES)
     planes = (cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) for share in shares)
     return [_relief(np.asarray(plane, np.float32)) for plane in planes]
 
 
 def _of_scales(reliefs: list[tuple[Array32, ...]], *, dark: bool = False) -> Strokes:
-    """See `find_strokes`, and those that are darker than the floor."""
+    """Return the strokes at their brightest scale (see `find_strokes`), or with `dark` those darker than the floor."""
     by_scale, (height, width) = [], reliefs[0][0].shape
     size = (width, height)
     for scale, relief in zip(_SCALES, reliefs, strict=True):
@@ -99,23 +104,25 @@ def _of_scales(reliefs: list[tuple[Array32, ...]], *, dark: bool = False) -> Str
 
 
 def strokes_of_signs(grey: Array32) -> tuple[Strokes, Strokes]:
-    """The strokes of a photograph that are brighter than the floor, and those that are darker.
+    """Return the strokes of a photograph that are brighter than the floor, and those that are darker.
 
-    On fields with light lines dark ones came to 0.92 of their length at most, mostly to 0.2, but on one with dark seams
-    to more; on two with dark lines to 6 and 14.
+    On fields with light lines, the length of the dark strokes was at most 0.92 of that of the light ones, mostly 0.2,
+    and more on one field with dark seams; on two fields with dark lines it was 6 and 14 times.
     """
     reliefs = _reliefs(grey)
     return _of_scales(reliefs), _of_scales(reliefs, dark=True)
 
 
 def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:
-    """Those of the narrowest paint that are lines of their own: stripes of sun are wide, or run beside each other."""
+    """Return strokes of the narrowest paint that have few others beside them: stripes of sun are wide, or run in
+    parallel.
+    """
     strokes = _strokes(*_ridge_points(_relief(grey)))
     return strokes.take(alone(strokes, reach_px) > _OWN)
 
 
 def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, int]) -> Array:
-    """(N,) how bright a ridge of the other scale lies along each stroke, 0 where there is none."""
+    """(N,) strength of the other scale's ridge along each stroke, 0 where there is none."""
     plane = np.zeros(image_size[::-1], np.float32)
     for row in np.argsort(other.strength):
         a, b = np.round(other.ends[row]).astype(int).tolist()
@@ -127,8 +134,8 @@ def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, in
 
 
 def _relief(grey: Array32) -> tuple[Array32, ...]:
-    """A plane that is smoothed a little, its `_second` derivatives, `_bends` of those, and the derivatives where it is
-    smoothed more.
+    """Return a slightly smoothed plane, its `_second` derivatives, `_bends` of those, and the second derivatives of a
+    more strongly smoothed plane.
     """
     soft = _smoothed(grey, _SIGMA_PX)
     second = _second(soft)
@@ -136,12 +143,14 @@ def _relief(grey: Array32) -> tuple[Array32, ...]:
 
 
 def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[Array, Array, Indices]:
-    """Points on ridges, or on valleys: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
+    """Return points on ridges, or on valleys: pixels (N, 2), strength (N,), and number of the connected piece of each
+    (N,).
+    """
     soft, xx, yy, xy, middle, apart, *wide = relief
     sign = np.float32(-1.0 if dark else 1.0)
     strength = np.maximum(apart - sign * middle, 0.0)
     usual = median(strength[::3, ::3].ravel())
-    # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
+    # Noise differs between sun and shadow; lines are not part of the noise around them.
     size = (_NEARBY_PX, _NEARBY_PX)
     nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
     nearby = cv2.boxFilter(np.minimum(strength, 2.0 * _NOISE * nearby), cv2.CV_32F, size, normalize=True)
@@ -151,7 +160,7 @@ def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[A
     level, off = _bends(*(plane.ravel()[at] for plane in wide))
     at = at[off - sign * level < _WIDEST * strength.ravel()[at]]
     a, b, d = (sign * plane.ravel()[at] for plane in (xx, xy, yy))
-    angle = 0.5 * np.arctan2(2.0 * b, a - d) + 0.5 * np.pi  # of the direction that bends most
+    angle = 0.5 * np.arctan2(2.0 * b, a - d) + 0.5 * np.pi  # of the direction with the largest curvature
     nx, ny = np.cos(angle), np.sin(angle)
     gx, gy = (0.5 * sign * (soft.ravel()[at + later] - soft.ravel()[at - later]) for later in (1, width))
     high = strength.ravel()[at]
@@ -166,13 +175,13 @@ def _ridge_points(relief: tuple[Array32, ...], *, dark: bool = False) -> tuple[A
 
 
 def _second(soft: Array32) -> tuple[Array32, ...]:
-    """Second derivatives by x, by y and by both."""
+    """Second derivatives: by x twice, by y twice, and by x and y."""
     orders = ((2, 0), (0, 2), (1, 1))
     return tuple(_single(np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0) for order in orders)
 
 
 def _bends(xx: Array32, yy: Array32, xy: Array32) -> tuple[Array32, Array32]:
-    """The mean of both eigenvalues of second derivatives, and how far each is from that."""
+    """Mean of both eigenvalues of second derivatives, and how far each is from the mean."""
     return 0.5 * (xx + yy), np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
 
 
@@ -185,14 +194,14 @@ def _single(plane: AnyArray) -> Array32:
 
 
 def _strokes(pixels: Array, strength: Array, piece: Indices) -> Strokes:
-    """The straight lines through the points of each piece in each tile of the image."""
+    """Fit a straight line to the points of each piece in each tile of the image."""
     if not len(pixels):
         return Strokes(np.empty((0, 2, 2)), np.empty(0))
     tile = np.floor(np.maximum(pixels, 0.0) / _TILE_PX).astype(np.int64)
     key = (piece * 4096 + tile[:, 0]) * 4096 + tile[:, 1]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)
 
-    weight = strength**2  # at the ends of dashes ridges fan out, ever fainter
+    weight = strength**2  # at the ends of dashes ridges fan out and get fainter
     total = np.bincount(group, weight)
 
     def mean(values: Array) -> Array:
@@ -205,7 +214,8 @@ def _strokes(pixels: Array, strength: Array, piece: Indices) -> Strokes:
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     along_x, along_y = np.cos(angle), np.sin(angle)
     root = np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
-    half = np.sqrt(3.0 * np.maximum(0.5 * (xx + yy) + root, 0.0))  # of an even line with that second moment
+    # half length of a uniform line with that second moment
+    half = np.sqrt(3.0 * np.maximum(0.5 * (xx + yy) + root, 0.0))
     across = np.sqrt(np.maximum(0.5 * (xx + yy) - root, 0.0))
     good = (2.0 * half >= _LEAST_PX) & (across < _STRAIGHT_PX) & (count > 2.0 * _DENSE * half)
     centre, reach = np.column_stack([cx, cy]), np.column_stack([half * along_x, half * along_y])

@@ -1,4 +1,4 @@
-"""Photographs out of a video, a frame at a time: spread over it, or the sharpest of each stretch of it."""
+"""Photographs from a video: frames spread over it, or the sharpest frame of each stretch."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from ceres_cal.detect.headers import viewers_turn_deg
 from ceres_cal.detect.images import encoded
 
 MOST_FRAMES = 200_000
-"""Of a video, an hour and a half: each has to be passed over."""
+"""Largest number of frames of a video, an hour and a half: each has to be passed over."""
 
 
 class Video(Frozen):
-    """A video that OpenCV can read, and how many frames it has, as it says or, where it does not, as were counted."""
+    """A video that OpenCV can read, and its number of frames, as stated in the file or else counted."""
 
     path: Path
     capture: cv2.VideoCapture
     total: int
 
     def frames(self, step: int) -> Iterator[tuple[int, Image]]:
-        """Every so many-th frame of one size with its number; the rest is passed over without decoding it.
+        """Yield every `step`-th frame with its number, all of one size; the others are passed over without decoding.
 
         Raises:
             InputError: none can be read.
@@ -53,7 +53,7 @@ class Video(Frozen):
 
 
 def open_video(path: Path) -> Video:
-    """A video that is to be read.
+    """Open a video for reading.
 
     Raises:
         InputError: OpenCV cannot read it as a video; or it has more than MOST_FRAMES, or frames that are too large.
@@ -62,7 +62,7 @@ def open_video(path: Path) -> Video:
     width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
     require_room(int(6 * width * height), f"{path}: frames of {width:.0f} x {height:.0f} px")
     total = int(min(max(capture.get(cv2.CAP_PROP_FRAME_COUNT), 0.0), 1e9))
-    if not total:  # some formats do not say
+    if not total:  # some formats do not state it
         while total <= MOST_FRAMES and capture.grab():
             total += 1
         capture = _opened(path)
@@ -77,7 +77,7 @@ def _opened(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path)) if path.is_file() else None
     if capture is None or not capture.isOpened():
         raise _not_a_video(path)
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)  # pixels as the sensor stored them, as of photographs
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)  # pixels as the sensor stored them, as for photographs
     return capture
 
 
@@ -86,7 +86,7 @@ def _not_a_video(path: Path) -> InputError:
 
 
 def spread_frames(video: Path, count: int, progress: ImageProgress | None = None) -> Iterator[tuple[str, Image]]:
-    """At most so many frames, evenly over a video, with how messages name them.
+    """Yield at most `count` frames, evenly spread over a video, with their names for messages.
 
     Raises:
         InputError: see `open_video` and `Video.frames`.
@@ -99,16 +99,16 @@ def spread_frames(video: Path, count: int, progress: ImageProgress | None = None
 
 
 def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgress | None = None) -> list[Path]:
-    """Write the sharpest frames of `count` even stretches of a video into a folder, as PNG; their paths.
+    """Write the sharpest frame of each of `count` equal stretches of a video into a folder, as PNG; return their paths.
 
     Raises:
         InputError: see `open_video` and `Video.frames`.
     """
-    sampled = 10  # frames of each stretch: a hand that holds a board comes to rest in between
+    sampled = 10  # frames examined in each stretch: a hand that holds a board stops in between
     opened = open_video(video)
     stretches = min(count, opened.total)
     written: list[Path] = []
-    best: tuple[int, float, Image] | None = None  # of a stretch: its number, sharpness and frame
+    best: tuple[int, float, Image] | None = None  # number of the stretch, sharpness and frame
 
     def write(frame: Image) -> None:
         written.append(make_folder(folder) / f"{len(written) + 1:04d}.png")
@@ -128,7 +128,7 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
 
 
 def _sharpness(frame: Image) -> float:
-    """The variance of the Laplacian, in half a megapixel at most: what is blurred by less does not matter."""
+    """Variance of the Laplacian in the frame reduced to at most half a megapixel: smaller blur does not matter."""
     judged_px = 5e5
     scale = min(1.0, float(np.sqrt(judged_px / (frame.shape[0] * frame.shape[1]))))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -138,7 +138,7 @@ def _sharpness(frame: Image) -> float:
 def frames_of_videos(
     videos: Sequence[Path], count: int, folder: Path, progress: ImageProgress | None = None
 ) -> list[Path]:
-    """The sharpest frames of each video, written into a folder of its own: see `folder_of_frames`.
+    """Write the sharpest frames of each video into a folder of its own (see `folder_of_frames`); return their paths.
 
     Raises:
         InputError: a video cannot be read, two would have one folder, or count is below 1.
@@ -154,9 +154,9 @@ def frames_of_videos(
 
 
 def turned_words(path: Path) -> str:
-    """What is to be known of a photograph or video whose file tells viewers to turn it; "" of any other.
+    """Return a remark on a photograph or video whose file tells viewers to turn it; "" for any other.
 
-    Pixels are those that the sensor stored, however the camera was held: intrinsics belong to them.
+    Pixels are used as the sensor stored them, however the camera was held: intrinsics belong to these.
     """
     is_video = path.suffix.lower() in VIDEO_ENDINGS
     degrees = _opened(path).get(cv2.CAP_PROP_ORIENTATION_META) if is_video else viewers_turn_deg(read_bytes(path))
@@ -164,5 +164,5 @@ def turned_words(path: Path) -> str:
 
 
 def folder_of_frames(video: Path, folder: Path) -> Path:
-    """Where the frames taken out of a video are written: beside its name, where a folder of photographs may be."""
+    """Return the folder for frames taken from a video; a folder of photographs may already have the video's name."""
     return folder / f"{video.stem}_frames"

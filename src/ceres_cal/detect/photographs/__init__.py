@@ -1,4 +1,4 @@
-"""From photographs of a field to its observations: detection and refitting of the camera, in turn, until they agree."""
+"""Observations from photographs of a field: detection and refits of the camera alternate until they agree."""
 
 from ceres_cal.base.frozen import names_of
 

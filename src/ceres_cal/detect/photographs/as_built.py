@@ -1,9 +1,9 @@
-"""Whether the lines that were followed are where the target says: which lie aside, and which dimensions are others.
+"""Whether the followed lines are where the target says: which are off their nominal position, which dimensions differ.
 
-One linear model of the camera and of all that may be painted otherwise: every curve's offset, and the target's own
-dimensions, which move several curves at once. The camera is projected out, and what is left decides by evidence
-(marginal likelihood) between curves that belong, scattering by as much as paint does, single curves that lie aside, and
-dimensions that are others: a spike and slab prior (Mitchell and Beauchamp, JASA 83, 1988), its sets searched by beam.
+One linear model contains the camera and all that may be painted differently: every curve's offset, and the target's own
+dimensions, which move several curves at once. The camera is projected out. The evidence (marginal likelihood) of the
+residuals then decides between curves that scatter as paint usually does, single misplaced curves, and different
+dimensions: a spike and slab prior (Mitchell and Beauchamp, JASA 83, 1988), whose sets are searched by beam.
 """
 
 from __future__ import annotations
@@ -23,33 +23,35 @@ from ceres_cal.problem.residuals import residuals, whole_structure, write_equati
 from ceres_cal.scene import Camera, Target
 from ceres_cal.scene.targets.target import PAINT_WANDERS
 
-# Of what a curve usually lies aside that does: by how much all paint scatters about its drawing; and of all curves that
-# lie aside, root sum of squares: farther, they are others.
+# In units of the usual offset of a misplaced curve: candidates for the scatter of all paint about its drawing; and the
+# largest root sum of squares of all misplaced curves' offsets, beyond which this is another field.
 _SCATTER, _FARTHEST = PAINT_WANDERS * 0.5 ** np.arange(4.0, -0.5, -0.5), 3.0
-_OTHER = 0.1  # of a dimension that is another one, as a share of it
-_LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
-# Sets that go on, parts of one, and parts more by which none explains better, after which none is looked for: of 46
-# pictures one needed its third, where lines lie aside that hide one another.
+_OTHER = 0.1  # prior standard deviation of a dimension that differs, as a share of the dimension
+_LOG_ODDS = np.log(0.1 / 0.9)  # prior log odds that a curve is misplaced, or that a dimension differs
+# Beam search: sets that are extended, largest number of parts, and how many parts more are tried without improvement.
+# Of 46 pictures one needed the third, where misplaced lines hide one another.
 _BEAM, _MOST, _IN_VAIN = 24, 9, 3
-# Of a dimension, and of what a curve usually lies aside, another field: what a tape measure, a strange lens and a floor
-# that is not flat make of one is less.
+# Least change of a dimension that makes another field: as a share of it, and in units of the usual offset of a
+# misplaced curve. A tape measure, an unusual lens and a floor that is not flat cause smaller changes.
 _OTHER_FIELD, _LONGER = 0.02, 4.0
-_SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
-_APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
+# least change of a dimension in standard deviations, which assume that lines are taped independently of each other
+_SURELY = 10.0
+_APART, _ALIKE = 40, 0.1  # largest distance, in places, and least correlation at which errors count as correlated
 
 
 class FieldAsBuilt(Frozen):
-    """What explains best how curves lie.
+    """The most likely explanation of where the curves lie.
 
     Attributes:
-        aside_m: name of a curve -> by how much it lies beside its drawing, m, where it does.
-        dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
-        sd_m: name of each of those -> its standard deviation, m.
-        drawn: name of a dimension -> its value by the target, m. names: of the curves that tell it.
-        usual_m: by how much a curve lies aside that does. scatter_m: by how much all the others do, where
-            it is seen.
-        wander_m: by how much lines wander that none of that explains, nor what is stated of their places; infinite
-            where the camera shows none.
+        aside_m: name of a misplaced curve -> its offset from its drawing, m.
+        dimensions: name of a dimension that differs from the target's -> its most likely value, m.
+        sd_m: name of each of those curves and dimensions -> its standard deviation, m.
+        drawn: name of a dimension -> its value in the target, m.
+        names: of the curves used.
+        usual_m: usual offset of a misplaced curve, m. scatter_m: standard deviation of the other curves' offsets, m; 0
+            where none is seen.
+        wander_m: unevenness of the lines, m, that none of this nor the stated sigmas explain; infinite where the camera
+            shows no line.
     """
 
     aside_m: Mapping[str, float]
@@ -63,14 +65,14 @@ class FieldAsBuilt(Frozen):
 
     @property
     def laid_m(self) -> Mapping[str, float]:
-        """Name of a curve -> the standard deviation by which it may lie beside its drawing, where it may."""
+        """Name of a curve -> the standard deviation of its offset from its drawing, m, for curves that may have one."""
         every = self.names if self.scatter_m else ()
         return dict.fromkeys(every, self.scatter_m) | dict.fromkeys(self.aside_m, self.usual_m)
 
     @property
     def is_other(self) -> bool:
-        """Whether this is another field: a dimension too far off for a tape measure, lines all over the place, or bent
-        as by no lens.
+        """Whether this is another field: a dimension differs by too much for a tape measure, lines are misplaced
+        everywhere, or they are bent as by no lens.
         """
         changed = any(
             abs(length - self.drawn[name])
@@ -83,11 +85,11 @@ class FieldAsBuilt(Frozen):
 
     @property
     def _is_bent(self) -> bool:
-        """Whether its lines wander farther than paint scatters. Tape that was laid by hand wanders by 3 mm of 9 m."""
+        """Whether the lines wander farther than paint scatters. Tape laid by hand wanders by 3 mm on a field of 9 m."""
         return not self.wander_m < _SCATTER[-1] * self.usual_m
 
     def words(self) -> tuple[str, ...]:
-        """A sentence on each dimension and each curve that is not as drawn."""
+        """One sentence for each dimension and each curve that differs from the drawing."""
         dimensions = [
             f"{_spoken(name)} is {_change(length / self.drawn[name])} than the target says, "
             f"{length:.3f} ± {self.sd_m[name]:.3f} m instead of {self.drawn[name]:g}: other dimensions?"
@@ -102,7 +104,7 @@ class FieldAsBuilt(Frozen):
 
 
 AS_DRAWN = FieldAsBuilt({}, {}, {}, {}, (), np.inf)
-"""Nothing is known of how a target is painted."""
+"""The state in which nothing is known of how a target is painted."""
 
 
 def _spoken(name: str) -> str:
@@ -115,16 +117,16 @@ def _change(factor: float) -> str:
 
 
 def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, ...]) -> FieldAsBuilt:
-    """What the lines that were found say of how the target is painted: as drawn where they do not say it.
+    """Estimate from the lines that were found how the target is painted; as drawn where they do not determine it.
 
-    All of the camera but its aspect may follow.
+    All of the camera but its aspect is free.
 
     Args:
-        priors: on its intrinsics.
+        priors: on the camera's intrinsics.
     """
-    together = 4.0  # neighbouring places whose errors go together, at least
-    least_sigma_px = 0.05  # of places on a curve: what a model of its shape is good for
-    determined = 1e-12  # of what the curves' numbers are known to in all: below is rounding
+    together = 4.0  # least number of neighbouring places whose errors are correlated
+    least_sigma_px = 0.05  # least sigma of a place on a curve: the accuracy of a model of its shape
+    determined = 1e-12  # share of the trace of the curves' normal matrix, below which information is rounding
     rows = lines.found
     sigma = np.sqrt(together) * np.maximum(lines.sigma_px[rows], least_sigma_px)
     seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
@@ -142,7 +144,8 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     columns = equations.structure_columns(structure)
     there = np.flatnonzero(np.any(columns != 0.0, axis=0))
     normal, slope = model.left_of(columns[:, there])
-    bent = model.with_columns(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
+    # residuals of lines that no offset straightens: wavy tape, another lens
+    bent = model.with_columns(columns[:, there])
     misfit = float(bent.left_over @ bent.left_over) / max(bent.spare, 1)
     noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / together)
     _, moves = dimension_slopes(structure.names, seen.targets, dimensions_of(seen.targets))
@@ -153,10 +156,11 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
 
 
 def _wander_m(lines: Lines, target: Target, left_px: Array, places: Indices) -> float:
-    """By how much paint wanders from what is drawn, m, by what is left of places that were found: nothing up to twice
-    what is stated, which a calibration estimates as noise.
+    """Standard deviation, m, of the paint's deviation from the drawing, from the residuals of the places that were
+    found; 0 up to twice the stated sigma, which a calibration estimates as noise.
     """
-    found, usual = lines.take(lines.found).take(places), 0.6745  # of a standard deviation, the median
+    # median of the absolute value of a normal variable of standard deviation 1
+    found, usual = lines.take(lines.found).take(places), 0.6745
     times = median(np.abs(left_px) / found.sigma_px) / usual
     wide_m = np.array([target.curves[name].width_m for name in target.curve_names])
     left_m = np.abs(left_px) * wide_m[found.course.curve] / found.course.width_px
@@ -164,7 +168,7 @@ def _wander_m(lines: Lines, target: Target, left_px: Array, places: Indices) -> 
 
 
 def _places_together(residuals: Array, curve: Indices) -> float:
-    """How many neighbouring places count as one: their correlation, summed until it has fallen to nothing."""
+    """How many neighbouring places count as one: the sum of their correlations until these have fallen to nothing."""
     products, pairs = np.zeros(_APART), np.zeros(_APART)
     for number in distinct(curve):
         own = residuals[curve == number]
@@ -182,11 +186,11 @@ def _curve_of(name: str) -> str:
 
 
 def _explained(effects: RandomEffects, owner: Array, moves: Array, target: Target) -> FieldAsBuilt:
-    """The set of curves and dimensions of most evidence.
+    """Find the set of curves and dimensions with the most evidence.
 
     Args:
-        effects: Q numbers of curves, as they are left once the camera followed. owner: (Q,) names of the curves.
-        moves: (Q, D) of the numbers by the target's dimensions.
+        effects: Q numbers of curves, with the camera projected out. owner: (Q,) names of the curves.
+        moves: (Q, D) derivatives of the numbers by the target's dimensions.
     """
     curves, drawn, usual_m = list(dict.fromkeys(owner.tolist())), dict(target.dimensions), target.usual_aside_m
     moving = {name: column for name, column in zip(drawn, moves.T, strict=True) if np.any(column != 0.0)}
@@ -212,7 +216,7 @@ def _explained(effects: RandomEffects, owner: Array, moves: Array, target: Targe
 
 
 def _searched(effects: RandomEffects, roots: Sequence[Array], usual_m: float) -> tuple[list[int], float]:
-    """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
+    """Return the best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint beside it, m."""
     width = max((root.shape[1] for root in roots), default=1)
     padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
     modes = effects.modes(np.array(padded).reshape(len(roots), len(effects.turn), width))

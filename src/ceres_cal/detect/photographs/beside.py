@@ -1,7 +1,7 @@
-"""Lines that run beside each other where a target has one, as a boundary line beside a touch line: which of them is it.
+"""Choice among parallel lines where a target has one, such as a boundary line beside a touch line.
 
-The nearer or the brighter one is often the wrong one, and a camera bends until that fits, too. All curves together tell
-them apart: for every choice a camera is solved for, and hardly more than one fits.
+The nearer or the brighter line is often the wrong one, and a camera bends until that fits, too. All curves together
+decide: a camera is solved for with every choice, and hardly more than one choice fits.
 """
 
 from __future__ import annotations
@@ -17,22 +17,24 @@ from ceres_cal.detect.lines import peaks
 from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observations_of, refit_camera
 from ceres_cal.scene import Camera, Target
 
-# Of half the image's diagonal, how far to either side others are looked for.
+# How far to either side other lines are searched, as a share of half the image's diagonal.
 _REACH = 0.06
-_FAINT = 0.4  # of the usual brightness, what may be a line
-_LEAST = 0.35  # of a curve's places, those on a line that runs along it
+_FAINT = 0.4  # least brightness of a line, as a share of the usual one
+_LEAST = 0.35  # least share of a curve's places on a line that runs along it
 _MOST_BESIDE, _MOST_CHOICES = 3, 48
 
 
 _PaintLine = tuple[Indices, Array]
-"""Paint that runs along a curve: rows of the course, and where paint is from there, px along the normal."""
+"""Paint that runs along a curve: rows of the course, and the paint's offset from there along the normal, px."""
 
 
 def among_others(
     grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics
 ) -> tuple[Camera, Target] | None:
-    """The camera by which curves are other lines than those next to where they were predicted; None where none are."""
-    sigma_px = 0.5  # of a peak
+    """Return the camera and target for which some curves are other lines than the nearest; None where the nearest fit
+    best.
+    """
+    sigma_px = 0.5  # of a peak's position
     spacing_px = 12.0
     course = predict(target, camera, curves, spacing_px, 2.0)
     best, least = None, np.inf
@@ -49,9 +51,10 @@ def among_others(
 
 
 def _choices(beside: Sequence[Sequence[_PaintLine]]) -> Iterator[tuple[bool, list[_PaintLine]]]:
-    """Every choice of a line for each curve, the nearest first, and whether it is that; none where there is no other.
+    """Yield every choice of a line for each curve, the nearest lines first, and whether all are the nearest. Nothing is
+    yielded where there is no alternative.
 
-    Of more curves with others beside them than can be tried, only some take part.
+    If more curves have alternatives than can be tried, only some take part.
     """
     ordered = sorted(beside, key=lambda lines: (len(lines) > 1, -len(lines[0][0])))
     taking_part, count = [], 1
@@ -65,7 +68,7 @@ def _choices(beside: Sequence[Sequence[_PaintLine]]) -> Iterator[tuple[bool, lis
 
 
 def _lines_beside(grey: Array32, course: Course, reach_px: float) -> list[list[_PaintLine]]:
-    """Of each curve along which paint runs, the lines that may be it, the nearest first."""
+    """Return the lines that each curve may be, the nearest first, for the curves along which paint runs."""
     if not len(course):
         return []
     steps, bright = peaks(grey, course, reach_px)
@@ -81,8 +84,8 @@ def _lines_beside(grey: Array32, course: Course, reach_px: float) -> list[list[_
 
 
 def _joined(rows: Indices, steps: Array, seen: Mask) -> list[_PaintLine]:
-    """Peaks at neighbouring rows that are about as far off, joined."""
-    # Places that a line may be hidden for, and by how much it may bend from one to the next, px.
+    """Join peaks at neighbouring rows with similar offsets into lines."""
+    # Largest gap in a line, in places, and its largest bend from one place to the next, px.
     gap, bend_px = 4, 1.2
     lines: list[list[tuple[int, float]]] = []
     for row in rows.tolist():

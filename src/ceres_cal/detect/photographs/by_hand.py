@@ -1,6 +1,7 @@
-"""A start from points that somebody showed: their pixels, roughly, and which cameras they may belong to.
+"""Initial estimates from points that a user pointed out: their rough pixels, and the cameras that they are consistent
+with.
 
-And the camera that points and lines tell which somebody drags on a page: from the first on, fast enough to follow it.
+Also the camera for points and lines that a user drags on a page, from the first one on and fast enough to follow it.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from ceres_cal.start.search import searched
 from ceres_cal.start.sightlines import CameraPrior, Sightlines
 
 FORMAT, VERSION = "ceres-cal/corners", 1
-# How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
+# Standard deviation of a click on a corner, px, twice that of a careful one. Nothing changes from half to double.
 SIGMA_PX = 15.0
 FEWEST = 4
 STRETCH = 0.03
-"""A standard deviation of fy / fx where a picture was stretched one way."""
-_WRONG = 6.0  # standard deviations of a click: as far off, and it is another place's
+"""Standard deviation of fy / fx of a picture that was stretched in one direction."""
+_WRONG = 6.0  # standard deviations of a click, beyond which it shows another place
 _FREED = ("a3", "phi", "aspect", "a2", "cx", "cy", "a4", "a5")
 
 
 class Clicks(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Pixels of named points of a target, and of places somewhere on named curves, good to some 15 px; they may lie
+    """Pixels of named points of a target, and of places somewhere on named curves, accurate to some 15 px; they may lie
     outside the image.
     """
 
@@ -53,8 +54,8 @@ class Clicks(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_clicks(path: str | Path) -> Clicks:
-    """A file `{"format": "ceres-cal/corners", "version": 1, "points": {"TopLeftCorner": [x, y], ...}}`, which may have
-    places of curves besides, `"curves": [["HalfwayLine", x, y], ...]`.
+    """Load a file `{"format": "ceres-cal/corners", "version": 1, "points": {"TopLeftCorner": [x, y], ...}}`, which may
+    also contain places on curves, `"curves": [["HalfwayLine", x, y], ...]`.
 
     Raises:
         InputError: one line that names the file.
@@ -63,7 +64,7 @@ def load_clicks(path: str | Path) -> Clicks:
 
 
 def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
-    """The clicks that a file describes; InputError that names `where`."""
+    """Return the clicks that a file describes; an InputError names `where`."""
     with naming(where):
         return convert(body_of(data, where, FORMAT, VERSION), Clicks, where)
 
@@ -71,15 +72,16 @@ def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
 def starts_from_clicks(
     clicks: Clicks, target: Target, image_size: tuple[int, int], lengths: tuple[Prior, ...] = ()
 ) -> tuple[list[Camera], FreeIntrinsics]:
-    """Posed cameras of several lenses that the clicks may belong to, and what is free to be told by the photograph.
+    """Return posed cameras with several lenses that are consistent with the clicks, and what the photograph may change.
 
     Args:
-        lengths: what is known of dimensions of the target that are free, too.
+        lengths: priors on dimensions of the target that are free, too.
 
     Raises:
         InputError: a point that the target does not have, points on one line, or no camera that sees them there.
     """
-    stretches = (1.0, 1.06, 1.14, 1.25, 1.4, 1.7, 2.3, 4.0)  # of the image's corner by the lens: a fisheye's the last
+    # radial stretch of the image's corner by the lens; the last is a fisheye's
+    stretches = (1.0, 1.06, 1.14, 1.25, 1.4, 1.7, 2.3, 4.0)
     clicks.require_names(target)
     points = {name: (*pixel, SIGMA_PX) for name, pixel in clicks.points.items()}
     hints = PointHints.of(target, points, [(*place, SIGMA_PX) for place in clicks.curves])
@@ -99,13 +101,13 @@ def starts_from_clicks(
 
 
 def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prior, ...] = ()) -> FreeIntrinsics:
-    """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are; and
-    of lengths of the target.
+    """Return what a photograph may change of a camera of which only a rough phi and points are known, and of the
+    target's lengths.
 
     Args:
-        camera: far from the middle of whose picture its principal point is about right.
+        camera: if its principal point is far from the picture's middle, it is taken as about right.
     """
-    off = 0.04  # a standard deviation of the principal point, of the width
+    off = 0.04  # standard deviation of the principal point, as a share of the width
     size, centre = np.array(camera.image_size), 0.5 * (np.array(camera.image_size) - 1.0)
     if np.any(np.abs(camera.principal_point - centre) > 3.0 * off * size):
         centre, off = np.array(camera.principal_point), 2.0 * off
@@ -118,7 +120,7 @@ def unknown_optics(camera: Camera, hints: PointHints | None, lengths: tuple[Prio
 
 
 def _with_stretch(stretch: float, pixels: Array, plane: Array, image_size: tuple[int, int]) -> tuple[Camera, Array]:
-    """The camera with so wide a lens that suits the clicks best, and how far off each click is, (N,) px."""
+    """Return the camera with this radial stretch that fits the clicks best, and each click's residual (N,) px."""
     middle, half = 0.5 * (np.array(image_size) - 1.0), 0.5 * float(np.hypot(*image_size))
     offsets, bend = pixels - middle, 1.0 / stretch - 1.0
     usual = float(np.log(USUAL_PHI * half)), float(np.log(USUAL_PHI_FACTOR))
@@ -136,7 +138,7 @@ def _with_stretch(stretch: float, pixels: Array, plane: Array, image_size: tuple
 
 
 def _odd_one(names: list[str], off_px: Array) -> str:
-    """What is wrong with clicks: the one that the others contradict, or all."""
+    """Return what is wrong with clicks: the one that contradicts the others, or all of them."""
     wrong = [name for name, off in zip(names, off_px, strict=True) if off > _WRONG * SIGMA_PX]
     if len(names) - len(wrong) < FEWEST:
         return (
@@ -149,18 +151,18 @@ def _odd_one(names: list[str], off_px: Array) -> str:
 # ---- dragged by hand ------------------------------------------------------------------------------------------------
 
 _AS_SHOWN = Weighting(loss="trivial")
-# How many equations free which intrinsics; fewer leave the lens as it was.
+# Least number of equations for each set of free intrinsics; with fewer the lens is not changed.
 _FREED_BY = ((8, ("phi",)), (12, ("phi", "a3")), (24, ("phi", "a3", "cx", "cy")), (36, ("phi", "a3", "a2", "cx", "cy")))
-_AGAINST = 4.0  # standard deviations of a hand by which a click contradicts the others
+_AGAINST = 4.0  # standard deviations of a click by which it contradicts the others
 
 
 def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera:
-    """A camera straight above the middle of a target, which fills most of the picture.
+    """Return a camera straight above the middle of a target, which fills most of the picture.
 
     Args:
-        side: of the picture, towards which the field's left end lies.
+        side: side of the picture towards which the field's left end lies.
     """
-    filled = 0.8  # of the picture, by a field of which nothing is known yet
+    filled = 0.8  # share of the picture that a field fills of which nothing is known yet
     low, high = target.box
     size, (width, height) = high - low, image_size
     turns = {"left": 0, "top": 1, "right": 2, "bottom": 3}
@@ -176,11 +178,12 @@ def guess(target: Target, image_size: tuple[int, int], side: str = "") -> Camera
 
 
 def solved(shown: PointHints, before: Camera, base: Camera, *, quickly: bool = False) -> Camera:
-    """The camera by all clicks, each as well as a hand hits it; what nobody showed goes along with them.
+    """Fit the camera to all clicks, each weighted by the accuracy of a hand; other points move along with them.
 
     Args:
-        before: where to start from. base: the camera before anything was shown. quickly: another start is tried only
-            where this one leads nowhere.
+        before: start of the fit.
+        base: the camera before anything was shown.
+        quickly: another start is tried only where this one does not converge.
     """
     if not shown.equations:
         return base
@@ -196,7 +199,7 @@ def solved(shown: PointHints, before: Camera, base: Camera, *, quickly: bool = F
 
 
 def _fitted(shown: PointHints, start: Camera, base: Camera, weighting: Weighting) -> Camera | None:
-    """The camera that suits best what was shown, with as much of it free as that can tell."""
+    """Fit the camera to what was shown, with as many free intrinsics as that can determine."""
     wanted: tuple[str, ...] = next((names for least, names in reversed(_FREED_BY) if shown.equations >= least), ())
     free = tuple(name for name in wanted if name in intrinsic_names(base.lens))
     observed = _hints(shown, base).observed(base.image_size)
@@ -205,10 +208,10 @@ def _fitted(shown: PointHints, start: Camera, base: Camera, weighting: Weighting
 
 
 def settled(shown: PointHints, before: Camera, base: Camera) -> tuple[Camera, dict[str, float], str]:
-    """The camera once nothing is dragged any more, the clicks that contradict the others (see `judged`), and what is
-    wrong with them all.
+    """Return the camera after dragging has ended, the clicks that contradict the others (see `judged`), and what is
+    wrong with all of them together.
     """
-    far = 10.0  # of them: no camera near puts it there
+    far = 10.0  # standard deviations of a click, beyond which no camera nearby fits it
     camera, wrong = solved(shown, before, base), ""
     off_px, sigma_px = off(shown, camera)
     if len(shown.feature) >= FEWEST and np.any(off_px > far * sigma_px):
@@ -218,12 +221,13 @@ def settled(shown: PointHints, before: Camera, base: Camera) -> tuple[Camera, di
 
 
 def judged(shown: PointHints, camera: Camera, base: Camera) -> tuple[Camera, dict[str, float]]:
-    """The camera without the clicks that contradict the others, and by how many px those are off, by name or "#2" of a
-    place of a curve.
+    """Return the camera without the clicks that contradict the others, and how far off those are, px, by name, or by
+    "#2" for a place on a curve.
     """
-    enough = 10  # equations from which on a contradiction can be seen
+    enough = 10  # least number of equations with which a contradiction can be seen
     off_px, sigma_px = off(shown, camera)
-    if shown.equations < enough or np.all(off_px <= 0.5 * _AGAINST * sigma_px):  # others take a share of it
+    # the other clicks absorb a share of an error
+    if shown.equations < enough or np.all(off_px <= 0.5 * _AGAINST * sigma_px):
         return camera, {}
     robust = _fitted(shown, camera, _turned(shown, base), ROBUST) or camera
     off_px, sigma_px = off(shown, robust)
@@ -233,10 +237,10 @@ def judged(shown: PointHints, camera: Camera, base: Camera) -> tuple[Camera, dic
 
 
 def anew(shown: PointHints, image_size: tuple[int, int]) -> Camera:
-    """The camera that the named points tell from nothing, as `detect_field` starts from them.
+    """Return the camera that the named points determine without an initial estimate, as in `detect_field`.
 
     Raises:
-        InputError: fewer than four, or none can be right, and why.
+        InputError: fewer than four points, or none can be right, and why.
     """
     points = dict(zip(shown.names, map(tuple, shown.pixels.tolist()), strict=True))
     names = (shown.target.curve_names[number] for number in shown.curve)
@@ -246,13 +250,13 @@ def anew(shown: PointHints, image_size: tuple[int, int]) -> Camera:
 
 
 def off(shown: PointHints, camera: Camera) -> tuple[Array, Array]:
-    """(N,) how far each click is from its point or curve, px, and how well a hand hits it."""
+    """(N,) distance of each click from its point or curve, px, and (N,) standard deviation of a click, px."""
     ends = np.concatenate([shown.pixels, shown.places]) - feet(shown, camera)
     return np.nan_to_num(np.linalg.norm(ends, axis=1), nan=1e6), np.concatenate([shown.sigma_px, shown.place_sigma_px])
 
 
 def feet(shown: PointHints, camera: Camera) -> Array:
-    """(N, 2) px where the model has what each click shows."""
+    """(N, 2) px where the model places what each click shows."""
     points = camera.project(shown.target.point_array[shown.feature]) if len(shown.feature) else np.empty((0, 2))
     lines = curves_in_image(shown.target, camera)
     nearest = []
@@ -264,7 +268,7 @@ def feet(shown: PointHints, camera: Camera) -> Array:
 
 
 def _foot(line: Array, number: int, place: Array) -> Array:
-    """The nearest place of the two pieces of a line that meet at one of its corners."""
+    """Return the nearest place on the two pieces of a polyline that meet at one of its corners."""
     best = line[number]
     for other in (number - 1, number + 1):
         if 0 <= other < len(line) and np.all(np.isfinite(line[other])):
@@ -277,19 +281,19 @@ def _foot(line: Array, number: int, place: Array) -> Array:
 
 
 def curves_in_image(target: Target, camera: Camera, steps: int = 60) -> Mapping[str, Array]:
-    """Each curve's middle (S, 2) px; NaN where the camera does not show it."""
+    """Return each curve's middle (S, 2) px; NaN where the camera does not show it."""
     return {name: camera.project(curve_points(curve, 0, steps)) for name, curve in target.curves.items()}
 
 
 def _cost(shown: PointHints, camera: Camera) -> float:
-    """Of the clicks, the largest square of how far one is off, in standard deviations."""
+    """Return the largest squared residual of the clicks, in standard deviations."""
     off_px, sigma_px = off(shown, camera)
     return float(np.max((off_px / sigma_px) ** 2, initial=0.0))
 
 
 def _hints(shown: PointHints, base: Camera) -> PointHints:
-    """What was shown, and loosely the other points where they were."""
-    held_px = 300.0  # how loosely points that nobody showed stay where they were
+    """Add the other points of the target, held loosely at their present pixels, to what was shown."""
+    held_px = 300.0  # standard deviation with which the other points are held
     rest = np.setdiff1d(np.arange(len(shown.target.points), dtype=np.int32), shown.feature)
     there = base.project(shown.target.point_array[rest])
     rest, there = rest[np.isfinite(there[:, 0])], there[np.isfinite(there[:, 0])]
@@ -302,7 +306,9 @@ def _hints(shown: PointHints, base: Camera) -> PointHints:
 
 
 def _turned(shown: PointHints, base: Camera) -> Camera:
-    """The base shifted, and from two points on turned about its axis and lifted, so that they come near their place."""
+    """Return the base camera shifted, and with two or more points also turned about its axis and raised, so that points
+    come near the clicks.
+    """
     if not len(shown.feature):
         return base
     axis = np.array(base.principal_point)

@@ -1,4 +1,4 @@
-"""Cameras that may have taken a photograph of a target, from nothing but its strokes of paint."""
+"""Cameras that may have taken a photograph of a target, estimated from its strokes of paint alone."""
 
 from __future__ import annotations
 
@@ -20,32 +20,35 @@ from ceres_cal.observations import Prior
 from ceres_cal.problem.structure import redrawn
 from ceres_cal.scene import Camera, Radial, Target, curve_points
 
-_UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
-# The score of a match after which no other lens and tilt is tried: it only saves time. Nothing changes from 0.79 to
-# 0.94.
+_UPRIGHTS = 4  # largest number of solutions for lens and tilt that are matched
+# Score of a match after which no other lens and tilt is tried, to save time. Nothing changes from 0.79 to 0.94.
 _SURE = 0.88
 _POWERS = (2, 3, 4, 5)
-# Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
+# Least score as a share of the best match's: of another candidate, and of another view of the same picture. Nothing
+# changes from 0.6 to 0.86.
 _COMPARABLE, _ALIKE = 0.3, 0.9
-# Of the best one's likelihood of place, another's that is followed. In 17 disturbed pictures others had 0.38 at most.
+# Least likelihood of a candidate that is followed, as a share of the best one's. In 17 disturbed pictures others had
+# 0.38 at most.
 _LIKELY = 0.5
 _MOST, _MOST_ALIKE = 4, 60
-# Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
-# of that beside it.
+# Share of an unknown length by which it is drawn longer and shorter, too: a match is nearly as good up to half of it
+# away.
 _LENGTH_STEP = 0.06
 BUDGET_S = 60.0
-"""Of processor time for one photograph: ten times what one takes that shows the field (6 s on two cores). Where another
-field is asked for, whose lines fit in ever more places, the search took more than 200 s."""
-_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
+"""Processor time for one photograph, s: ten times what one takes that shows the field (6 s on two cores). Without it
+the search for another field, whose lines fit in ever more places, took more than 200 s.
+"""
+_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in camera heights; in rad
 
 
 class Auto(Frozen, eq=True):
-    """No start: the field is to be found in the photograph.
+    """No initial estimate: the field is to be found in the photograph.
 
     Attributes:
-        facing: which way round it is, where it looks alike turned.
-        before: or the station's camera before it was moved; the way that it is turned least is taken.
-        lengths: what is known of dimensions of the target that are to be told by the photograph.
+        facing: which way round the field is, where it looks the same when turned.
+        before: alternatively, the station's camera before it was moved; the view with the least rotation from it is
+            taken.
+        lengths: priors on dimensions of the target that are to be estimated from the photograph.
     """
 
     facing: tuple[Facing, ...] = ()
@@ -57,10 +60,11 @@ class FieldSearch(Frozen):
     """A photograph and the target that it may show.
 
     Attributes:
-        asked: what is known of it. others: the target drawn with other lengths, where some are not known.
-        until_s: of this thread's processor time, after which no further camera is looked at.
-        cameras: cameras of candidates so far. reached: what was followed. refused: those of it that are surely not
-            the field.
+        grey: the photograph. stroke_map: its strokes. grid: the target's lines.
+        asked: what is known of the field. others: the target drawn with other lengths, where some are unknown.
+        until_s: processor time of this thread after which no further camera is tried, s.
+        cameras: cameras of candidates so far. reached: results of following lines. refused: those results that are
+            surely not the field.
     """
 
     grey: Array32
@@ -81,10 +85,10 @@ class FieldSearch(Frozen):
 def prepare_search(
     grey: Array32, target: Target, curves: Collection[str], asked: Auto, strokes: Strokes | None = None
 ) -> FieldSearch:
-    """The strokes of a photograph, beside what they are to be taken for.
+    """Prepare a search: the strokes of a photograph and the lines that they may be.
 
     Args:
-        strokes: where they are known already.
+        strokes: the photograph's strokes if they are known already.
 
     Raises:
         InputError: the target has too few straight lines.
@@ -95,16 +99,19 @@ def prepare_search(
 
 
 def narrowed(search: FieldSearch) -> FieldSearch:
-    """The same among the strokes of narrow paint alone: where nothing else was found, stripes may have hidden it."""
+    """Return the search with only the strokes of narrow paint: where nothing else was found, stripes may have hidden
+    it.
+    """
     strokes = find_narrow_strokes(search.grey, CROWDED * search.stroke_map.unit_px)
     return replace(search, stroke_map=_stroke_map(search.grey, strokes))
 
 
 def off_centre(search: FieldSearch) -> FieldSearch:
-    """The same about that quarter of the picture about which the strokes are straighter than about its middle, as where
-    it is a part of a sensor; about its middle where none is.
+    """Return the search with the lens centred in that quarter of the picture about which strokes are clearly straighter
+    than about its middle, as in a picture that is a part of a sensor; unchanged if there is none.
     """
-    share, better = 0.22, 0.05  # of the picture, from its middle; as in a score
+    # distance of the centres from the middle, as a share of the picture; least gain in score
+    share, better = 0.22, 0.05
     middle, size = search.stroke_map, np.array(search.stroke_map.image_size)
     maps = [middle, *(replace(middle, centre=size * one) for one in product((0.5 - share, 0.5 + share), repeat=2))]
     scores = [best_score(one.ends, one.weights, search.grid.least_share) for one in maps]
@@ -118,7 +125,7 @@ def _stroke_map(grey: Array32, strokes: Strokes) -> StrokeMap:
 
 
 def _drawings(target: Target, curves: Collection[str], lengths: Sequence[Prior]) -> Iterator[Target]:
-    """The target, and drawn with those two of the lengths by which most paint moves in steps to either side."""
+    """Yield the target, then the target drawn with steps to either side in two lengths: those that move most paint."""
     yield target
     moved: dict[float, str] = {}
     for prior in lengths:
@@ -137,8 +144,8 @@ def _drawings(target: Target, curves: Collection[str], lengths: Sequence[Prior])
 
 
 def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
-    """Cameras that may have taken it, the best first, each once for all turns of the target, and in no later search
-    among other strokes of it again; and how it was drawn.
+    """Return cameras that may have taken the photograph, the best first, and how the target was drawn for each. Turns
+    of the target count as one camera, and cameras that an earlier search among other strokes returned are omitted.
     """
     scored: list[tuple[float, Camera]] = []
     drawn: dict[int, LineGrid] = {}
@@ -162,10 +169,12 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
 
 
 def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:
-    """Other cameras with about these optics, turned by quarters, moved, higher or lower, that may have taken it too.
+    """Return other cameras with similar optics that may have taken the photograph, too: turned by quarters, moved,
+    higher or lower.
 
     Args:
-        camera: that may have. detected: names of the curves that were found from there.
+        camera: a camera that may have taken it.
+        detected: names of the curves that were found with it.
     """
     stroke_map = replace(search.stroke_map, centre=np.array(camera.principal_point))
     upright = _upright_of(camera, search)
@@ -181,16 +190,16 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
 
 
 def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> list[tuple[Camera, LineGrid]]:
-    """Those by which the target's own lines are seen in the picture about as well as by the best, the best first, and
-    the one that was given first.
+    """Return, the best first, the cameras whose predicted lines are seen in the picture about as well as the best
+    one's, and the first camera of those given.
     """
-    # who asks says that it ended early
+    # the caller reports that time ran out
     in_time = ((grid.target, camera) for camera, grid in cameras if not search.is_out_of_time)
     likelihood = likelihoods_of_places(search.grey, in_time, search.grid.curves)
     order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST].tolist()
     best = likelihood[order[0]] if likelihood else 0.0
     likely = [row for row in order if likelihood[row] >= min(_LIKELY * best, best)]
-    # What strokes match best is followed, too: boxes on the floor cover one line wholly and leave another.
+    # The best match of strokes is always followed: boxes on the floor may cover one line and leave another.
     return [cameras[row] for row in dict.fromkeys([*likely, *range(len(cameras))[:1]])]
 
 
@@ -198,8 +207,8 @@ def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> 
 
 
 def _optics(upright: Upright, stroke_map: StrokeMap) -> Camera:
-    """A camera with the polynomial that is nearest to the one coefficient, over the image."""
-    share = np.linspace(0.0, 1.02, 60)  # of half the image's diagonal
+    """Return a camera with the polynomial that is nearest to the one coefficient, over the image."""
+    share = np.linspace(0.0, 1.02, 60)  # in units of half the image's diagonal
     ideal = share / (1.0 + upright.bend * share**2)
     values = np.linalg.lstsq(share[:, None] ** np.array(_POWERS), ideal - share, rcond=None)[0]
     lens = Radial(tuple(values / stroke_map.unit_px ** (np.array(_POWERS) - 1.0)), _POWERS)
@@ -224,7 +233,9 @@ def _upright_of(camera: Camera, search: FieldSearch) -> Upright:
 def _distinct(
     scored: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
 ) -> list[Camera]:
-    """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
+    """Return the best of the cameras that place the target differently, whatever its turn, and not as `known` does;
+    best first.
+    """
     given = [] if known is None else [known]
     cameras = [*given, *(camera for score, camera in scored if score >= least * scored[0][0])]
     left, chosen = np.arange(len(cameras)), list[Camera]()
@@ -236,12 +247,12 @@ def _distinct(
 
 
 def _poses(cameras: Sequence[Camera]) -> Array:
-    """(N, 3, 4) [R t]."""
+    """(N, 3, 4) the cameras' [R t]."""
     return np.reshape([camera.cam_from_world.matrix for camera in cameras], (-1, 3, 4))
 
 
 def _same_place(pose: Array, others: Array, turns: Sequence[Pose]) -> Mask:
-    """(N,) which of the others (N, 3, 4) are about the one (3, 4), or that after a turn of the target."""
+    """(N,) which of the other poses (N, 3, 4) are close to the one (3, 4), possibly after a turn of the target."""
     ways, back = chained(pose, np.array([turn.matrix for turn in turns])), inverted(others)
     between = chained(ways[:, None], back)
     height = np.maximum(-pose[:, 2] @ pose[:, 3], back[:, 2, 3])

@@ -1,4 +1,4 @@
-"""A field's painted lines, arcs, corners and crossings from photographs of one station, as observations."""
+"""Observations of a field's painted lines, arcs, corners and crossings, from photographs of one station."""
 
 from __future__ import annotations
 
@@ -40,22 +40,25 @@ from ceres_cal.scene.targets import others_of_kind
 
 TARGET_NAME = "field"
 Start = Camera | Clicks | Auto
-# Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
+# Largest standard deviation of a length while lines are followed, as a share of it: it keeps lengths that few lines
+# determine from diverging.
 _ABOUT = 0.15
-# Of a field from its origin: the largest ones end at 150 m, the smallest in millimetres reaches 750.
+# Largest distance of a field's lines from its origin, m: the largest fields end at 150 m, the smallest in millimetres
+# reaches 750.
 _FIELD_M = 500.0
-# Of the field in two pictures, at the median of its lines: farther, the camera did not stand still.
+# Largest median distance between the field's lines in two pictures, px: if it is larger, the camera did not stand
+# still.
 _SAME_PLACE_PX = 3.0
 
 
 class FieldDetections(Frozen):
-    """What `detect_field` found.
+    """Result of `detect_field`.
 
     Attributes:
         observations: one view per image that shows the field.
-        found: path -> the camera that predicts its lines, and what was measured.
+        found: path -> the camera that predicts the lines, and the measured lines.
         missed: path and reason of every other image.
-        searched: what came of those images in which the field was found without a start.
+        searched: path -> result of the search, for images in which the field was found without an initial estimate.
     """
 
     observations: Observations
@@ -67,15 +70,16 @@ class FieldDetections(Frozen):
 
 
 class FieldOptions(Frozen, eq=True):
-    """What observations of a field are to be.
+    """Which observations of a field are made.
 
     Attributes:
-        camera, station: the names they bear; the station's is that of the camera by default.
-        points: corners and crossings, too. They are extrapolated from places of lines, which tell a camera better.
-        edges: both edges of the paint instead of its middle.
-        left_out: (height, width) pixels that show nothing of the field: hall, walls, people.
-        keep_start: nothing farther from the start than 12 px is looked at.
-        lengths: what is known of dimensions of the target (named "field") that are to be told by the photographs.
+        camera, station: names in the observations; by default the station has the camera's name.
+        points: whether corners and crossings are observed, too. They are extrapolated from places on lines, which
+            determine a camera better.
+        edges: both edges of the paint are observed instead of its middle.
+        left_out: (height, width) mask of pixels that show nothing of the field: hall, walls, people.
+        keep_start: nothing farther than 12 px from the start is searched.
+        lengths: priors on dimensions of the target (named "field") that are to be estimated from the photographs.
         refused: called with the path of each image that does not show the field, and what was seen there instead.
     """
 
@@ -98,23 +102,25 @@ def detect_field(
     options: FieldOptions | None = None,
     progress: ImageProgress | None = None,
 ) -> FieldDetections:
-    """Painted lines and arcs of a field in photographs that one camera took at one station; where the options ask for
-    them, corners and crossings.
+    """Detect a field's painted lines and arcs, and optionally corners and crossings, in photographs of one camera at
+    one station.
 
     Curve observations are of the paint's middle, at places whose windows share no pixel; `sigma_px` comes from the
-    pixels of each window, times a factor that the scatter from place to place tells. A point is where measured curves
-    meet; the places that told it are no curve observations besides.
+    pixels of each window, times a factor estimated from the scatter between places. A point is where measured curves
+    meet; the places used for it are not curve observations as well.
 
     Args:
         images: files of any kind OpenCV reads, all of one size.
-        start: the station's camera before it was moved (by up to 130 px, or 5 degrees), points that somebody showed, or
-            `Auto()`: the field is found without any (see `search`). Later images start from what the last one told.
-        curves: names of those that are painted; None: all of the target with a width.
+        target: the field.
+        start: the station's camera before it was moved (by up to 130 px, or 5 degrees), points that a user showed, or
+            `Auto()` to find the field without either (see `search`). Later images start from the last result.
+        curves: names of the painted curves; None for all of the target that have a width.
+        options: which observations are made; see `FieldOptions`.
         progress: called after each image.
 
     Raises:
         InputError: an image cannot be read or has another size than the camera, a name that the target does not have, a
-            length that no painted line shows, or it cannot be told which way round the field is.
+            length that no painted line shows, or it cannot be determined which way round the field is.
         NothingShownError: no image shows the field.
     """
     options = options or FieldOptions()
@@ -122,8 +128,8 @@ def detect_field(
     painted = require_findable(target, curves, options.lengths)
     paths, drawn = [Path(path) for path in images], drawn_as_stated({TARGET_NAME: target}, options.lengths)[TARGET_NAME]
     results: dict[str, SearchResult] = {}
-    places: list[SearchResult] = []  # one for each that a camera stood at, where the last picture was taken first
-    elsewhere = isinstance(start, Auto)  # whether it is looked for at another place, too: once in vain is enough
+    places: list[SearchResult] = []  # one result for each place of the camera, the latest first
+    elsewhere = isinstance(start, Auto)  # whether an image is also searched without a start; one failure is enough
 
     def looked_for(path: Path, grey: Array32, starts: Sequence[Start | SearchResult]) -> SearchResult:
         with naming(path):
@@ -149,7 +155,7 @@ def detect_field(
         if progress is not None:
             progress(number, len(paths), path.name)
     for path in takewhile(lambda path: results[str(path)].followed is None, paths if places else ()):
-        results[str(path)] = looked_for(path, read_light(path), places)  # later ones told where it is
+        results[str(path)] = looked_for(path, read_light(path), places)  # with the place that later images showed
     if not places and len(paths) > 1:
         # reads: "no field in any of ... images"
         together = attempt(partial(_together, paths, partial(looked_for, starts=[start])), InputError)
@@ -162,7 +168,7 @@ def detect_field(
 
 
 def _detections(results: Mapping[str, SearchResult], target: Target, options: FieldOptions) -> FieldDetections:
-    """What those images tell that show the field.
+    """Collect the observations of the images that show the field.
 
     Raises:
         NothingShownError: none does.
@@ -177,13 +183,15 @@ def _detections(results: Mapping[str, SearchResult], target: Target, options: Fi
     seen = {target.curve_names[number] for number in distinct(every.curves.feature)}
     seen |= {target.point_names[number] for number in distinct(every.points.feature)}
     lengths = [_found(one, next(iter(followed.values()))) for one in options.lengths]
-    lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
+    lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # others remain as drawn
     priors = {(one.name, one.quantity): one for one in sorted((*every.priors, *lengths), key=lambda one: one.sigma)}
     return FieldDetections(replace(every, priors=tuple(priors.values())), followed, missed, searched)
 
 
 def _apart_px(one: SearchResult, other: SearchResult) -> float:
-    """How far the floor that one picture shows lies from there in another, px, at the median of its lines' places."""
+    """Median distance, px, between the lines' places in one picture and where another picture's camera projects the
+    same floor.
+    """
     if one.followed is None or other.followed is None:
         return np.inf
     pixels = other.followed.lines.pixels[other.followed.lines.found]
@@ -193,7 +201,7 @@ def _apart_px(one: SearchResult, other: SearchResult) -> float:
 
 
 def _of_one_place(results: Mapping[str, SearchResult]) -> dict[str, SearchResult]:
-    """The same without pictures that show the field elsewhere than most of them do."""
+    """Remove pictures that show the field at another place than most of them do."""
     groups: list[list[str]] = []
     for path, result in results.items():
         near = [own for own in groups if _apart_px(results[own[0]], result) < _SAME_PLACE_PX]
@@ -210,10 +218,10 @@ def _of_one_place(results: Mapping[str, SearchResult]) -> dict[str, SearchResult
 
 
 def _together(paths: Sequence[Path], looked_for: Callable[[Path, Array32], SearchResult]) -> dict[str, SearchResult]:
-    """The field in the one picture of all of them, each of which shows too little of it.
+    """Search for the field in one picture made of all of them, each of which shows too little of it.
 
     Raises:
-        InputError: they make no one picture, or that shows no field either.
+        InputError: they cannot be combined, or the combined picture shows no field either.
     """
     one = merged((str(path), read_colour(path)) for path in paths[:: -(-len(paths) // MOST_PICTURES)])
     name = f"{one.used[0]} and {len(one.used) - 1} more, together"
@@ -224,12 +232,12 @@ def _together(paths: Sequence[Path], looked_for: Callable[[Path, Array32], Searc
 
 
 def _signs(grey: Array32, *, is_near: bool) -> Iterator[tuple[bool, Strokes | None]]:
-    """Whether a photograph's lines are darker than its floor, and its strokes that are so, where they were looked for:
-    the likelier first, the other where it may be, too.
+    """Yield whether a photograph's lines are darker than its floor, and the strokes of that sign if they were searched:
+    the more likely sign first, then the other where it is possible, too.
     """
-    nearly = 0.5  # of the strokes' length: seams and cables may be longer than the lines
+    nearly = 0.5  # least ratio of the strokes' lengths: seams and cables may be longer than the lines
     if is_near:
-        yield False, None  # a start that is near finds light ones sooner than strokes tell
+        yield False, None  # from a start that is near, light lines are found sooner than strokes
     strokes = strokes_of_signs(grey)
     light, dark = (float(np.sum(one.length_px)) for one in strokes)
     if not is_near:
@@ -239,19 +247,19 @@ def _signs(grey: Array32, *, is_near: bool) -> Iterator[tuple[bool, Strokes | No
 
 
 def _found(prior: Prior, followed: FieldLines) -> Prior:
-    """What is known of a length; where nothing is, a calibration starts from what was found."""
+    """Return the prior on a length; where nothing is known, a calibration starts from the value found."""
     return replace(prior, value=(followed.target.dimensions[prior.quantity],)) if prior.is_open else prior
 
 
 def _tracked(lengths: tuple[Prior, ...]) -> tuple[Prior, ...]:
-    """The same as tight as lines are followed under: a field is about as large as it is said to be."""
+    """Return the priors as tight as lines are followed under: a field is about as large as stated."""
     return tuple(replace(one, sigma=(min(one.sigma[0], _ABOUT * one.value[0]),)) for one in lengths)
 
 
 def require_findable(
     target: Target, curves: Collection[str] | None = None, lengths: Sequence[Prior] = ()
 ) -> tuple[str, ...]:
-    """The names of the curves that photographs may show, all of a target or some.
+    """Return the names of the painted curves that photographs may show, all of a target's or those given.
 
     Raises:
         InputError: a name that the target does not have, no painted curve, a target in another unit, or a length that
@@ -275,7 +283,7 @@ def require_findable(
 
 
 def _without(grey: Array32, left_out: Mask | None) -> Array32:
-    """A photograph in which what is left out looks like what is around it."""
+    """Fill the masked part of a photograph with what is around it."""
     if left_out is None:
         return grey
     if left_out.shape != grey.shape:
@@ -291,10 +299,10 @@ def _looked_for(
     starts: Sequence[Start | SearchResult],
     options: FieldOptions,
 ) -> SearchResult:
-    """The field, by lines that are lighter or darker than the floor, from the first start that leads to it.
+    """Search for the field by lines that are lighter or darker than the floor, from the first start that leads to it.
 
     Args:
-        starts: what pictures before showed, or the one that was given.
+        starts: results of earlier pictures, or the start that was given.
     """
     tried: list[SearchResult] = []
     for start in starts:
@@ -316,18 +324,18 @@ def _looked_from(
     options: FieldOptions,
     strokes: Strokes | None,
 ) -> SearchResult:
-    """The field from where another image showed it, or from the start that was given, or from none."""
+    """Search for the field from where another image showed it, from the start that was given, or without a start."""
     lengths = _tracked(options.lengths)
     if isinstance(start, Auto):
         return search(grey, target, painted, replace(start, lengths=lengths), strokes)
-    assert start is not None  # an image that showed it
+    assert start is not None  # a result that shows the field
     target = start.target if isinstance(start, FieldLines) else target
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), lengths)
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
     if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
         return SearchResult(followed)
     if followed.holds and not followed.is_decided and not options.keep_start:
-        # It is near, or looks like it, and its lens led astray: the search has other lenses to start from.
+        # The field may be near, with a lens that was misleading: the search starts from other lenses.
         auto = Auto(before=followed.camera, lengths=lengths)
         # reads: "the field length is ... larger", as it was followed
         other = attempt(partial(search, grey, target, painted, auto), InputError)
@@ -343,17 +351,17 @@ def _looked_from(
 
 @or_none  # reads: "its lines were not found ..."
 def _is_worn(grey: Array32, followed: FieldLines) -> bool:
-    """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
+    """Whether this is the field with lines worn to dashes; always False for a target without a grid of lines."""
     return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves, Auto()), followed)
 
 
 def _starts(
     start: Camera | Clicks | FieldLines, target: Target, size: tuple[int, int], lengths: tuple[Prior, ...]
 ) -> tuple[list[Camera], FreeIntrinsics]:
-    """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to.
+    """Return the cameras to start from: the last image's, the one given, or those that are consistent with the clicks.
 
     Args:
-        lengths: what is known of them.
+        lengths: priors on the target's dimensions.
     """
     if isinstance(start, Clicks):
         return starts_from_clicks(start, target, size, lengths)
@@ -368,9 +376,9 @@ def _starts(
 
 
 def _observations(frame: str, followed: FieldLines, target: Target, options: FieldOptions) -> Observations:
-    """One image's view: what its lines and crossings are, each pixel counted once.
+    """Return one image's view: observations of its lines and crossings, each pixel used once.
 
-    Curves that lie beside their drawing are straight and round nevertheless: they tell the lens, under an offset.
+    Misplaced curves are straight and round nevertheless: they help to determine the lens, with an offset each.
     """
     camera, lines = followed.camera, followed.lines
     points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
@@ -386,8 +394,8 @@ def _observations(frame: str, followed: FieldLines, target: Target, options: Fie
         aside = _curves(beside, beside.found, options.edges)
         curves = joined([curves, aside])
     priors = [Prior.of_offset(TARGET_NAME, name, sigma_m) for name, sigma_m in built.laid_m.items()]
-    # Dimensions may be others, or look so by a lens that is none of ours; and where lines lie aside, so may the whole.
-    # Beyond what is usual a calibration says that this is contradicted.
+    # Dimensions may differ, or seem to because of a lens that no model here describes. Where lines are misplaced, the
+    # whole field may be, too. A calibration reports a contradiction beyond the usual amount.
     extent_m = float(np.max(np.ptp(target.box, axis=0)))
     for name, drawn_m in built.drawn.items():
         off_m = abs(built.dimensions.get(name, drawn_m) - drawn_m)
@@ -396,7 +404,7 @@ def _observations(frame: str, followed: FieldLines, target: Target, options: Fie
             priors.append(Prior("target", TARGET_NAME, name, (drawn_m,), (min(off_m, 0.5 * built.usual_m),)))
     if lines.coma_px:
         priors.append(Prior("camera", options.camera, COMA, (0.0,), (lines.coma_px,)))
-    if camera.aspect != 1.0:  # else it is solved for as one with square pixels
+    if camera.aspect != 1.0:  # otherwise the camera is solved for with square pixels
         priors.append(Prior("camera", options.camera, "aspect", (camera.aspect,), (STRETCH,)))
     return Observations(
         {TARGET_NAME: target},

@@ -1,4 +1,4 @@
-"""What came of following a field's lines in a photograph, and whether that is the field."""
+"""Result of following a field's lines in a photograph, and whether it is the field."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from ceres_cal.detect.lines import SPACING_PX, Lines
 from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt
 from ceres_cal.scene import Camera, Target
 
-# Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
+# Least share of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33
+# to 0.67.
 LEAST_SHARE = 0.5
-# The same from which on no other start is tried. At half of its odds nothing changes.
+# Share of the places with paint from which on no other start is tried. At half of its odds nothing changes.
 SURE_SHARE = 0.7
-# The same of lines that may be worn to dashes: other fields and wrong places have as much, and strokes must decide.
+# Least share of the places with paint for lines that may be worn to dashes: other fields and wrong places reach it as
+# well, so strokes must decide.
 _LEAST_IF_WORN = 0.3
-# Found of a curve, at least; places on curves without that, at most.
+# Share of a curve's places below which it is absent; largest share of all places on absent curves.
 _ABSENT, _MOST_ABSENT = 0.2, 0.08
 
 
@@ -25,12 +27,14 @@ class FieldLines(Frozen):
     """A field's lines as they were followed.
 
     Attributes:
-        camera: the posed camera that predicts them. target: as its dimensions were found.
-        curves: names of those that were followed. missing: of those that the target may lack, and this field does.
-        lines: what was measured there, but for curves that lie aside.
-        beside: the same of the curves that lie aside.
+        camera: the posed camera that predicts them.
+        target: the target with the dimensions that were found.
+        curves: names of the curves that were followed.
+        missing: names of the curves that the target may lack, and this field does.
+        lines: measurements of the curves, without misplaced ones.
         visible: names of the curves along which there is paint, whether it could be measured or not.
-        built: how the curves lie, where the photograph had to tell the lens, too.
+        built: where the curves lie, if the photograph had to determine the lens, too.
+        beside: measurements of the misplaced curves.
     """
 
     camera: Camera
@@ -44,20 +48,20 @@ class FieldLines(Frozen):
 
     @cached_property
     def places(self) -> int:
-        """How many are in view, those on curves that this field does not have among them."""
+        """Number of places in view, including those on curves that this field lacks."""
         return len(self.lines.found) + len(self._lacking)
 
     @property
     def share(self) -> float:
-        """Of the places in view, the share where paint was found: of a field that lacks something the rest must be
-        seen all the better.
+        """Share of the places in view where paint was found. Places on curves that the field lacks count, so the rest
+        of it must be seen all the better.
         """
         return float(np.count_nonzero(self.lines.found) / self.places) if self.places else 0.0
 
     @property
     def absent(self) -> tuple[int, ...]:
-        """The curves in view of which next to nothing was found, nor is to be seen unless the target may lack them: of
-        these there may be others, elsewhere.
+        """Numbers of the curves in view of which almost nothing was found. Curves that are visible are excluded, unless
+        the target may lack them: the visible paint may then be another line's.
         """
         curve, found = self.lines.course.curve, self.lines.found
         numbers, places = np.unique(curve, return_counts=True)
@@ -68,7 +72,7 @@ class FieldLines(Frozen):
 
     @property
     def lacks_wholly(self) -> tuple[tuple[str, ...], ...]:
-        """The parts that the target may lack of which nothing is there."""
+        """The optional parts of the target of which nothing is there."""
         none = {*self.missing, *(self.target.curve_names[number] for number in self.absent)}
         return tuple(part for part in self.target.optional if none.issuperset(part))
 
@@ -83,7 +87,7 @@ class FieldLines(Frozen):
 
     @property
     def holds(self) -> bool:
-        """Whether this is the field: paint at half of the places in view, and no line missing that weighs."""
+        """Whether this is the field: paint at half of the places in view, and no important line missing."""
         return self.share >= LEAST_SHARE and self._has_all
 
     @property
@@ -93,22 +97,24 @@ class FieldLines(Frozen):
 
     @property
     def is_field(self) -> bool:
-        """Whether it holds, and its curves lie as those of the target do."""
+        """Whether it holds, and its curves lie where the target says."""
         return self.holds and not self.built.is_other
 
     @property
     def is_decided(self) -> bool:
-        """Whether its lines are there, and other dimensions alone explain them: no other start would tell more."""
+        """Whether its lines are surely there, and different dimensions alone explain them: another start would not
+        help.
+        """
         is_another = self.built.is_other and bool(self.built.dimensions) and not self.built.aside_m
         return is_another and self.is_sure
 
     @property
     def may_be_worn(self) -> bool:
-        """Whether it is at least the field if its lines are worn to dashes."""
+        """Whether it is at least consistent with the field if its lines are worn to dashes."""
         return self.share >= _LEAST_IF_WORN and self._has_all
 
     @property
     def _has_all(self) -> bool:
         gone = [number for number in self.absent if self.target.curve_names[number] not in self.visible]
-        missing = np.isin(self.lines.course.curve, gone)  # what it may lack, and others hide, is lacking at most
+        missing = np.isin(self.lines.course.curve, gone)  # an optional curve that is hidden counts only as lacking
         return float(np.mean(missing)) <= _MOST_ABSENT

@@ -1,4 +1,4 @@
-"""Following a field's lines in a photograph: search along normals, refit the camera, search nearer, until at rest."""
+"""Following a field's lines in a photograph: search along normals, refit the camera, search nearer, until converged."""
 
 from __future__ import annotations
 
@@ -34,24 +34,25 @@ from ceres_cal.problem.parameters import intrinsic_names
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, target_from_spec
 
-FAR_PX = 130.0  # how far off the start may be
+FAR_PX = 130.0  # how far off the start may be, px
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
-# From points that were shown: what stands farther beside a line than they are off cannot draw it away.
+# Reaches for a start from points that a user showed: a line farther off than these points' errors cannot attract it.
 _SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
-# Of the share, what square pixels keep at least where the picture was not stretched; times the misfit, what they have
-# at most: 1.3 where it was not, 9 where it was by 2 to 7 %.
+# For a picture that was not stretched: least ratio of the shares of paint found with square and with free pixels, and
+# largest ratio of the misfits, 1.3 there and 9 where the picture was stretched by 2 to 7 %.
 _KEPT, _WORSE = 0.95, 2.0
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
 _FEWEST = 12
-_MOST_OTHERS = 3  # ways to see the field that are tried where the best looks like another field
+_MOST_OTHERS = 3  # number of other solutions that are tried where the best one looks like another field
 _ROUNDS = 6
-_NEARER = 2  # times that lines of other dimensions are looked for again
-_LESS = 0.02  # of the share: by so much less is no worse
-_AT_REST_PX = 0.1  # lines that are predicted so little elsewhere are not measured again: they are found up to 5 px off
-_SAME_PX = 1.0  # a start so near to where another came to rest: wrong ones went on by 0.8 px at most, and to there
+_NEARER = 2  # how often lines of changed dimensions are searched again
+_LESS = 0.02  # a share of paint lower by at most this is no worse
+_AT_REST_PX = 0.1  # lines whose prediction moves by less are not measured again: they are found up to 5 px off
+# cameras closer than this converge to the same result: wrong ones moved by 0.8 px at most, to that result
+_SAME_PX = 1.0
 
 _T = TypeVar("_T")
 
@@ -61,13 +62,15 @@ def follow(
 ) -> FieldLines:
     """Follow a target's painted curves in a photograph, from the best of several starts.
 
-    A start that is near is taken at once; else shifts, turns and scales of it are tried, by 130 px and 7.5 degrees.
+    A near start is tried as it is; after that shifts, turns and scales of it, by up to 130 px and 7.5 degrees.
 
     Args:
-        starts: posed cameras, any of which may be right. curves: names of those that are painted.
+        starts: posed cameras, any of which may be right.
+        curves: names of the painted curves.
+        free: what the photograph may change besides the pose.
 
     Returns:
-        The best that was reached; whether it is the field, `FieldLines.holds` tells.
+        The best result; `FieldLines.holds` says whether it is the field.
     """
     tracker = Tracker(grey, target, curves, free or FreeIntrinsics())
     tried = tracker.tried(starts)
@@ -87,11 +90,13 @@ def follow(
 
 @dataclass(frozen=True, eq=False)
 class Tracker:
-    """A photograph, the target's painted curves that are followed in it, and what of the camera is free.
+    """A photograph, the target's painted curves that are followed in it, and what is free in the camera.
 
     Attributes:
-        missing: curves that the target may lack, and this field does. reached: what starts led to so far.
-        known: what was made of a camera before. is_even: whether the picture is known to have no coma.
+        missing: curves that the target may lack, and this field does.
+        reached: results so far of all starts.
+        known: cache of results by camera.
+        is_even: whether the picture is known to have no coma.
     """
 
     grey: Array32
@@ -104,41 +109,43 @@ class Tracker:
     is_even: bool = False
 
     def approached(self, camera: Camera) -> FieldLines:
-        """`follow` from one start, up to where the lens remains that it started from. What others led to, and leads to
-        again, is not followed to its end.
+        """Follow from one start, with the kind of lens that it has. A start that leads to an earlier result is not
+        followed to its end.
         """
         return next(self.tried([camera]))
 
     def refined_from(self, camera: Camera, lacking: Sequence[tuple[str, ...]] = ()) -> FieldLines:
-        """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside, as
-        drawn next to where lines were followed that look like another field's, or in a picture that was stretched.
+        """Refine a camera that is right except for its lens: choose the kind of lens that fits best, and leave out
+        misplaced curves. Lines that look like another field's are searched again near their drawn place, and a
+        stretched picture is tried.
 
         Args:
             lacking: parts that this field is known to lack.
         """
         tracker = self.lacking(lacking).of_painted(camera)
         lines = tracker.measured(camera)
-        tracker = replace(tracker, is_even=lines.is_even)  # the picture has coma, or none, wherever its lines are now
+        # whether the picture has coma does not depend on where its lines are now
+        tracker = replace(tracker, is_even=lines.is_even)
         return tracker.told(tracker.followed(camera, lines))
 
     def followed(self, camera: Camera, lines: Lines) -> FieldLines:
-        """What was measured from a camera."""
+        """Return the measured lines of a camera, with the curves that are visible."""
         visible = visible_curves(self.grey, self.target, camera, self.curves)
         return FieldLines(camera, self.target, tuple(self.curves), self.missing, lines, visible)
 
     def of_painted(self, camera: Camera) -> Tracker:
-        """The same without what the target may lack and this camera does not see."""
+        """Return the tracker without optional parts of the target that this camera does not see."""
         painted = painted_curves(self.grey, self.target, camera, self.curves)
         missing = (*self.missing, *(name for name in self.curves if name not in painted))
         return replace(self, curves=painted, missing=missing)
 
     def lacking(self, parts: Sequence[tuple[str, ...]]) -> Tracker:
-        """The same without some parts that the target may lack."""
+        """Return the tracker without some optional parts of the target."""
         names = [name for part in parts for name in part]
         return replace(self, curves=[one for one in self.curves if one not in names], missing=tuple(names))
 
     def tried(self, starts: Sequence[Camera]) -> Iterator[FieldLines]:
-        """What is reached from the starts: what is surely the field at once, then the others, the best first."""
+        """Yield the results of the starts: one that is surely the field at once, then the others, the best first."""
         is_sure: dict[FieldLines, bool] = {}
         for one in self._reached(starts):
             if one not in is_sure:
@@ -158,10 +165,10 @@ class Tracker:
         for reaches, camera in product(shown if self.free.keep else (*shown, _FAR_REACHES_PX), shifted):
             yield self.close_in(camera, reaches)
         if not shifted:
-            yield self.close_in(starts[0], ())  # as it is: nothing to search
+            yield self.close_in(starts[0], ())  # as it is: no line to search
 
     def shifted_starts(self, starts: Sequence[Camera]) -> list[Camera]:
-        """Cameras that put the lines near something thin and bright, the best first."""
+        """Return cameras that put the lines near something thin and bright, the best first."""
         courses = [self._predicted(camera) for camera in starts]
         usable = [number for number, course in enumerate(courses) if len(course) >= _FEWEST]
         if not usable:
@@ -181,7 +188,7 @@ class Tracker:
         return refitted
 
     def close_in(self, camera: Camera, reaches_px: Sequence[float]) -> FieldLines:
-        """Search ever nearer, freeing one intrinsic after the other; then measure and refit until at rest."""
+        """Search ever nearer, freeing one intrinsic after the other; then measure and refit until convergence."""
         tracker = self
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
@@ -198,13 +205,13 @@ class Tracker:
         return there
 
     def _reached_before(self, camera: Camera) -> FieldLines | None:
-        """What was at rest before, of the same lines, so near that it is where this camera would come to rest."""
+        """Return an earlier result of the same lines, if it is so near that this camera would converge to it."""
         own = self.target.spec, tuple(self.curves)
         alike = [one for one in self.reached if (one.target.spec, one.curves) == own]
         return next((one for one in alike if moved_px(one.camera, camera, one.lines.course.pixels) < _SAME_PX), None)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> FieldLines:
-        """Measured and refitted, with these intrinsics free, until nothing moves any more, or no less than before."""
+        """Measure and refit, with these intrinsics free, until the lines stop moving, or move no less than before."""
         return self._once(camera, (names,), lambda: self._at_rest(camera, names))
 
     def _once(
@@ -214,7 +221,9 @@ class Tracker:
         made: Callable[[], _T],
         is_same: Callable[[Camera, _T], bool] = lambda start, came: False,
     ) -> _T:
-        """What is made from a camera, or one that is the same, of these lines: they are asked for time and again."""
+        """Return `made()`, or its earlier result for the same lines from this camera or an equivalent one: results are
+        asked for repeatedly.
+        """
         asked = *what, tuple(self.curves), self.target.spec
         for start, before, came in self.known:
             if before == asked and (start is camera or is_same(start, came)):
@@ -224,7 +233,8 @@ class Tracker:
         return came
 
     def _at_rest(self, camera: Camera, names: tuple[str, ...]) -> FieldLines:
-        no_nearer = 0.8  # of the last step: lines that are taken in turns, or none that fit, come to no rest
+        # a step must be smaller than this share of the last one: lines that alternate, or do not fit, never converge
+        no_nearer = 0.8
         tracker, lines, moved, there = self, self.measured(camera), np.inf, camera
         for _ in range(_ROUNDS):
             if np.count_nonzero(lines.found) < _FEWEST:
@@ -240,13 +250,14 @@ class Tracker:
         return tracker.followed(there, lines)
 
     def refined(self, followed: FieldLines) -> FieldLines:
-        """The same, predicted with the lens that suits the curves best, without those that lie aside."""
+        """Refine the result: predict with the lens that fits the curves best, without the misplaced curves."""
         whole = self._with(followed)
         followed = whole.without_aside(followed)
-        if followed.built.is_other:  # as by a lens that does not suit: a polynomial bends a strong one's lines
+        # possibly because of an unsuitable lens: a polynomial bends the lines of a strong one
+        if followed.built.is_other:
             other = whole.without_aside(whole.farther(whole.with_best_lens(followed)))
             other = self.as_drawn(other) if other.built.is_other else other
-            if other.built.is_other:  # the lens that its lines suit better with those dimensions says which they are
+            if other.built.is_other:  # the dimensions are those under the lens that fits better with them
                 return min(followed, other, key=whole._misfit_as_built)
             followed = other
         curves = [name for name in whole.curves if name not in followed.built.aside_m]
@@ -258,8 +269,8 @@ class Tracker:
         return stretched if stretched.is_field else there
 
     def farther(self, followed: FieldLines) -> FieldLines:
-        """The same searched again from farther off, with its kind of lens: one that was too simple for a wide lens had
-        the ends of lines elsewhere, and what is found next to there holds another one back.
+        """Search again from farther off, with the kind of lens found. A lens that was too simple for a wide one put the
+        ends of lines elsewhere, and what is found near there would mislead another lens.
         """
         tracker, camera = self, followed.camera
         for reach in _NEAR_REACHES_PX:
@@ -268,10 +279,11 @@ class Tracker:
         return there if there.may_be_worn and there.share > followed.share else followed
 
     def as_drawn(self, other: FieldLines) -> FieldLines:
-        """What looks like another field, or the one that is drawn, where all of its lines are there as well.
+        """Return the field as drawn if all of its lines are there as well, although the result looks like another
+        field.
 
-        A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
-        dimensions free the camera is right: its own lines are next to where that puts them.
+        If the camera takes a line around the field for one of its own, it bends until areas and circle disagree. With
+        their dimensions free the camera is right, and the field's own lines are near where it predicts them.
         """
         there = self.as_built(other)[1]
         if not there.is_sure:
@@ -283,8 +295,9 @@ class Tracker:
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
     def told(self, followed: FieldLines) -> FieldLines:
-        """The same refined, with square pixels; unless it is the field in a picture that was stretched one way, and
-        square pixels suit clearly worse, by other dimensions as well, or show no field and no other dimensions either.
+        """Refine with square pixels. Other pixels, for a picture stretched in one direction, are used only where they
+        show the field and square pixels either fit clearly worse, even with different dimensions, or show neither the
+        field nor different dimensions alone.
         """
         square = self.squared(followed)
         even = self.refined(square)
@@ -296,27 +309,27 @@ class Tracker:
         return even if not stretched.is_field or (is_told and not self._suits_worse(nearest, stretched)) else stretched
 
     def _suits_worse(self, one: FieldLines, other: FieldLines) -> bool:
-        """Whether less paint is found where one has the lines than where another has them, or it lies off that."""
+        """Whether less paint is found at the first result's lines than at the second's, or fits them worse."""
         return one.share < _KEPT * other.share or self._misfit(one) > _WORSE * self._misfit(other)
 
     def _misfit(self, followed: FieldLines) -> float:
         return misfit(followed.camera, self._with(followed)._observed(followed.lines, followed.camera))
 
     def _misfit_as_built(self, followed: FieldLines) -> float:
-        """The same where its lines are followed to with the dimensions that they say."""
+        """Misfit of the lines when they are followed with the dimensions that they indicate."""
         return self._misfit(self.as_built(followed)[1])
 
     def _with(self, followed: FieldLines) -> Tracker:
-        """The same for curves, and a target as drawn, as they were followed."""
+        """Return the tracker for the curves, and the target as drawn, of a result."""
         return replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
 
     def squared(self, followed: FieldLines) -> FieldLines:
-        """The same lines through a camera with square pixels."""
+        """Refit the same lines with a camera of square pixels."""
         camera = squared_pixels(followed.camera)
         return self._with(followed).at_rest(camera, _free(camera))
 
     def without_aside(self, followed: FieldLines) -> FieldLines:
-        """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
+        """Leave out the misplaced curves in turn, so that none pulls the camera to where others seem misplaced."""
         free = _free(followed.camera)
         whole, built = replace(self, target=followed.target), AS_DRAWN
         left = whole
@@ -335,10 +348,10 @@ class Tracker:
         return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
     def as_built(self, followed: FieldLines) -> tuple[FieldAsBuilt, FieldLines]:
-        """How all curves lie, and where they are followed to with those dimensions.
+        """Return where all curves lie, and the result of following them with the dimensions found.
 
-        Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
-        others; so they are looked for again, and measured, where those dimensions put them.
+        With different dimensions lines are several pixels from where they were searched, and some are missed or
+        confused. So they are searched and measured again where those dimensions put them.
         """
         return self._once(followed.camera, ("as built",), lambda: self._as_built(followed))
 
@@ -360,10 +373,10 @@ class Tracker:
         return built, nearest
 
     def with_best_lens(self, followed: FieldLines, *, is_stretched: bool = False) -> FieldLines:
-        """What is found when the lines are predicted with the kind of lens that suits them best.
+        """Return the lines predicted with the kind of lens that fits them best.
 
-        A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
-        does so where nothing was measured.
+        A polynomial that is a pixel off bends the lines from which crossings are extrapolated; one that folds in the
+        picture does so where nothing was measured.
         """
         lengths = tuple(prior for prior in self.free.priors if prior.dimension)
         observed = self._observed(followed.lines, followed.camera)
@@ -378,12 +391,12 @@ class Tracker:
     def _refitted(
         self, camera: Camera, observations: Observations, names: tuple[str, ...]
     ) -> tuple[Tracker, Camera] | None:
-        """The camera refitted with these intrinsics free, and the tracker of the target as it is then."""
+        """Return the tracker with the refitted target, and the camera refitted with these intrinsics free."""
         refitted = refit_camera(camera, observations, names, self.free.priors)
         return None if refitted is None else (replace(self, target=refitted[1]), refitted[0])
 
     def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> tuple[Tracker, Camera] | None:
-        """The camera refitted to what is brightest along the normals; None where too little is."""
+        """Refit to the brightest places along the normals; None where too few are found."""
         course = self._predicted(camera, 2.0)
         if len(course) < _FEWEST:
             return None
@@ -402,7 +415,9 @@ class Tracker:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
     def measured(self, camera: Camera, *, is_even: bool = False) -> Lines:
-        """The lines next to where a camera has them, or another one of its kind has them that far from there."""
+        """Measure the lines near where a camera predicts them; return an earlier measurement if it has the same kind of
+        lens and predicts them almost there.
+        """
         is_even = is_even or self.is_even
 
         def is_same(start: Camera, came: Lines) -> bool:
@@ -424,5 +439,5 @@ class Tracker:
 
 
 def _free(camera: Camera) -> tuple[str, ...]:
-    """Names of the intrinsics that a photograph may change: its pixels are square where they are so far."""
+    """Names of the intrinsics that a photograph may change; pixels that are square so far remain square."""
     return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect" or camera.aspect != 1.0)

@@ -1,4 +1,4 @@
-"""Whether what was followed is the field: what speaks against it, how good it is, and when two are one and the same."""
+"""Judgement of whether followed lines are the field: objections, likelihood, and when two results are the same."""
 
 from __future__ import annotations
 
@@ -13,38 +13,41 @@ from ceres_cal.detect.photographs.painted import BY_CHANCE
 from ceres_cal.problem.quantities import is_lens
 from ceres_cal.scene import Arc, Target
 
-# Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
-# double.
+# Largest distance of a stroke that lies on the target, px: the edge of wide paint is that far from its middle. Nothing
+# changes from half to double.
 _NEAR_PX = 6.0
-# Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
-# stripes of sun it is 0.83 at least, of other fields 0.6 at most.
+# Least share of the strokes that could be lines of the target which lie on it. On photographs with cables, seams and
+# stripes of sun it is 0.83 or more, for other fields 0.6 at most.
 _EXPLAINED = 0.75
-# The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole,
-# and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
+# Least share of all strokes, including those beside the target, where walls and boundary lines run. It is 0.61 or more
+# where the target is seen whole. The lower limit holds if all of the target's lines are there, because a wider boundary
+# line may show more strokes than they do.
 _OF_ALL, _OF_ALL_IF_WHOLE = 0.55, 0.4
-# Of straight lines, those that a camera lays on any others by place, size and bend; the negative log of the chance that
-# the rest lie on lines by themselves, from which on other lines lie there besides: 13 where they do, of others 7; the
-# same where each is seen to lie as drawn, to millimetres; and below which a corner may be any corner, so that nearly
-# all the picture must be explained: 0.92 is, of others 0.88.
+# _LAID: number of straight lines that a camera can place on any others by position, size and bend. The other limits are
+# of the negative log of the chance that the remaining lines lie on strokes by coincidence. From _NO_CHANCE on,
+# unexplained strokes are accepted as other lines (13 where such lines are, 7 for other fields); from _IF_AS_DRAWN on
+# where each line is seen to lie as drawn, to millimetres. Below _BY_ANY a corner may be any corner, so _IF_ANY of the
+# strokes must be explained: 0.92 are, for other fields 0.88.
 _LAID, _NO_CHANCE, _IF_AS_DRAWN, _BY_ANY, _IF_ANY = 5, 9.0, 4.0, 2.0, 0.9
-# Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
-# another line's at least.
+# Largest sine of the angle between a stroke and the lines: 4 degrees. Least strength of another line, as a share of the
+# usual strength of strokes on the lines.
 _PARALLEL, _AS_STRONG = 0.07, 0.5
-# Found on a curve, and curves of which so many were: fewer could be any lines. Nothing changes from half to double.
+# Least number of places found on a curve, and of curves with so many: fewer could be any lines. Nothing changes from
+# half to double.
 _FEWEST_PLACES, _FEWEST_CURVES = 5, 3
-# Cosine of the tilt: 65 degrees, 20 more than is promised. Nothing changes at half of it; at double, 33 degrees,
+# Least cosine of the tilt: 65 degrees, 20 more than is promised. Nothing changes at half of it; at double, 33 degrees,
 # tilted views are missed.
 _LEAST_UPRIGHT = 0.42
-# Of the extent of what is seen: cameras that put it nearer together than that name it alike. Nothing changes from
-# half to double.
+# Distance, as a share of the extent of what is seen, within which two cameras give it the same names. Nothing changes
+# from half to double.
 _SAME_FLOOR = 0.1
 
 
 def why_missed(followed: FieldLines, target: Target, *, started: bool) -> str:
-    """Why lines that were followed are not the target's; for those that do not hold.
+    """Return why followed lines are not the target's, for a result that does not hold.
 
     Args:
-        started: whether somebody said where to start.
+        started: whether a start was given.
     """
     if followed.built.is_other:
         asked = ",".join(name.removesuffix("_m") for name in followed.built.dimensions)
@@ -59,7 +62,7 @@ def why_missed(followed: FieldLines, target: Target, *, started: bool) -> str:
 
 
 def objection(search: FieldSearch, followed: FieldLines) -> str:
-    """What speaks against taking what was followed for the field, or nothing."""
+    """Return what speaks against taking the followed lines for the field, or ""."""
     if not is_shown(search, followed) or followed.built.is_other:
         return why_missed(followed, search.grid.target, started=False)
     names = detected_curves(search, followed)
@@ -81,10 +84,11 @@ def objection(search: FieldSearch, followed: FieldLines) -> str:
 
 
 def is_shown(search: FieldSearch, followed: FieldLines) -> bool:
-    """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own, and on
-    more than half of its curves: a few cables lie on some of any field's.
+    """Whether paint is found at enough places. A worn field may have fewer, if there are no other strokes, and if paint
+    is on more than half of its curves: a few cables lie on some curves of any field.
     """
-    # The same of a field whose paint is found at fewer than half of the places; worn lines in dashes: 1.
+    # Least share of explained strokes for a field whose paint is found at fewer than half of the places; lines worn to
+    # dashes have 1.
     explained_if_worn = 0.9
     if followed.holds or not followed.may_be_worn:
         return followed.holds
@@ -95,19 +99,19 @@ def is_shown(search: FieldSearch, followed: FieldLines) -> bool:
 
 
 def likelihood(followed: FieldLines) -> float:
-    """How much likelier the paint that was found is of the target there than of lines laid anywhere.
+    """Log-likelihood ratio of the paint that was found for the target being there against lines laid anywhere.
 
-    The log-likelihood ratio of so many places with paint: a grid that is moved by a line has fewer of them.
+    It counts places with paint: a grid that is shifted by a line has fewer of them.
     """
     return float(followed.places * divergence(max(followed.share, BY_CHANCE), BY_CHANCE))
 
 
 def explained(search: FieldSearch, followed: FieldLines) -> tuple[float, float]:
-    """Of the strokes inside the target's outline, and of those everywhere, that could be its lines, the share that lies
-    on them.
+    """Return the share of strokes that lie on the target's lines, among strokes inside its outline and among all
+    strokes.
 
-    Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
-    stripes of sun that run otherwise, or are fainter, say nothing against it.
+    Only strokes that could be its lines count: those parallel or perpendicular to them and as strong as those on them.
+    Cables, seams, shadows and stripes of sun in other directions, or fainter ones, are no objection.
     """
     course_px = 3.0
     strokes, parallel = search.stroke_map.strokes, _parallel(search, followed)
@@ -117,7 +121,7 @@ def explained(search: FieldSearch, followed: FieldLines) -> tuple[float, float]:
         inside = everywhere & np.all((parallel.middle > low) & (parallel.middle < high), axis=1)
     middle, length_px = strokes.ends.mean(axis=1), strokes.length_px
     away = np.sum(line**2, axis=1)
-    parts = np.array_split(middle, 1 + len(middle) // 128)  # what is worked on stays in the cache
+    parts = np.array_split(middle, 1 + len(middle) // 128)  # each part fits into the processor's cache
     apart = [np.min(away - 2.0 * some @ line.T, axis=1, initial=np.inf) for some in parts]
     near = np.sum(middle**2, axis=1) + np.concatenate(apart) < _NEAR_PX**2
 
@@ -131,8 +135,8 @@ def explained(search: FieldSearch, followed: FieldLines) -> tuple[float, float]:
 
 
 class _Parallel(Frozen):
-    """The N strokes on the floor, in the grid: their middles (N, 2), half a pixel there (N,), whether they run along
-    its lines, or across, (N,) each, and between which corners (2, 2) the target lies.
+    """The N strokes on the floor, in the grid: their middles (N, 2) m, half a pixel there (N,) m, whether they are
+    parallel to its lines or perpendicular, (N,) each, and the corners (2, 2) m of the target's outline.
     """
 
     middle: Array
@@ -143,7 +147,7 @@ class _Parallel(Frozen):
 
 
 def _parallel(search: FieldSearch, followed: FieldLines) -> _Parallel:
-    rim = 0.02  # of its size
+    rim = 0.02  # as a share of the target's size
     strokes = search.stroke_map.strokes
     ends = np.stack([followed.camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
     x, y = np.abs(ends[1] - ends[0]).T
@@ -156,10 +160,11 @@ def _parallel(search: FieldSearch, followed: FieldLines) -> _Parallel:
 
 
 def coincidence(search: FieldSearch, followed: FieldLines) -> float:
-    """How unlikely it is that lines of something else lie where all of the target's do: the negative log of it.
+    """Negative log of the chance that lines of something else lie where all of the target's do.
 
-    Of each straight line: in how many of the places beside it, all over the field, there are as many strokes as on it.
-    Where others run everywhere, as on striped floors, it tells nothing; and a camera lays some lines on any others.
+    The chance for each straight line is the share of positions beside it, all over the field, that have as many strokes
+    as its own. Where strokes are everywhere, as on striped floors, this decides nothing; and a camera can place a few
+    lines on any others.
     """
     tried, as_many, near_px = 300, 0.8, 2.0
     parallel, turn, target = _parallel(search, followed), search.grid.turn, followed.target
@@ -182,7 +187,7 @@ def coincidence(search: FieldSearch, followed: FieldLines) -> float:
 
 
 def same_labels(search: FieldSearch, one: FieldLines, other: FieldLines) -> bool:
-    """Whether two put what is seen onto the same places of the target, whatever its turn."""
+    """Whether two results place what is seen at the same places of the target, whatever its turn."""
     pixels = one.lines.pixels[one.lines.found]
     here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
     extent = float(np.max(np.ptp(here, axis=0)))
@@ -191,13 +196,13 @@ def same_labels(search: FieldSearch, one: FieldLines, other: FieldLines) -> bool
 
 
 def detected_curves(search: FieldSearch, followed: FieldLines) -> list[str]:
-    """Names of the curves that were found."""
+    """Return the names of the curves that were found."""
     numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
     return [search.grid.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
 
 
 def _in_two_directions(search: FieldSearch, names: list[str]) -> bool:
-    """Whether these curves run in more than one direction."""
+    """Whether these curves have more than one direction."""
     numbers = [search.grid.target.curve_names.index(name) for name in names]
     tracks, is_arc = search.grid.target.tracks[0, numbers], search.grid.target.is_arc[numbers]
     ways = tracks[~is_arc, 1, :2]

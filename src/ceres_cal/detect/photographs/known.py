@@ -1,4 +1,4 @@
-"""What photographs show of the things that a calibration knows, as observations for `refit` and `check`."""
+"""Observations for `refit` and `check`: what photographs show of the targets that a calibration knows."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _REACH = f"{FAR_PX:.0f} px or 5 degrees"
 
 
 class KnownDetections(Frozen):
-    """What `detect_known` found.
+    """Result of `detect_known`.
 
     Attributes:
         station: where the photographs were taken.
         observations: under the names of the calibration; None where no photograph shows anything.
         shown: name of a target -> how many photographs show it.
         missed: path and reason of every photograph that shows nothing.
-        images: how many photographs there were.
+        images: number of photographs.
     """
 
     station: str
@@ -39,7 +39,7 @@ class KnownDetections(Frozen):
     __repr__ = brief
 
     def require(self) -> Observations:
-        """The observations; NothingShownError where there are none."""
+        """Return the observations; NothingShownError where there are none."""
         if self.observations is None:
             path, reason = self.missed[0]
             raise NothingShownError(
@@ -59,21 +59,22 @@ def detect_known(
     boards: bool = True,
     progress: ImageProgress | None = None,
 ) -> KnownDetections:
-    """Look through photographs of one station for everything that the calibration's targets let one find there.
+    """Search photographs of one station for everything of the calibration's targets that can be detected.
 
-    Painted fields by `detect_field`, from where the station stood (it may have moved by up to 130 px, or 5 degrees),
-    chessboards by `detect_boards`. The search follows the picture and moves its own camera along, but what comes out
-    are pixels and names of what they show: a move stays in them.
+    Painted fields are found by `detect_field`, from where the station stood (it may have moved by up to 130 px, or 5
+    degrees), chessboards by `detect_boards`. The search adapts its own camera to the picture, but the results are
+    pixels and the names of what they show: a move of the camera remains visible in them.
 
     Args:
         images: files of any kind OpenCV reads.
         station: by default the only one there is.
-        not_painted: curves that the field does not have. boards: else painted fields only.
+        not_painted: curves that the field does not have.
+        boards: whether chessboards are searched as well as painted fields.
         progress: called after each image and target with (steps done, steps in all, file name).
 
     Raises:
         InputError: an image cannot be read or has another size than the camera, the calibration has no such station, no
-            such curve, or no target that is found in photographs.
+            such curve, or no target that can be detected in photographs.
     """
     paths, posed = [Path(path) for path in images], calibration.station(station)
     name = station or next(iter(calibration.stations))
@@ -113,7 +114,7 @@ def detect_known(
 def _searched(
     paths: list[Path], target: Target, posed: Camera, painted: list[str], options: FieldOptions, report: ImageProgress
 ) -> FieldDetections | BoardDetections:
-    """What images show of one target."""
+    """Detect one target in the images."""
     if is_painted(target):
         return detect_field(paths, target, posed, painted, options, report)
     return detect_boards(paths, target, options.camera, options.station, progress=report)
@@ -129,12 +130,12 @@ def check_photographs(
     not_painted: Collection[str] = (),
     progress: ImageProgress | None = None,
 ) -> tuple[Agreements, KnownDetections]:
-    """`check` with photographs of one station; boards, which lie anywhere, are not looked for.
+    """Apply `check` to photographs of one station; boards, which may lie anywhere, are not searched.
 
-    Where no photograph shows the field near where the calibration has it, the station does not hold, and its words say
-    so: the camera has moved far, or nothing is to be seen. Raises what `detect_known` and `check` raise.
+    Where no photograph shows the field near where the calibration predicts it, the station does not hold, and its words
+    say why: the camera has moved far, or nothing is visible. Raises what `detect_known` and `check` raise.
     """
-    require_posterior(calibration)  # before any is read
+    require_posterior(calibration)  # before any photograph is read
     detections = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
     if detections.observations is not None:
         return check(calibration, detections.observations, false_alarms, checks), detections
@@ -146,7 +147,7 @@ def check_photographs(
 
 
 def is_painted(target: Target) -> bool:
-    """Whether a target has lines to be found in photographs: those with a width."""
+    """Whether a target has lines that can be found in photographs: those with a width."""
     return bool(target.painted)
 
 
@@ -155,7 +156,7 @@ def _counted(images: int) -> str:
 
 
 def _count_on(progress: ImageProgress | None, turn: int, turns: int, done: int, images: int, name: str) -> None:
-    """What one of several searches through the same images tells."""
+    """Report the progress of one of several searches through the same images."""
     if progress is not None:
         progress(turn * images + done, turns * images, name)
 

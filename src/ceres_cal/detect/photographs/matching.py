@@ -1,9 +1,9 @@
-"""Which line of a target is which in a photograph whose floor is known but for place, size and quarter turns.
+"""Assignment of lines in a photograph to lines of a target, for a floor known except for place, size and quarter turns.
 
-Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place,
-one line across tells the other: every such choice, in all four turns, is a hypothesis. Its score is how much likelier
-it makes the paint that was found than lines laid anywhere. Mirrored choices do not arise: the camera stands above a
-floor whose z points up, and a rotation mirrors nothing.
+Two parallel lines of the floor assigned to two of the target determine the camera's height and one coordinate of its
+place, and one line across determines the other: every such choice, in all four turns, is a hypothesis. Its score is how
+much likelier it makes the paint that was found than lines laid anywhere. Mirrored hypotheses do not arise: the camera
+stands above a floor whose z points up, and a rotation mirrors nothing.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from ceres_cal.detect.registration import REDUCED, Nearness
 from ceres_cal.detect.strokes import Strokes, alone
 from ceres_cal.kernels import lines_near
 
-# Of lines on the floor, in camera heights: how well a straightened stroke tells its place.
+# Width of a peak of strokes in position across a line, in camera heights: the accuracy of a straightened stroke.
 _PEAK = 0.012
-_MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line
-# Sine of the angle by which a stroke may be off the direction of its line: 9 degrees, as lens and tilt are rough yet.
+_MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # largest number of lines in one direction; least share of all strokes in one line
+# Largest sine of the angle between a stroke and its line: 9 degrees, as lens and tilt are still rough.
 _PARALLEL = 0.15
-# Within which two hypotheses are one, in camera heights.
+# Distance within which two hypotheses are one, in camera heights.
 _CELL = 0.03
-# Choices of two lines one way, at least, that are tried with each one across: it only saves time.
+# Least number of choices of two lines one way that are tried with each line across, to save time.
 _PAIRS = 120
-_FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
-# Of the places on the target: a camera nearer than that sees too little of it.
+_FEW, _MANY = 60, 300  # number of places on the target at which all hypotheses, and the best ones, are scored
+# Least share of the places on the target that are in view: a camera that shows less is too near.
 _LEAST_IN_VIEW = 0.03
-CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
+CROWDED = 0.12  # distance, in half diagonals, within which lines of a target are hardly ever parallel
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
 
 class StrokeMap(Frozen):
-    """The strokes of a photograph, how near each pixel is to them, and the lens's centre (2,) px."""
+    """The strokes of a photograph, how near each pixel is to them, the image's size, and the lens's centre (2,) px."""
 
     strokes: Strokes
     near: Nearness
@@ -45,34 +45,35 @@ class StrokeMap(Frozen):
 
     @property
     def unit_px(self) -> float:
-        """Half the image's diagonal."""
+        """Half the image's diagonal, px."""
         return 0.5 * float(np.hypot(*self.image_size))
 
     @property
     def ends(self) -> Array:
-        """(N, 2, 2) the strokes' ends from the centre, in half image diagonals."""
+        """(N, 2, 2) the strokes' ends relative to the centre, in half image diagonals."""
         return np.asarray((self.strokes.ends - self.centre) / self.unit_px)
 
     @cached_property
     def weights(self) -> Array:
-        """(N,) px of each stroke, as far as it may be a line."""
+        """(N,) length of each stroke, px, times how much it may be a line of its own."""
         return self.strokes.length_px * alone(self.strokes, CROWDED * self.unit_px)
 
     @cached_property
     def paint_px(self) -> float:
-        """The length of any lines that strokes can cover: of worn lines they cover the gaps, too."""
+        """Length of lines that strokes can cover, px; on worn lines they cover the gaps, too."""
         return max(self.near.length_px, 1.0)
 
     @cached_property
     def _by_chance(self) -> float:
-        """The share of any line that strokes cover by chance."""
+        """Share of any line that strokes cover by chance."""
         return float(np.clip(np.mean(self.near.plane), 1e-3, 0.5))
 
     def likelihood(self, covered_px: Array, shown_px: Array) -> Array:
-        """How much likelier a target is than lines laid anywhere, by how much of what it shows strokes cover.
+        """How much likelier a target is than lines laid anywhere, given the length that it shows and what strokes cover
+        of it.
 
-        The log-likelihood ratio of so many successes, at whatever share of the paint is left, over what it would be if
-        the target were the strokes: from 0 to about 1.
+        The log-likelihood ratio of so many successes at any share of paint, divided by its value if the target were the
+        strokes: from 0 to about 1.
         """
         chance = self._by_chance
         covered_px = np.minimum(covered_px, self.paint_px)
@@ -81,22 +82,22 @@ class StrokeMap(Frozen):
 
 
 def divergence(share: Array | float, other: Array | float) -> Array:
-    """Kullback and Leibler's, of two probabilities: what a trial tells of the first against the second."""
+    """Kullback-Leibler divergence of two probabilities: the expected log-likelihood ratio of one trial."""
     share, other = (np.clip(one, 1e-6, 1.0 - 1e-6) for one in (share, other))
     return np.asarray(share * np.log(share / other) + (1.0 - share) * np.log((1.0 - share) / (1.0 - other)))
 
 
 class FloorLines(Frozen):
-    """Where lines lie on the floor, in increasing order: x of those that run along y, and y of those along x.
+    """Positions of lines on the floor, ascending: x of those along y, and y of those along x.
 
-    In camera heights from the place below the camera.
+    The unit is the camera's height; the origin is below the camera.
     """
 
     x: Array
     y: Array
 
     def turned(self, quarters: int) -> FloorLines:
-        """The same in axes that are turned by quarters, counter-clockwise."""
+        """Return the lines in axes that are rotated by quarter turns, counter-clockwise."""
         lines = self
         for _ in range(quarters):
             lines = FloorLines(lines.y, -lines.x[::-1])
@@ -104,7 +105,7 @@ class FloorLines(Frozen):
 
 
 def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
-    """The lines on which most strokes lie."""
+    """Return the lines on which most strokes lie."""
     ends, weights = stroke_map.ends, stroke_map.weights
     floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
     on_floor = np.all(np.isfinite(floor), axis=(1, 2))
@@ -120,8 +121,8 @@ def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
 def match(
     upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines, least: float
 ) -> list[tuple[float, Pose]]:
-    """The best hypotheses for these lines: how good each is, and the camera from the target; the best first, up to
-    those that have less than `least` of its score.
+    """Return the best hypotheses for these lines: the score and the target's pose in the camera, the best first, down
+    to the share `least` of the best score.
     """
     kept = 250
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
@@ -155,12 +156,12 @@ def _hypotheses(lines: FloorLines, grid: LineGrid) -> Array:
     every = np.concatenate(parts)
     every = every[every[:, 0] > 0.0]
     cells = np.round(np.column_stack([np.log(every[:, 0]), every[:, 1:] / every[:, :1]]) / _CELL)
-    order = np.lexsort(cells.T[::-1])  # as by np.unique, which compares rows one by one
+    order = np.lexsort(cells.T[::-1])  # same as np.unique, which compares rows one by one
     return every[order[np.any(np.diff(cells[order], axis=0, prepend=np.nan), axis=1)]]
 
 
 def _pairs(peaks: Array, lines: Array) -> tuple[Array, Array]:
-    """Camera height and place for every two lines seen taken for two of the grid, in the same order."""
+    """Camera height and place for every two lines seen when assigned to two lines of the grid, in the same order."""
     i, j = np.triu_indices(len(peaks), 1)
     a, b = np.triu_indices(len(lines), 1)
     height = (lines[b] - lines[a])[None] / (peaks[j] - peaks[i])[:, None]
@@ -169,7 +170,9 @@ def _pairs(peaks: Array, lines: Array) -> tuple[Array, Array]:
 
 
 def _telling(height: Array, place: Array, peaks: Array, lines: Array) -> tuple[Array, Array]:
-    """Those that put most of the lines seen on lines of the grid; where many are as good, all of them."""
+    """Keep the hypotheses that put most of the lines seen on lines of the grid; all of them where many are equally
+    good.
+    """
     if len(height) <= _PAIRS:
         return height, place
     where = (lines - place[:, None]) / height[:, None]
@@ -180,14 +183,14 @@ def _telling(height: Array, place: Array, peaks: Array, lines: Array) -> tuple[A
 
 
 def _crossed(height: Array, place: Array, peaks: Array, lines: Array) -> Array:
-    """(K, 3) each height and place with, third, the place across for each line seen taken for each of the grid."""
+    """(K, 3) each height and place, and the place across for each line seen when assigned to each line of the grid."""
     other = lines[None, None] - height[:, None, None] * peaks[None, :, None]
     count = len(peaks) * len(lines)
     return np.column_stack([np.repeat(height, count), np.repeat(place, count), other.ravel()])
 
 
 def _peaks(values: Array, weights: Array, total: float) -> Array:
-    """Where most strokes lie, in increasing order."""
+    """Return the positions where most strokes lie, ascending."""
     chosen: list[float] = []
     left = weights.copy()
     for _ in range(_MOST_PEAKS):
@@ -204,10 +207,10 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
 
 
 def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: tuple[Array, Mask]) -> Array:
-    """(K,) of each hypothesis, from 0 to 1."""
+    """(K,) score of each hypothesis, from 0 to 1."""
     there, first = places
     optics = upright.bend, upright.phi, stroke_map.unit_px, *stroke_map.centre, *stroke_map.image_size
-    # In metres: a ray from the camera may have any length.
+    # Rays from the camera are in metres, as they may have any length.
     along, feet = upright.rotation[:, :2] @ there.T, hypotheses[:, [1, 2, 0]] @ upright.rotation.T
     sums = np.empty((len(hypotheses), 3))
     near = stroke_map.near

@@ -1,4 +1,4 @@
-"""How well a target's own lines are seen where a camera puts them, and which of those it may lack are not there."""
+"""Visibility of a target's own lines where a camera predicts them, and which of its optional parts are absent."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from ceres_cal.detect.lines import search
 from ceres_cal.detect.photographs.matching import divergence
 from ceres_cal.scene import Camera, Target
 
-# Where lines are sought: px apart, and to either side as a share of half the image's diagonal.
+# Spacing of the places where lines are searched, px; search distance to either side, as a share of half the image's
+# diagonal; least number of places.
 _SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12
-BY_CHANCE = 0.3  # of the places on any lines, those that look like paint: what is brighter than the others does
+BY_CHANCE = 0.3  # share of the places on any lines that look like paint: those brighter than the others
 _R3 = 1.2207440846057596 ** -np.arange(1.0, 4.0)
-_NEAR = 0.012  # the same where they are known to lie
-# Of the floor beside the curves that are seen, the darkest and the lightest share, times which it is another floor.
+_NEAR = 0.012  # search distance where the lines' positions are known, as a share of half the image's diagonal
+# Quantile for the darkest and lightest floor beside visible curves, and the factor beyond these that makes another
+# floor.
 _DARKEST, _ANOTHER = 0.25, 1.4
-# Log-likelihood ratio from which on paint along a curve is none by chance.
+# Log-likelihood ratio beyond which paint along a curve is not by chance.
 _SURELY = 3.0
-# Of the places on lines, at most, where lines that are not painted look like paint: 0.3 by chance, 0.8 of worn ones.
+# Largest share of the places that look like paint on an unpainted part: 0.3 are so by chance, 0.8 on worn lines.
 _LACKS = 0.5
 
 
@@ -32,11 +34,11 @@ def _seen(
     share_of_image: float = _REACH,
     known: dict[float, float] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Of each of the target's C curves: places in view, and those of them that have paint nearby; and how bright what
-    is brightest near each place (N,) of the course is.
+    """For each of the target's C curves, count the places in view and those with paint nearby; also return the largest
+    brightness near each place (N,) of the course.
 
     Args:
-        known: how bright lines laid anywhere are by chance, by their width.
+        known: cache of the brightness that lines laid anywhere have by chance, by their width.
     """
     count, size = len(target.curves), (grey.shape[1], grey.shape[0])
     if len(course) < _FEWEST:
@@ -57,7 +59,7 @@ def _course(target: Target, camera: Camera, curves: Collection[str]) -> Course:
 
 
 def _lacking(target: Target, places: Array, bright: Array) -> set[str]:
-    """Curves of the optional parts that are in view, and of which hardly more is seen than by chance."""
+    """Return the curves of optional parts that are in view, and of which hardly more is seen than by chance."""
     names: set[str] = set()
     for part in target.optional:
         rows = [target.curve_index[name] for name in part]
@@ -67,8 +69,8 @@ def _lacking(target: Target, places: Array, bright: Array) -> set[str]:
 
 
 def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
-    """Places of lines all over an image, in all directions: a low-discrepancy sequence (Roberts 2018, R3)."""
-    anywhere = 400  # places of lines laid anywhere, by which that brightness is known
+    """Return places of lines all over an image, in all directions: a low-discrepancy sequence (Roberts 2018, R3)."""
+    anywhere = 400  # number of places from which that brightness is estimated
     x, y, turn = np.mod(np.outer(_R3, np.arange(1.0, anywhere + 1.0)), 1.0)
     pixels = np.column_stack([x, y]) * (np.array(image_size) - 1.0)
     normals = np.column_stack([np.cos(np.pi * turn), np.sin(np.pi * turn)])
@@ -77,16 +79,16 @@ def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
 
 
 def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
-    """These curves without the optional parts of the target that are not in the picture, where the camera sees them."""
+    """Return these curves without those optional parts that the camera should see and that are not in the picture."""
     lacking = _lacking(target, *_seen(grey, target, _course(target, camera, curves))[:2])
     return tuple(name for name in curves if name not in lacking)
 
 
 def _covered(grey: Array32, course: Course, bright: Array, seen: Mask) -> Array:
-    """(C,) of each of the target's curves the places beside which lies no floor that those have which are seen (C,), by
-    how bright what is near each place (N,) is.
+    """(C,) number of places on each curve beside which the floor differs from that of the curves that are seen (C,),
+    given the brightness near each place (N,).
     """
-    beside_widths = 4.0  # from a line's middle, of its width: past its edges' blur, before its neighbour
+    beside_widths = 4.0  # distance from a line's middle, in line widths: past its edges' blur, before its neighbour
     paint = bright * seen[course.curve]
     if not np.any(paint > 0.0):
         return np.zeros(len(seen))
@@ -99,8 +101,8 @@ def _covered(grey: Array32, course: Course, bright: Array, seen: Mask) -> Array:
 
 
 def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
-    """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
-    other paint, to be measured; and those that something covers, by what is beside them: no floor that the others have.
+    """Return the curves along which there is more paint than by chance, even if it cannot be measured (dashes, or other
+    paint too near), and those that something covers, as the floor beside them differs from that beside the others.
     """
     course = _course(target, camera, curves)
     places, painted, bright = _seen(grey, target, course, _NEAR)
@@ -113,12 +115,11 @@ def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
 def likelihoods_of_places(
     grey: Array32, places: Iterable[tuple[Target, Camera]], curves: Collection[str]
 ) -> list[float]:
-    """How much likelier the target is in each of some places than elsewhere, by where its own lines are seen in the
-    picture itself.
+    """Return how much likelier the target is at each of some places than elsewhere, given where its own lines are seen.
 
-    The log-likelihood ratio of so many places with paint, less what tells that the curves do not share one share: of a
-    target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere. Optional parts
-    that are not seen say nothing.
+    This is the log-likelihood ratio of so many places with paint, less that of different shares on different curves: if
+    the target is elsewhere, some of its lines are on paint and others are not, while wear and robots are everywhere.
+    Optional parts that are not seen are ignored.
     """
     known: dict[float, float] = {}
     seen = ((target, _seen(grey, target, _course(target, camera, curves), known=known)) for target, camera in places)

@@ -1,5 +1,5 @@
-"""The camera that a photograph's lines, as far as they are known yet, belong to: from a start, in one robust solve, or
-with the kind of lens that suits them best.
+"""The camera that fits a photograph's lines, as far as they are known: from an initial estimate, in one robust solve,
+or with the kind of lens that fits them best.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ceres_cal.scene.lens import LENSES
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
 NOTHING: tuple[Indices32, Array, Array] = (np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
-"""Curves, pixels and sigmas of no place."""
+"""Curves, pixels and sigmas of zero places."""
 _QUICK = Options(max_iterations=30, threads=1)
 ROBUST = Weighting(loss="cauchy", loss_scale=2.0)
 
 
 class PointHints(Frozen):
-    """What somebody showed of a target: points by their index (P,) among its own, pixels (P, 2), sigma_px (P,), and
-    places (N, 2) px of curves (N,), with sigmas (N,).
+    """What a user showed of a target: points by their index (P,) in the target, pixels (P, 2), sigma_px (P,), and
+    places (N, 2) px on curves (N,), with sigmas (N,) px.
     """
 
     target: Target
@@ -48,7 +48,9 @@ class PointHints(Frozen):
         points: Mapping[str, tuple[float, float, float]],
         places: Sequence[tuple[str, float, float, float]] = (),
     ) -> PointHints:
-        """Points by name and places with their curve, each x, y and sigma in px; without what the target has not."""
+        """Make hints from points by name and places with their curve, each with x, y and sigma in px; names unknown to
+        the target are omitted.
+        """
         points = {name: place for name, place in points.items() if name in target.point_index}
         places = [place for place in places if place[0] in target.curve_index]
         at = np.array(list(points.values()), dtype=float).reshape(-1, 3)
@@ -59,27 +61,27 @@ class PointHints(Frozen):
 
     @property
     def names(self) -> list[str]:
-        """(P,) of the points."""
+        """(P,) names of the points."""
         return [self.target.point_names[number] for number in self.feature]
 
     def observed(self, image_size: tuple[int, int]) -> Observations:
-        """The same as observations."""
+        """Return the hints as observations."""
         return observations_of(self.target, image_size, *NOTHING, self)
 
     @property
     def equations(self) -> int:
-        """Numbers that were shown: two of a point, one of a place on a curve."""
+        """Number of equations: two for a point, one for a place on a curve."""
         return 2 * len(self.feature) + len(self.curve)
 
 
 class FreeIntrinsics(Frozen):
-    """What of the camera, and of the target, a photograph may change besides the pose.
+    """What a photograph may change of the camera besides its pose, and of the target.
 
     Attributes:
-        names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
-            the target, which are free because of that.
-        hints: what somebody showed, which holds the camera while lines are far off.
-        keep: whether the starts are known to be near: nothing far off is looked at.
+        names: free intrinsics, in the order in which they are freed.
+        priors: priors on them, and on dimensions of the target, which are thereby free.
+        hints: what a user showed, which holds the camera while lines are far off.
+        keep: whether the starts are known to be near, so that nothing far off is searched.
     """
 
     names: tuple[str, ...] = ()
@@ -96,7 +98,7 @@ def observations_of(
     sigma_px: Array,
     hints: PointHints | None = None,
 ) -> Observations:
-    """One view of a field in the world: pixels (N, 2) on curves (N,), and what somebody showed besides."""
+    """Return one view of a field in the world: pixels (N, 2) on curves (N,), and what a user showed besides."""
     points = NO_POINTS
     if hints is not None:
         points = Points(np.zeros(len(hints.feature), np.int32), hints.feature, hints.pixels, hints.sigma_px)
@@ -119,7 +121,7 @@ def problem_of(
     priors: tuple[Prior, ...],
     weighting: Weighting = ROBUST,
 ) -> tuple[Problem, Estimate]:
-    """What `refit_camera` solves, and where from."""
+    """Return the problem that `refit_camera` solves, and its initial estimate."""
     names, solved = intrinsic_names(camera.lens), tuple(prior.dimension for prior in priors if prior.dimension)
     freed = np.array(sorted(names.index(name) for name in free), dtype=np.int64)
     estimate = Estimate(
@@ -141,12 +143,13 @@ def refit_camera(
     priors: tuple[Prior, ...] = (),
     weighting: Weighting = ROBUST,
 ) -> tuple[Camera, Target] | None:
-    """The posed camera that one view's observations tell, from one that is near, and the target; None where they tell
-    none.
+    """Fit a posed camera, and the target, to one view's observations, from a camera nearby; None where it cannot be
+    determined.
 
     Args:
-        free: names of the intrinsics that are free too. priors: on them, and on dimensions that are solved for.
-        weighting: noise and loss; by default one under which what is far off decides nothing.
+        free: names of the intrinsics that are free, too.
+        priors: on them, and on dimensions that are estimated.
+        weighting: noise and loss; by default far outliers have no influence.
     """
     problem, estimate = problem_of(camera, observations, free, priors, weighting)
     solution = solve(problem, estimate, precision=1e-6)
@@ -163,21 +166,21 @@ def refit_camera(
 def best_fit(
     camera: Camera, observations: Observations, lengths: tuple[Prior, ...] = (), *, is_stretched: bool = False
 ) -> Calibration | None:
-    """The calibration of one view with the kind of lens that suits it best, from a camera near by.
+    """Return the calibration of one view with the kind of lens that fits it best, from a camera nearby.
 
-    Pixels are square where this camera's are, or where they suit the view nearly as well and it is not stretched.
+    Pixels are square if this camera's are, or if they fit the view almost as well and it is not stretched.
     """
-    # Times the noise with other pixels: 1.00 to 1.07 where a court was drawn a millimetre off, 1.18 where a photograph
-    # of worn lines was stretched by 4 %, 7 where a clear one was by 7 %.
+    # Largest ratio of the noise with square pixels to that with free ones: 1.00 to 1.07 where a court was drawn a
+    # millimetre off, 1.18 where a photograph of worn lines was stretched by 4 %, 7 where a clear one was by 7 %.
     nearly = 1.12
-    # Times the noise of one that folds in the picture: a polynomial's does beyond the last line, and bends what is
-    # predicted there; of a fisheye the others leave a hundred times as much.
+    # Penalty factor on the noise of a lens that folds in the picture: a polynomial may do so beyond the last line, and
+    # bends what is predicted there. For a fisheye the other lenses leave a hundred times as much noise.
     folded = 2.0
     fits = [] if is_stretched else _fits(squared_pixels(camera), observations, lengths)
     if camera.aspect != 1.0:
         fits += [(nearly * off, found, own) for off, found, own in _fits(camera, observations, lengths)]
     order = sorted(fits, key=lambda fit: fit[0] * (folded if fit[1].station().folds else 1.0))
-    asked = (  # a phi that no lens has lies in an open valley, of which another place is as good
+    asked = (  # a phi that no lens has is in an open valley of the cost, where another place fits as well
         # quiet: the next one is taken
         one if is_lens(one.station()) else attempt(partial(calibrate_near, one.station(), observations, own))
         for _, one, own in order
@@ -188,12 +191,12 @@ def best_fit(
 def _fits(
     near: Camera, observations: Observations, lengths: tuple[Prior, ...]
 ) -> list[tuple[float, Calibration, Options]]:
-    """With each kind of lens: how far off the view is, in noise, and the calibration with its options."""
+    """For each kind of lens, return the residual noise of the view, the calibration, and its options."""
     stretched, fits = near.aspect != 1.0, list[tuple[float, Calibration, Options]]()
-    own_first = sorted(LENSES.items(), key=lambda one: one[0] != near.lens.kind)  # the others are near where it ends
+    own_first = sorted(LENSES.items(), key=lambda one: one[0] != near.lens.kind)  # the others start from its result
     for kind, lens in own_first:
         if lens.set_at_start:
-            continue  # a few lines do not tell a lens without a formula
+            continue  # a few lines do not determine a lens without a formula
         powers = (lens.trial_powers or ((),))[-1]
         own = Options(lens=kind, powers=powers, priors=lengths, as_built="as drawn", free_aspect=stretched)
         # quiet: where none fits these lines, they are judged as found
@@ -205,25 +208,25 @@ def _fits(
 
 
 def squared_pixels(camera: Camera) -> Camera:
-    """The same with square pixels of the same size."""
+    """Return the camera with square pixels of the same area."""
     return replace(camera, phi=camera.phi * camera.aspect**0.5, aspect=1.0)
 
 
 def misfit(camera: Camera, observations: Observations) -> float:
-    """Mean cost of the curve observations of one view, by the loss of `refit_camera`."""
+    """Mean cost of the curve observations of one view, under the loss of `refit_camera`."""
     problem, estimate = problem_of(camera, observations, (), ())
     left = residuals(problem.sights, estimate).curves / problem.weighting.loss_scale
     return float(np.mean(np.log1p(np.nan_to_num(left, nan=np.inf) ** 2)))
 
 
 def moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
-    """How far the floor that is seen at these pixels moves from one camera to the other, px at most."""
+    """Largest displacement, px, from one camera to the other of the floor that is seen at these pixels."""
     floor = camera.locate(pixels)
     moved = refitted.project(np.column_stack([floor, np.zeros(len(floor))])) - pixels
     return float(np.nanmax(np.linalg.norm(moved, axis=1), initial=0.0))
 
 
 def redrawn_px(camera: Camera, course: Course, target: Target) -> float:
-    """How far beside the places of a course another drawing of the target has its curves, px at most."""
+    """Largest distance, px, from the places of a course to the curves of another drawing of the target."""
     there = course_at(target, camera, course.curve, course.s).pixels
     return float(np.nanmax(np.abs(np.sum((there - course.pixels) * course.normals, axis=1)), initial=0.0))

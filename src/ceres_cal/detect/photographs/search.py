@@ -1,4 +1,4 @@
-"""The field in a photograph without any start: candidates are followed and judged, and one of its turns is chosen."""
+"""Search for the field without an initial estimate: candidates are followed and judged, and one view is chosen."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ from ceres_cal.detect.strokes import Strokes
 from ceres_cal.scene import Camera, Target, in_image
 from ceres_cal.scene.targets import others_of_kind
 
-# Of the strokes explained, by the first without an objection: no other is followed, nor after one whose lines lie as
-# drawn to millimetres. It only saves time. Nothing changes from 0.82 to 0.95.
+# Share of explained strokes for which the first candidate without an objection ends the search, to save time; so does
+# one whose lines lie as drawn to millimetres. Nothing changes from 0.82 to 0.95.
 _SURE = 0.9
-# Of the best one's likelihood: another way to see the picture that is as good makes it ambiguous. Of a circle and a
-# cross a quarter turn that is wrong has 1.1 times as much as the right one.
+# Share of the best likelihood from which on another view makes the picture ambiguous. For a circle and a cross, a wrong
+# quarter turn has 1.1 times the likelihood of the right one.
 _AS_GOOD = 0.87
-# The likeliest candidates, which a lens of another kind may suit: of 41 pictures that show the field one needs two.
+# Number of the likeliest candidates that are refined with another kind of lens: of 41 pictures that show the field one
+# needs two.
 _MOST_REFINED = 2
 OTHER = "it shows {0}: give that as the target (--target {0})"
 _NO_LINES = (
@@ -52,7 +53,9 @@ _NO_LINES = (
 
 
 class SeveralWaysError(InputError):
-    """The field is found, but what is known does not say which way round, or contradicts all ways; `seen` is one."""
+    """The field is found, but what is known does not determine its orientation, or contradicts all; `seen` is one of
+    them.
+    """
 
     def __init__(self, message: str, seen: FieldLines) -> None:
         super().__init__(message)
@@ -60,15 +63,15 @@ class SeveralWaysError(InputError):
 
 
 class SearchResult(Frozen):
-    """What came of looking for the field.
+    """Result of a search for the field.
 
     Attributes:
         followed: the field, or None. reason: why none was found.
+        ways: number of ways in which the photograph can be taken for the field; 0 if a start was given.
+        chosen_by: what chose one of several ways: "facing" or "before"; empty if there is only one.
         seen: the best candidate, where none is the field.
-        ways: in how many ways the photograph can be taken for the field; 0: none was looked for, a start was given.
-            chosen_by: what chose one of them: "facing", "before", or nothing, where there is but one.
-        darker: whether its lines were looked for as darker ones than the floor.
-        shows: the name of another target of the same kind that is found in its place.
+        darker: whether lines darker than the floor were searched.
+        shows: name of another target of the same kind that is found instead.
     """
 
     followed: FieldLines | None
@@ -85,16 +88,16 @@ def search(
 ) -> SearchResult:
     """Find a target's painted curves in a photograph and follow them.
 
-    The picture must show straight lines at right angles, two one way and one across at least; whatever else the target
-    has takes part in telling the ways apart. Nothing is known of the lens but that it is about radial and centred; the
-    camera looks down, at up to 55 degrees from the upright. A mirrored photograph of a field that is its own mirror
-    image looks like another one's: it cannot be told, and is not.
+    The picture must show straight lines at right angles, at least two one way and one across; all other curves of the
+    target help to decide between possible views. Of the lens it is only assumed that it is approximately radial and
+    centred. The camera looks down, tilted by up to 55 degrees. A mirrored photograph of a field that is its own mirror
+    image looks like another field's; this cannot be detected.
 
     Args:
-        strokes: of the photograph, where they were looked for already.
+        strokes: strokes of the photograph, if they are known already.
 
     Raises:
-        SeveralWaysError: the photograph can be taken for the field in several ways, and nothing says which.
+        SeveralWaysError: the photograph can be taken for the field in several ways, and nothing decides between them.
         InputError: the target has too few straight lines, or nothing that `auto.facing` names.
     """
     require_sides(auto.facing, target, curves)
@@ -113,7 +116,7 @@ def search(
 
 
 def _search_about(problem: FieldSearch) -> SearchResult:
-    """The same about one middle of the lens."""
+    """Search with one assumed centre of the lens."""
     good, seen, reason = _looked(problem, problem)
     if not good:
         good, other, against = _looked(problem, narrowed(problem))
@@ -127,7 +130,7 @@ def _search_about(problem: FieldSearch) -> SearchResult:
     problem = replace(problem, grid=grid_of(best.target, problem.grid.curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, _turned(problem, camera)) for camera in similar]
-    if problem.is_out_of_time:  # it may look alike in ways that nobody looked at
+    if problem.is_out_of_time:  # other views that look alike may not have been tried
         return _given_up(best)
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
@@ -138,7 +141,7 @@ def _search_about(problem: FieldSearch) -> SearchResult:
 
 
 def _shows(problem: FieldSearch, target: Target) -> bool:
-    """Whether the picture surely shows this target, as it is drawn, in the place of the one that was looked for."""
+    """Whether the picture surely shows this target, as it is drawn, instead of the one that was searched."""
     grid = attempt(partial(grid_of, target, target.painted), InputError)  # quiet: it has no lines to be found by
     if isinstance(grid, CalibrationError):
         return False
@@ -153,7 +156,7 @@ def _shows(problem: FieldSearch, target: Target) -> bool:
 
 
 def _looked(problem: FieldSearch, among: FieldSearch) -> tuple[list[FieldLines], FieldLines | None, str]:
-    """What may be the field, by candidates from some strokes; else the best there is, and what speaks against it."""
+    """Return candidates from some strokes that may be the field, the best of the others, and what speaks against it."""
     good: list[FieldLines] = []
     seen: FieldLines | None = None
     reason, refined = _NO_LINES, 0
@@ -187,19 +190,19 @@ def _given_up(seen: FieldLines | None) -> SearchResult:
 
 
 def _turned(problem: FieldSearch, camera: Camera) -> Camera:
-    """The one of a camera's turns that what is known favours, so that it need not be followed again."""
+    """Return the turn of a camera that agrees best with what is known, so that it need not be followed again."""
     ways = [camera.at(camera.cam_from_world @ turn) for turn in problem.grid.turns]
     agreeing = _consistent(problem, ways)
     return ways[agreeing[0]] if agreeing else camera
 
 
 def _followed(problem: FieldSearch, camera: Camera) -> FieldLines:
-    """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
+    """Follow the target's lines from a camera that is about right, held by the points that it puts into the picture."""
     return _tracker(problem, problem.grid.target, camera).approached(camera)
 
 
 def _tracker(problem: FieldSearch, target: Target, camera: Camera) -> Tracker:
-    """What follows a target as it is drawn, from about there."""
+    """Return a tracker of a target as it is drawn, from a camera that is about right."""
     pixels = camera.project(target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
     hints = PointHints(target, rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
@@ -211,7 +214,7 @@ def _tracker(problem: FieldSearch, target: Target, camera: Camera) -> Tracker:
 
 
 def _one_way(problem: FieldSearch, distinct: Sequence[FieldLines]) -> SearchResult:
-    """The one way that agrees with what is known; SeveralWaysError where none does, or several."""
+    """Return the one view that agrees with what is known; SeveralWaysError where none does, or several."""
     target, curves = problem.grid.target, problem.grid.curves
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.grid.turns]
     agreeing = _consistent(problem, ways)
@@ -234,7 +237,7 @@ def _one_way(problem: FieldSearch, distinct: Sequence[FieldLines]) -> SearchResu
 
 
 def _consistent(problem: FieldSearch, cameras: Sequence[Camera]) -> list[int]:
-    """Numbers of the cameras that agree with what is known; one alone needs no old calibration to agree with."""
+    """Indices of the cameras that agree with what is known; a single camera need not agree with an old calibration."""
     if problem.asked.facing:
         return agreeing_with_facing(cameras, problem.asked.facing, problem.grid.target, problem.grid.curves)
     if problem.asked.before is not None and len(cameras) > 1:
@@ -243,7 +246,7 @@ def _consistent(problem: FieldSearch, cameras: Sequence[Camera]) -> list[int]:
 
 
 def _contradiction(ways: Sequence[Camera], facing: Sequence[Facing], target: Target, curves: Collection[str]) -> str:
-    """That no way agrees with all of what is known."""
+    """Message that no view agrees with all of what is known."""
     given = ", ".join(f"{one.feature}={one.side}" for one in facing)
     if len(facing) > 1 and all(agreeing_with_facing(ways, [one], target, curves) for one in facing):
         return f"{given} hold together in a mirrored picture only: mirror it back, or check them"
@@ -251,7 +254,7 @@ def _contradiction(ways: Sequence[Camera], facing: Sequence[Facing], target: Tar
 
 
 def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -> str:
-    """Where something that tells these cameras apart lies, and how to say which is meant."""
+    """Describe where a feature that distinguishes these cameras lies, and how to say which one is meant."""
     name = distinguishing_feature(target, curves)
     sides = list(dict.fromkeys(side_of(name, camera, target, curves) for camera in cameras))
     if len(sides) < len(cameras):

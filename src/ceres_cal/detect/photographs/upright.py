@@ -1,12 +1,13 @@
-"""How a camera looks at a floor whose lines run in two directions at right angles: lens, focal length and turn.
+"""Lens, focal length and rotation of a camera above a floor whose lines run in two perpendicular directions.
 
-Nothing is known beforehand but the strokes of paint in one photograph. A stroke and the camera's centre span a plane;
-the direction of a line on the floor lies in the planes of all of its strokes. So the strokes vote for two directions at
-right angles, for a focal length, and for the one coefficient of a lens
+Only the strokes of paint in one photograph are known. A stroke and the camera's centre span a plane; the direction of a
+line on the floor lies in the planes of all of its strokes. So the strokes vote for two perpendicular directions, for a
+focal length, and for the one coefficient of a lens
 
     ray = (p / phi, 1 + c |p|^2),    p in half image diagonals from the image's middle,
 
-that straightens them. Of a floor that is seen from straight above no line tells the focal length: a usual one is taken.
+that straightens them. If the floor is seen from straight above, no line determines the focal length: a usual one is
+taken.
 """
 
 from __future__ import annotations
@@ -20,34 +21,35 @@ from ceres_cal.kernels import shares_along
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45, -0.6, -0.75)
-_MOST_BENT = -0.75  # a floor that is seen farther out than that lies behind the camera
+_MOST_BENT = -0.75  # with more distortion, the floor seen farther out lies behind the camera
 PHIS = (0.8, 1.15, 1.6)
 _USUAL_BEND, _BEND_SIGMA = -0.15, 0.35
-# rad: a standard deviation of the tilts that cameras over fields have. Nothing changes from 0.33 to 0.67.
+# Prior standard deviation of the tilt of cameras over fields, rad. Nothing changes from 0.33 to 0.67.
 _USUAL_TILT = 0.5
-# Of all strokes, at one standard deviation: it decides only where strokes do not. Nothing changes from half to
-# double.
+# Penalty at one standard deviation, as a share of all strokes: it decides only where strokes do not. Nothing changes
+# from half to double.
 _PRIOR_WEIGHT = 0.03
-_RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))  # tilt, directions of it
+# tilt, degrees, and number of its directions
+_RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))
 _ROLL_DEG = 5.0
-_ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
+_ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off, in the first and the last round
 _ROUNDS = 12
-# Of the strokes, in the direction that has fewer: a floor needs both. Nothing changes from half to double. And of what
-# the target has there: fields without touch lines have little.
+# Least share of the strokes in the direction that has fewer, as a floor needs both. Nothing changes from half to
+# double. And the same as a share of what the target has there: fields without touch lines have little.
 _LEAST_SHARE, _LEAST_OF_OWN = 0.06, 0.3
 _DOWN = np.diag([1.0, -1.0, -1.0])
-_FROM_EACH, _REFINED = 2, 14  # of each lens and focal length, and of all
-# Of two answers' uprights, rad: nearer ones count as one. Nothing changes from half to double.
+_FROM_EACH, _REFINED = 2, 14  # number of rotations kept for each lens and focal length; number refined in all
+# Angle between two solutions' verticals, rad, below which they count as one. Nothing changes from half to double.
 _APART = 0.1
 
 
 class Upright(Frozen):
-    """One answer.
+    """One solution for lens, focal length and rotation.
 
     Attributes:
-        bend: c. phi: in half image diagonals.
+        bend: c, the lens's coefficient. phi: focal length in half image diagonals.
         rotation: (3, 3) camera from floor; the floor's x and y run along the lines, its z up.
-        share: of the strokes, those that run along x or y.
+        share: share of the strokes that run along x or y.
     """
 
     bend: float
@@ -56,21 +58,23 @@ class Upright(Frozen):
     share: float
 
     def rays(self, offsets: Array) -> Array:
-        """(N, 3) of offsets (N, 2) from the image's middle in half image diagonals, in the camera's frame."""
+        """(N, 3) rays in the camera's frame for offsets (N, 2) from the image's middle in half image diagonals."""
         return np.column_stack([offsets / self.phi, 1.0 + self.bend * np.sum(offsets**2, axis=1)])
 
     def floor(self, offsets: Array) -> Array:
-        """(N, 2) where they meet the floor, in camera heights from below the camera; NaN above the horizon."""
+        """(N, 2) where the rays meet the floor, in camera heights from below the camera; NaN above the horizon."""
         d = self.rays(offsets) @ self.rotation
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(d[:, 2:] < -0.05, d[:, :2] / -d[:, 2:], np.nan)
 
 
 def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0) -> list[Upright]:
-    """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best first.
+    """Return the best solutions for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best
+    first.
 
     Args:
-        own_share: of the target's lines, those in the direction that has fewer.
+        weights: (N,) of the strokes. most: largest number of solutions.
+        own_share: share of the target's lines in the direction that has fewer.
     """
     least = min(_LEAST_SHARE, _LEAST_OF_OWN * own_share)
     scored: list[tuple[float, Upright]] = []
@@ -94,12 +98,12 @@ def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0)
 
 
 def best_score(ends: Array, weights: Array, own_share: float) -> float:
-    """How many of the strokes the best answer straightens, less what speaks against it: see `find_upright`."""
+    """Return the share of the strokes that the best solution straightens, less its penalty: see `find_upright`."""
     return max((one.share - _penalty(one) for one in find_upright(ends, weights, 1, own_share)), default=0.0)
 
 
 def _rotations() -> Array:
-    """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
+    """(B, 3, 3) a grid of all rotations relative to the floor, except for quarter turns about the vertical."""
     rolls = np.array([rotation_exp([0.0, 0.0, roll]) for roll in np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))])
     ways = [(tilt, 2.0 * np.pi * number / count) for tilt, count in _RINGS_DEG for number in range(count)]
     leans = [rotation_exp(np.deg2rad(tilt) * np.array([np.cos(way), np.sin(way), 0.0])) for tilt, way in ways]
@@ -107,8 +111,8 @@ def _rotations() -> Array:
 
 
 def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Array, Array]:
-    """(..., N, 3) normals of the planes through the camera and the strokes, of any length, and their slopes by bend;
-    bend and phi are (...), or one number.
+    """(..., N, 3) normals, of any length, of the planes through the camera and the strokes, and their derivatives by
+    bend; bend and phi are (...), or one number.
     """
     (x, y), (u, v) = ends[:, 0].T, ends[:, 1].T
     near, far = x**2 + y**2, u**2 + v**2
@@ -119,7 +123,7 @@ def _normals(bend: Array | float, phi: Array | float, ends: Array) -> tuple[Arra
 
 
 def _score(normals: Array, weights: Array, rotations: Array, tolerance: float, least: float) -> Array:
-    """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
+    """(B,) share of the strokes that run along x or y; 0 where hardly any runs along one of them."""
     planes = normals / (tolerance * np.linalg.norm(normals, axis=1, keepdims=True))
     shares, axes = np.empty(len(rotations)), np.swapaxes(rotations[:, :, :2], 1, 2)
     single = np.float32  # twice as fast, and good enough for a share
@@ -134,7 +138,7 @@ def _penalty(optics: Upright) -> float:
 
 
 def _refined(starts: Sequence[Upright], ends: Array, weights: Array, least: float) -> list[Upright]:
-    """Gauss-Newton on turn, bend and log phi, robust and ever finer; of all starts at once."""
+    """Refine all starts at once by Gauss-Newton on rotation, bend and log phi, robust and with decreasing tolerance."""
     bend, phi = np.array([(one.bend, one.phi) for one in starts]).T
     rotation, share = np.array([one.rotation for one in starts]), weights / weights.sum()
     prior = _PRIOR_WEIGHT * np.array([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(USUAL_PHI_FACTOR) ** -2])
@@ -154,8 +158,8 @@ def _refined(starts: Sequence[Upright], ends: Array, weights: Array, least: floa
 
 
 def _deviation(bend: Array, phi: Array, rotation: Array, ends: Array) -> tuple[Array, Array]:
-    """(B, N) sine of the angle between each stroke and the nearer direction of each of B answers, and (B, 5, N) its
-    slopes by turn, bend and log phi.
+    """(B, N) sine of the angle between each stroke and the nearer direction of each of B solutions, and (B, 5, N) its
+    derivatives by rotation, bend and log phi.
     """
     normals, by_bend = _normals(bend, phi, ends)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
@@ -163,7 +167,7 @@ def _deviation(bend: Array, phi: Array, rotation: Array, ends: Array) -> tuple[A
     x, y, z = np.moveaxis(normals @ rotation, 2, 0)
     is_x, none = np.abs(x) <= np.abs(y), np.zeros_like(x)
     base = np.where(is_x, x, y)
-    turns = np.where(is_x, [none, -z, y], [z, none, -x])  # of the axis, w x e
+    turns = np.where(is_x, [none, -z, y], [z, none, -x])  # derivative of the axis, w x e
     axis = np.where(is_x[..., None], rotation[:, None, :, 0], rotation[:, None, :, 1])
     by_phi = np.where([False, False, True], -normals, 0.0)
     others = [
@@ -173,6 +177,6 @@ def _deviation(bend: Array, phi: Array, rotation: Array, ends: Array) -> tuple[A
 
 
 def _apart(one: Upright, other: Upright) -> bool:
-    """Whether two answers are two, but for quarter turns."""
+    """Whether two solutions differ by more than quarter turns."""
     away = np.linalg.norm(one.rotation[:, 2] - other.rotation[:, 2])
     return bool(away > _APART or abs(one.bend - other.bend) > 0.05 or abs(np.log(one.phi / other.phi)) > 0.15)
